@@ -1,0 +1,37 @@
+# `make` lists the targets. Each does all the set-up it needs; a second call skips what is done.
+VENV ?= .venv
+BIN := $(VENV)/bin
+OUT ?= lidarpool-out
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test lint format bench clean
+
+help:  ## list the targets
+	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /\1\t/' | expand -t 10
+
+demo:  ## run the default survey on a local cluster; results in $(OUT)/
+	@VENV=$(VENV) sh .ci/setup run
+	$(BIN)/lidarpool demo --out $(OUT)
+
+test:  ## run the test suite
+	@VENV=$(VENV) sh .ci/setup dev
+	$(BIN)/python -m pytest
+
+lint:  ## format check, lint, types, layer contracts
+	@VENV=$(VENV) sh .ci/setup dev
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format:  ## rewrite the sources in the project's format
+	@VENV=$(VENV) sh .ci/setup dev
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+bench:  ## benchmarks: pipeline throughput, ray casting
+	@VENV=$(VENV) sh .ci/setup dev
+	$(BIN)/python -m benchmarks.pipeline
+
+clean:  ## remove the virtual environment and caches
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
