@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .errors import LidarpoolError
 from .mesh import Mesh, points_array
+from .meshfile import load_meshes
 from .shapes import seed_objects
+from .transform import Transform
 
 # Single precision, which ray casters use, resolves a millimetre up to here.
 FAR_FROM_ZERO_M = 10_000.0
@@ -85,6 +88,21 @@ class Scene:
         76800
         """
         return cls.from_meshes(seed_objects())
+
+    @classmethod
+    def load(
+        cls,
+        path: str | Path,
+        *,
+        unit: str | None = None,
+        up_axis: str | None = None,
+        transform: Transform | None = None,
+    ) -> Scene:
+        """Read a mesh file: .glb .gltf .obj .stl .ply .off .dae .3mf.
+
+        See `lidarpool.meshfile.load_meshes` for the parameters and for what is raised.
+        """
+        return cls.from_meshes(load_meshes(path, unit=unit, up_axis=up_axis, transform=transform))
 
     @classmethod
     def from_meshes(cls, meshes: Iterable[Mesh]) -> Scene:

@@ -1,0 +1,117 @@
+"""COLLADA (.dae) files: object names, unit, up axis and all digits of the coordinates.
+
+trimesh reads .dae too, through the same pycollada, but names objects by their geometry instead
+of their node, drops the up axis, and keeps the single precision in which pycollada parses
+numbers, which moves georeferenced vertices by centimetres. Here the numbers are taken from the
+XML again, in double precision.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import collada  # type: ignore[import-untyped]
+import numpy as np
+from numpy.typing import NDArray
+
+from .mesh import Mesh
+from .transform import Transform
+
+# What may be missing without changing the shape: textures, materials, lights, cameras.
+_HARMLESS = ("image", "surface", "material", "effect", "shading", "profile", "light", "camera")
+
+
+def read_dae(path: Path) -> tuple[list[Mesh], float | None, str | None]:
+    """Read the default scene of a COLLADA file.
+
+    Returns
+    -------
+    meshes
+        One for each node that has geometry, named by the node, in the file's unit and axes.
+    unit_m
+        Metres in the file's unit; None where it states none.
+    up_axis
+        'x', 'y' or 'z'; None where the file states none.
+
+    Raises
+    ------
+    Exception
+        What pycollada raises on a broken file; ValueError for missing or unknown geometry.
+    """
+    document = collada.Collada(
+        str(path), ignore=[collada.common.DaeUnsupportedError, collada.common.DaeBrokenRefError]
+    )
+    for error in document.errors:
+        text = str(error)
+        if not any(word in text.lower() for word in _HARMLESS):
+            raise ValueError(text)
+    meshes: list[Mesh] = []
+    if document.scene is not None:
+        for node in document.scene.nodes:
+            meshes += _walk(node, np.eye(4), "")
+    axis = document.assetInfo.upaxis
+    return meshes, document.assetInfo.unitmeter, axis[0].lower() if axis else None
+
+
+def _walk(node: Any, above: NDArray[np.float64], name: str) -> Iterator[Mesh]:
+    """Meshes of a node and of those under it; `above` is the (4, 4) matrix of its parent."""
+    if isinstance(node, collada.scene.GeometryNode):
+        yield from _geometry(node.geometry, Transform.from_matrix(above), name)
+    elif isinstance(node, collada.scene.Node):
+        # <instance_node> gives a node of another place, with transforms of its own.
+        matrix = above
+        for step in node.transforms:
+            matrix = matrix @ _matrix(step)
+        for child in node.children:
+            yield from _walk(child, matrix, node.name or name)
+
+
+def _geometry(geometry: Any, transform: Transform, name: str) -> Iterator[Mesh]:
+    """One mesh of all primitives, which differ by material only."""
+    vertices: list[NDArray[np.float64]] = []
+    faces: list[NDArray[np.int64]] = []
+    count = 0
+    for primitive in geometry.primitives:
+        triangles = primitive.triangleset() if hasattr(primitive, "triangleset") else primitive
+        index = getattr(triangles, "vertex_index", None)
+        if index is None or index.ndim != 2 or index.shape[1] != 3:
+            continue  # lines and points, which reflect no light
+        points = _numbers(primitive.sources["VERTEX"][0][4].xmlnode.find("{*}float_array"))
+        vertices.append(points.reshape(-1, 3))
+        faces.append(np.asarray(index, dtype=np.int64) + count)
+        count += len(vertices[-1])
+    if faces:
+        rows = np.concatenate(faces)
+        yield Mesh(
+            name or geometry.name or geometry.id or "geometry",
+            transform.apply(np.concatenate(vertices)),
+            rows[:, ::-1] if transform.mirrors else rows,
+        )
+
+
+def _matrix(step: Any) -> NDArray[np.float64]:
+    """Matrix (4, 4) of one <translate>, <scale>, <rotate>, <matrix> or <lookat>."""
+    out = np.eye(4)
+    if isinstance(step, collada.scene.TranslateTransform):
+        out[:3, 3] = _numbers(step.xmlnode)
+    elif isinstance(step, collada.scene.MatrixTransform):
+        out = _numbers(step.xmlnode).reshape(4, 4)
+    elif isinstance(step, collada.scene.ScaleTransform):
+        out[:3, :3] = np.diag(_numbers(step.xmlnode))
+    elif isinstance(step, collada.scene.RotateTransform):
+        x, y, z, degrees = _numbers(step.xmlnode)
+        axis = np.array([x, y, z]) / np.linalg.norm([x, y, z])
+        cross = np.cross(np.eye(3), axis)
+        angle = np.radians(degrees)
+        # Rodrigues (1840)
+        out[:3, :3] += np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    else:
+        out = np.asarray(step.matrix, dtype=np.float64)
+    return out
+
+
+def _numbers(node: Any) -> NDArray[np.float64]:
+    """Text of an XML element as double precision numbers."""
+    return np.array((node.text or "").split(), dtype=np.float64)
