@@ -1,1 +1,30 @@
-"""Placeholder."""
+"""Pool partitions, pipes and a delivery ledger for Dask clusters."""
+
+from .backoff import Backoff
+from .errors import PipeClosed, PipeFailed, PoolError
+from .ledger import Ledger
+from .local import local_cluster
+from .partition import Partition
+from .pipe import Pipe, forget_pipes
+from .placement import Recorder, TaskRecord, placement_violations, recorded
+from .pool import Pool
+from .worker_info import WorkerInfo, assign_devices
+
+__all__ = [
+    "Backoff",
+    "Ledger",
+    "Partition",
+    "Pipe",
+    "PipeClosed",
+    "PipeFailed",
+    "Pool",
+    "PoolError",
+    "Recorder",
+    "TaskRecord",
+    "WorkerInfo",
+    "assign_devices",
+    "forget_pipes",
+    "local_cluster",
+    "placement_violations",
+    "recorded",
+]

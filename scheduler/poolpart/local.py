@@ -1,0 +1,117 @@
+"""A partitioned cluster on this machine."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Mapping
+from typing import Any
+
+from distributed import Nanny, Scheduler, SpecCluster
+
+from .errors import PoolError
+from .probe import visible_gpus
+
+LOOPBACK = "127.0.0.1"
+
+
+def usable_cores() -> int:
+    """Processor cores that this process may run on."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def default_workers(cores: int, gpus: int) -> dict[str, int]:
+    """Worker processes of the GPU and OTHER partitions for a machine.
+
+    One worker a GPU. Without GPUs the GPU partition falls back to CPU workers, for half of
+    the cores; OTHER has the rest. The LIDAR stages mostly wait and share one process.
+
+    Examples
+    --------
+    >>> default_workers(cores=2, gpus=0), default_workers(cores=16, gpus=2)
+    ({'GPU': 1, 'OTHER': 1}, {'GPU': 2, 'OTHER': 13})
+    """
+    casting = gpus or max(1, cores // 2)
+    return {"GPU": casting, "OTHER": max(1, cores - casting - (1 if cores > 2 else 0))}
+
+
+def local_cluster(
+    *,
+    gpu_workers: int | None = None,
+    lidar_slots: int = 4,
+    other_workers: int | None = None,
+    host: str = LOOPBACK,
+    dashboard_port: int | None = 0,
+    environment: Mapping[str, str] | None = None,
+) -> SpecCluster:
+    """Start a Dask cluster on this machine, divided into GPU, LIDAR and OTHER.
+
+    Scheduler, workers and dashboard listen on the loopback interface only. Each partition's
+    workers are processes with a nanny, which restarts them when they die.
+
+    Parameters
+    ----------
+    gpu_workers
+        Workers of the GPU partition, one thread each; by default one a GPU, or for half of
+        the cores where there is no GPU.
+    lidar_slots
+        Threads, and slots, of the one LIDAR worker.
+    other_workers
+        Workers of the OTHER partition, one thread each; by default what is left.
+    host
+        Address to listen on.
+    dashboard_port
+        Port of Dask's dashboard, 0 for any free one, None for none.
+    environment
+        Variables to set in the workers.
+
+    Returns
+    -------
+    SpecCluster
+        Use it as a context manager, or call its `close`. The scheduler runs in this process.
+
+    Raises
+    ------
+    PoolError
+        If a number is below 1.
+    """
+    defaults = default_workers(usable_cores(), len(visible_gpus()))
+    counts = {
+        "GPU": defaults["GPU"] if gpu_workers is None else gpu_workers,
+        "OTHER": defaults["OTHER"] if other_workers is None else other_workers,
+    }
+    for name, count in (*counts.items(), ("LIDAR", lidar_slots)):
+        if count < 1:
+            raise PoolError(f"Partition {name!r} is given {count} workers; it needs at least 1.")
+    # One thread for each worker's numerical libraries: the processes share the cores.
+    env = {name: "1" for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
+    env |= environment or {}
+
+    def spec(partition: str, slots: int) -> dict[str, Any]:
+        options = {
+            "nthreads": slots,
+            "resources": {partition: slots},
+            "host": host,
+            "dashboard": False,
+            "memory_limit": "auto",
+            "env": env,
+            "silence_logs": logging.ERROR,
+        }
+        return {"cls": Nanny, "options": options}
+
+    workers = {f"GPU-{i}": spec("GPU", 1) for i in range(counts["GPU"])}
+    workers |= {"LIDAR-0": spec("LIDAR", lidar_slots)}
+    workers |= {f"OTHER-{i}": spec("OTHER", 1) for i in range(counts["OTHER"])}
+    dashboard = dashboard_port is not None
+    scheduler = {
+        "cls": Scheduler,
+        "options": {
+            "host": host,
+            "port": 0,
+            "dashboard": dashboard,
+            "dashboard_address": f"{host}:{dashboard_port}" if dashboard else None,
+        },
+    }
+    return SpecCluster(workers=workers, scheduler=scheduler, silence_logs=logging.ERROR)

@@ -1,0 +1,74 @@
+"""Where tasks really ran, reported by the tasks themselves."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from distributed import get_worker
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class TaskRecord:
+    """One task as it ran: on which worker, with which resources, and when.
+
+    `start` and `stop` are seconds since the epoch by the worker's clock; `items` is whatever
+    the task counts (scans, trials).
+    """
+
+    stage: str
+    partition: str
+    worker: str
+    resources: tuple[str, ...]
+    start: float
+    stop: float
+    items: int = 1
+
+    @property
+    def seconds(self) -> float:
+        """Time from start to stop."""
+        return self.stop - self.start
+
+    @property
+    def misplaced(self) -> bool:
+        """Whether the worker did not belong to the partition that the task was meant for."""
+        return self.partition not in self.resources
+
+
+class Recorder:
+    """Takes the time and place of the task that makes it; `done` gives the record."""
+
+    def __init__(self, stage: str, partition: str) -> None:
+        self.stage, self.partition = stage, partition
+        self.start = time.time()
+
+    def done(self, items: int = 1) -> TaskRecord:
+        """Record of the task up to now."""
+        worker = get_worker()
+        return TaskRecord(
+            stage=self.stage,
+            partition=self.partition,
+            worker=str(worker.name),
+            resources=tuple(sorted(worker.state.total_resources)),
+            start=self.start,
+            stop=time.time(),
+            items=items,
+        )
+
+
+def recorded(
+    stage: str, partition: str, function: Callable[..., T], /, *args: Any, **kwargs: Any
+) -> tuple[T, TaskRecord]:
+    """Run `function` on a worker and return its result with the record of the run."""
+    recorder = Recorder(stage, partition)
+    result = function(*args, **kwargs)
+    return result, recorder.done()
+
+
+def placement_violations(records: Iterable[TaskRecord]) -> list[TaskRecord]:
+    """Those records whose task ran outside its partition."""
+    return [record for record in records if record.misplaced]

@@ -1,0 +1,80 @@
+"""What is known of one worker; a leaf module."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+
+@dataclass(frozen=True)
+class WorkerInfo:
+    """One worker of a cluster.
+
+    Parameters
+    ----------
+    name
+        The worker's name; it stays when a nanny restarts the worker, the address does not.
+    address, host
+        Where it listens, and on which host.
+    nthreads
+        Its threads.
+    memory
+        Its memory limit in bytes, 0 for none.
+    gpus
+        UUIDs of the CUDA devices it may use, by ordinal.
+    resources
+        Dask resources that it declares, by name.
+    """
+
+    name: str
+    address: str
+    host: str
+    nthreads: int
+    memory: int = 0
+    gpus: tuple[str, ...] = ()
+    resources: Mapping[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def from_identity(
+        cls, address: str, identity: Mapping[str, Any], gpus: tuple[str, ...] = ()
+    ) -> WorkerInfo:
+        """From what the scheduler says of a worker."""
+        return cls(
+            name=str(identity["name"]),
+            address=address,
+            host=identity["host"],
+            nthreads=identity["nthreads"],
+            memory=identity["memory_limit"] or 0,
+            gpus=gpus,
+            resources=dict(identity["resources"]),
+        )
+
+
+def assign_devices(workers: Iterable[WorkerInfo]) -> dict[str, int]:
+    """Which CUDA device each worker should use, by the worker's own numbering.
+
+    Workers of one host spread over its devices. Each takes the first device in its own list
+    that the fewest others have: dask-cuda rotates `CUDA_VISIBLE_DEVICES` from worker to
+    worker so that number 0 is another device in each, whereas workers from a plain
+    `dask worker` all list the same devices in the same order.
+
+    Returns
+    -------
+    dict
+        Worker name to ordinal, for the workers that see any device.
+
+    Examples
+    --------
+    >>> one, two = (WorkerInfo(n, "", "host", 1, gpus=("a", "b")) for n in ("one", "two"))
+    >>> assign_devices([one, two])
+    {'one': 0, 'two': 1}
+    """
+    users: dict[str, int] = {}  # {device UUID: workers that have it}; UUIDs differ between hosts
+    chosen: dict[str, int] = {}
+    for worker in workers:
+        if worker.gpus:
+            ordinal = min(range(len(worker.gpus)), key=lambda i: users.get(worker.gpus[i], 0))
+            chosen[worker.name] = ordinal
+            users[worker.gpus[ordinal]] = users.get(worker.gpus[ordinal], 0) + 1
+    return chosen
