@@ -1,1 +1,16 @@
-"""Placeholder."""
+"""Closest hits of rays with triangle meshes, on CUDA, Embree or NumPy."""
+
+from .backend import BackendUnavailable
+from .caster import RayCaster
+from .hits import Hits, Returns
+from .rays import Pattern
+from .registry import available_backends
+
+__all__ = [
+    "BackendUnavailable",
+    "Hits",
+    "Pattern",
+    "RayCaster",
+    "Returns",
+    "available_backends",
+]

@@ -1,0 +1,107 @@
+"""What a ray casting engine must offer."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .hits import Hits, Returns
+from .mesh import LocalMesh
+from .rays import Pattern, Rays, rotated
+
+
+class BackendUnavailable(RuntimeError):  # noqa: N818 - a state, not a mishap
+    """The backend asked for cannot be used on this machine; the message says why."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """Closest hits of a chunk of rays, misses left out, in ray order.
+
+    Attributes
+    ----------
+    ray
+        intp (k,): number of the ray within the chunk.
+    t
+        float64 (k,): distance in local units.
+    triangle
+        int32 (k,): row of `faces`.
+    u, v
+        float64 (k,): weights of the second and third corner.
+    """
+
+    ray: NDArray[np.intp]
+    t: NDArray[np.float64]
+    triangle: NDArray[np.int32]
+    u: NDArray[np.float64]
+    v: NDArray[np.float64]
+
+
+class Backend(ABC):
+    """One engine, bound to one mesh.
+
+    A backend is made with the mesh, the most CPU threads to use (None for its own choice) and
+    the number of the CUDA device (None for the current one); each ignores what it has no use
+    for. It must offer `closest`; the rest may be overridden where the engine can do better.
+    """
+
+    name: ClassVar[str]
+    # Rays given to `closest` at a time: bounds the memory in use. A ray's result does not
+    # depend on the chunk that it is in.
+    chunk: ClassVar[int]
+
+    @classmethod
+    @abstractmethod
+    def missing(cls) -> str:
+        """Why this backend cannot be used here and what to install; "" when it can."""
+
+    def __init__(self, mesh: LocalMesh, threads: int | None, device: int | None) -> None:
+        self._mesh = mesh
+
+    @abstractmethod
+    def closest(self, rays: Rays) -> Found:
+        """Closest hits of at most `chunk` rays."""
+
+    def cast(self, rays: Rays) -> Hits:
+        """Closest hit of every ray."""
+        n = len(rays)
+        hits = Hits(np.full(n, np.inf), np.full(n, -1, np.int32), np.zeros(n), np.zeros(n))
+        for start in range(0, n, self.chunk):
+            found = self.closest(rays.part(start, start + self.chunk))
+            row = start + found.ray
+            hits.distance[row] = found.t / self._mesh.scale
+            hits.triangle[row] = found.triangle
+            hits.u[row] = found.u
+            hits.v[row] = found.v
+        return hits
+
+    def returns(self, rays: Rays) -> Returns:
+        """Closest hits of the rays that have one."""
+        ray: list[NDArray[np.int64]] = [np.zeros(0, np.int64)]
+        distance: list[NDArray[np.float64]] = [np.zeros(0)]
+        triangle: list[NDArray[np.int32]] = [np.zeros(0, np.int32)]
+        for start in range(0, len(rays), self.chunk):
+            found = self.closest(rays.part(start, start + self.chunk))
+            ray.append(found.ray + start)
+            distance.append(found.t / self._mesh.scale)
+            triangle.append(found.triangle)
+        return Returns(np.concatenate(ray), np.concatenate(distance), np.concatenate(triangle))
+
+    def scan(
+        self,
+        pattern: Pattern,
+        window: tuple[int, int],
+        origin: NDArray[np.float64],
+        rotation: NDArray[np.float64] | None,
+        interval: tuple[float, float],
+    ) -> Returns:
+        """Like `returns` for rows of a pattern, turned by `rotation`, from one origin (1, 3).
+
+        Rays are numbered from 0 at the window's start.
+        """
+        directions = rotated(pattern.directions[slice(*window)], rotation)
+        return self.returns(Rays(origin, directions, *interval))

@@ -1,0 +1,42 @@
+"""Ray casting in NumPy: the reference that works wherever Python does."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+
+from .backend import Backend, Found
+from .mesh import LocalMesh
+from .rays import Rays
+from .traverse import Walker
+from .tree import build_tree
+
+_WIDTH = 4
+_LEAF_SIZE = 2
+
+
+class NumpyBackend(Backend):
+    """Bounding volume hierarchy, walked by many rays at a time on one thread."""
+
+    name: ClassVar[str] = "numpy"
+    chunk: ClassVar[int] = 1 << 15
+
+    @classmethod
+    def missing(cls) -> str:
+        """See `Backend.missing`."""
+        return ""
+
+    def __init__(
+        self, mesh: LocalMesh, threads: int | None = None, device: int | None = None
+    ) -> None:
+        super().__init__(mesh, threads, device)
+        self._walker = Walker(mesh, build_tree(mesh.corners, _WIDTH, _LEAF_SIZE))
+
+    def closest(self, rays: Rays) -> Found:
+        """See `Backend.closest`."""
+        origins = np.broadcast_to(self._mesh.to_local(rays.origins), rays.directions.shape)
+        scale = self._mesh.scale
+        return self._walker.closest(
+            origins, rays.directions, rays.t_min * scale, rays.t_max * scale
+        )

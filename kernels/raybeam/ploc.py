@@ -1,0 +1,134 @@
+"""A binary bounding volume hierarchy by agglomeration.
+
+Parallel locally-ordered clustering, Meister and Bittner (2018): boxes are sorted along a space
+filling curve; then each looks at its neighbours in that order, and pairs that are each other's
+best partner (least area of the common box) are merged, until one is left. The trees are about
+as good as a full sweep with the surface area heuristic makes them, and every step is a few
+operations on whole arrays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+_RADIUS = 8  # neighbours looked at on either side; twice as many gain 1 to 2 % of the tree's cost
+_GRID_BITS = 21  # a coordinate; three of them fill 63 bits
+
+
+@dataclass(frozen=True)
+class BinaryTree:
+    """Nodes 0 to n-1 are the n boxes given, n to 2n-2 inner ones; the last is the root.
+
+    Attributes
+    ----------
+    low, high
+        float32 (3, 2n-1): boxes.
+    left, right
+        int32 (2n-1,): children; -1 for the boxes given.
+    rounds
+        Ranges of inner nodes that were made together: children always belong to an earlier
+        range than their parent.
+    """
+
+    low: NDArray[np.float32]
+    high: NDArray[np.float32]
+    left: NDArray[np.int32]
+    right: NDArray[np.int32]
+    rounds: tuple[tuple[int, int], ...]
+
+    @property
+    def area(self) -> NDArray[np.float32]:
+        """Half the surface of each node's box: (2n-1,)."""
+        return _half_area(self.high - self.low)
+
+
+def build(low: NDArray[np.float32], high: NDArray[np.float32]) -> BinaryTree:
+    """Build a tree over n boxes, n at least 1.
+
+    Parameters
+    ----------
+    low, high
+        float32 (3, n): least and greatest coordinates, within [-2, 2].
+    """
+    n = low.shape[1]
+    order = np.argsort(_morton(low, high), kind="stable").astype(np.int32)
+    all_low, all_high = np.empty((2, 3, 2 * n - 1), np.float32)
+    all_low[:, :n], all_high[:, :n] = low, high
+    left, right = np.full((2, 2 * n - 1), -1, np.int32)
+    low, high, ids = low[:, order], high[:, order], order
+    rounds: list[tuple[int, int]] = []
+    made = n
+    while len(ids) > 1:
+        first, second = _partners(low, high)
+        new = np.arange(made, made + len(first), dtype=np.int32)
+        rounds.append((made, made + len(first)))
+        made += len(first)
+        left[new], right[new] = ids[first], ids[second]
+        low[:, first] = np.minimum(low[:, first], low[:, second])
+        high[:, first] = np.maximum(high[:, first], high[:, second])
+        all_low[:, new], all_high[:, new] = low[:, first], high[:, first]
+        ids[first] = new
+        stay = np.ones(len(ids), np.bool_)
+        stay[second] = False
+        low, high, ids = low[:, stay], high[:, stay], ids[stay]
+    return BinaryTree(all_low, all_high, left, right, tuple(rounds))
+
+
+def _partners(
+    low: NDArray[np.float32], high: NDArray[np.float32]
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Pairs of positions that are each other's nearest, the lower one first."""
+    n = low.shape[1]
+    here = np.arange(n)
+    # Where all candidates are equally good, as among copies of one triangle, partners must still
+    # find each other: start from the pairs (0, 1), (2, 3), ... and leave them only for a better.
+    best = np.minimum(here ^ 1, n - 1)
+    cost = np.full(n, np.inf, np.float32)
+    even = here[: n - 1 : 2]
+    cost[even] = _half_area(
+        np.maximum(high[:, even], high[:, even + 1]) - np.minimum(low[:, even], low[:, even + 1])
+    )
+    cost[even + 1] = cost[even]
+    for step in range(1, min(_RADIUS, n - 1) + 1):
+        area = _half_area(
+            np.maximum(high[:, :-step], high[:, step:]) - np.minimum(low[:, :-step], low[:, step:])
+        )
+        for mine, other in ((here[:-step], here[step:]), (here[step:], here[:-step])):
+            less = area < cost[mine]
+            cost[mine[less]] = area[less]
+            best[mine[less]] = other[less]
+    first = np.flatnonzero((best[best] == here) & (here < best))
+    if 16 * len(first) < n:  # long chains of ever better partners: do not merge one by one
+        first = even
+        return first, first + 1
+    return first, best[first]
+
+
+def _half_area(size: NDArray[np.float32]) -> NDArray[np.float32]:
+    x, y, z = size
+    return x * y + y * z + z * x
+
+
+def _morton(low: NDArray[np.float32], high: NDArray[np.float32]) -> NDArray[np.uint64]:
+    """Position of each box's middle along a Z-order curve."""
+    middle = low.astype(np.float64) + high
+    start = middle.min(axis=1, keepdims=True)
+    extent = float((middle - start).max()) or 1.0
+    cell = ((middle - start) * ((2**_GRID_BITS - 1) / extent)).astype(np.uint64)
+    return _spread(cell[0]) << np.uint64(2) | _spread(cell[1]) << np.uint64(1) | _spread(cell[2])
+
+
+def _spread(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Two zero bits after each of the 21 lowest bits."""
+    for shift, mask in (
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ):
+        bits = (bits | bits << np.uint64(shift)) & np.uint64(mask)
+    return bits

@@ -1,0 +1,194 @@
+"""Rays as they come from the caller: checked, in float64, with unit directions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+# A squared length this close to 1 is a unit vector up to rounding and is left as it is, so that
+# directions which are normalised already are not moved by another last bit.
+_UNIT_SLACK = 1e-14
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Rays that have been checked.
+
+    Attributes
+    ----------
+    origins
+        float64 (n, 3), or (1, 3) when all rays share one, metres.
+    directions
+        float64 (n, 3), unit vectors.
+    t_min, t_max
+        Hits nearer or farther than this are not reported, metres; both ends count.
+    """
+
+    origins: NDArray[np.float64]
+    directions: NDArray[np.float64]
+    t_min: float
+    t_max: float
+
+    def __len__(self) -> int:
+        return len(self.directions)
+
+    def part(self, start: int, stop: int) -> Rays:
+        """Rays `start` to `stop`, without copying."""
+        origins = self.origins if len(self.origins) == 1 else self.origins[start:stop]
+        return Rays(origins, self.directions[start:stop], self.t_min, self.t_max)
+
+
+class Pattern:
+    """Directions that are cast many times, for example one revolution of a lidar.
+
+    They are checked and normalised once; a backend may keep its own copy where it computes.
+
+    Parameters
+    ----------
+    directions
+        (n, 3), any length but zero, in the sensor's axes.
+
+    Raises
+    ------
+    ValueError
+        For a wrong shape, or a direction that is zero or not finite.
+    """
+
+    def __init__(self, directions: ArrayLike) -> None:
+        self.directions = unit_directions(directions).copy()
+        self.directions.flags.writeable = False
+
+    def __len__(self) -> int:
+        return len(self.directions)
+
+    def __repr__(self) -> str:
+        return f"Pattern({len(self)} directions)"
+
+    def window(self, start: int, stop: int) -> tuple[int, int]:
+        """Check a half-open range of rows; raises ValueError when it is not one."""
+        if not 0 <= start <= stop <= len(self):
+            raise ValueError(
+                f"Rows {start} to {stop} are not within the pattern's {len(self)} directions."
+            )
+        return start, stop
+
+
+def check_rays(origins: ArrayLike, directions: ArrayLike, t_min: float, t_max: float) -> Rays:
+    """Rays in float64 with unit directions; raises ValueError for those that are none.
+
+    Parameters
+    ----------
+    origins
+        (3,) or (n, 3), metres.
+    directions
+        (n, 3), or (3,) for a single ray.
+    t_min, t_max
+        Metres, ``0 <= t_min <= t_max``.
+    """
+    unit = unit_directions(directions)
+    return Rays(check_origins(origins, len(unit)), unit, *check_interval(t_min, t_max))
+
+
+def check_origins(origins: ArrayLike, rays: int) -> NDArray[np.float64]:
+    """Origins as float64, one or one a ray; raises ValueError for what is neither."""
+    start = _table("origins", origins)
+    if len(start) not in (1, rays):
+        raise ValueError(
+            f"There are {len(start)} origins and {rays} directions: "
+            "give one origin for all rays, or one for each."
+        )
+    _refuse("Origin", start, np.isfinite(start), "finite coordinates")
+    return start
+
+
+def check_interval(t_min: float, t_max: float) -> tuple[float, float]:
+    """`t_min` and `t_max` as floats; raises ValueError unless ``0 <= t_min <= t_max``."""
+    t_min, t_max = float(t_min), float(t_max)
+    if not (0 <= t_min < np.inf and t_min <= t_max):
+        raise ValueError(
+            f"t_min is {t_min} and t_max {t_max}: distances must be finite, at least 0, "
+            "and t_max not less than t_min (inf for no limit)."
+        )
+    return t_min, t_max
+
+
+def unit_directions(directions: ArrayLike) -> NDArray[np.float64]:
+    """Directions as float64 unit vectors (n, 3); raises ValueError for zero, NaN and inf.
+
+    Each row's result depends on that row alone, so that batches may be cut anywhere.
+    """
+    table = _table("directions", directions)
+    x, y, z = table.T
+    # The order of these operations is the same in intersect.cu. No einsum or norm: those may
+    # fuse multiply and add, and then the last bit would depend on the machine.
+    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+        squared = (x * x + y * y) + z * z
+    off = np.abs(squared - 1) > _UNIT_SLACK
+    if not off.any() and not np.isnan(squared).any():
+        return table
+    _refuse(
+        "Direction",
+        table,
+        np.isfinite(table) & table.any(axis=1, keepdims=True),
+        "a finite vector that is not zero",
+    )
+    rows = table[off]
+    rows = rows / np.abs(rows).max(axis=1, keepdims=True)  # squares of 1e200 or 1e-200 are lost
+    x, y, z = rows.T
+    out = table.copy()
+    out[off] = rows / np.sqrt((x * x + y * y) + z * z)[:, None]
+    return out
+
+
+def rotated(
+    directions: NDArray[np.float64], rotation: NDArray[np.float64] | None
+) -> NDArray[np.float64]:
+    """Directions (n, 3) turned by a rotation matrix (3, 3), with one fixed order of rounding.
+
+    ``directions @ rotation.T`` would do, but its last bit depends on the machine's BLAS.
+    """
+    if rotation is None:
+        return directions
+    x, y, z = directions.T
+    out = np.empty_like(directions)
+    for axis, (a, b, c) in enumerate(rotation):
+        out[:, axis] = (x * a + y * b) + z * c
+    return out
+
+
+def check_rotation(rotation: ArrayLike | None) -> NDArray[np.float64] | None:
+    """Return a rotation matrix in float64; raises ValueError when it is not orthonormal."""
+    if rotation is None:
+        return None
+    matrix = np.asarray(rotation, dtype=np.float64)
+    if matrix.shape != (3, 3) or not np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-9):
+        raise ValueError(
+            "rotation must be a (3, 3) matrix with orthonormal rows (sensor to scene axes), "
+            f"not {np.asarray(rotation).tolist()}."
+        )
+    return matrix
+
+
+def _table(name: str, values: ArrayLike) -> NDArray[np.float64]:
+    """Values as float64 (n, 3); a single (3,) becomes one row."""
+    given = np.asarray(values)
+    if given.dtype.kind not in "fiu":
+        raise ValueError(f"{name} must be real numbers, not {given.dtype}.")
+    if given.ndim == 1 and given.shape == (3,):
+        given = given[None, :]
+    if given.ndim != 2 or given.shape[1] != 3:
+        raise ValueError(f"{name} must have the shape (n, 3) or (3,), not {given.shape}.")
+    return np.ascontiguousarray(given, dtype=np.float64)
+
+
+def _refuse(what: str, table: NDArray[np.float64], good: NDArray[np.bool_], expected: str) -> None:
+    """Raise ValueError for the first row that is not good in all its columns."""
+    if good.all():
+        return
+    bad = np.flatnonzero(~good.all(axis=1))
+    raise ValueError(
+        f"{what} {bad[0]} is {table[bad[0]].tolist()}: expected {expected} "
+        f"({len(bad)} of {len(table)} rows are like that)."
+    )

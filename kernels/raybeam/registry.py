@@ -1,0 +1,45 @@
+"""Which engines there are, and choosing one."""
+
+from __future__ import annotations
+
+from .backend import Backend, BackendUnavailable
+from .cuda_backend import CudaBackend
+from .embree_backend import EmbreeBackend
+from .numpy_backend import NumpyBackend
+
+# In the order in which "auto" tries them. A new backend is added here and nowhere else.
+_BACKENDS: tuple[type[Backend], ...] = (CudaBackend, EmbreeBackend, NumpyBackend)
+
+
+def available_backends() -> dict[str, str]:
+    """Backends by name, fastest first: "" for one that can be used here, else why not.
+
+    Examples
+    --------
+    >>> available_backends()["numpy"]
+    ''
+    """
+    return {backend.name: backend.missing() for backend in _BACKENDS}
+
+
+def choose(name: str) -> type[Backend]:
+    """Return the backend of that name, or for "auto" the first that can be used.
+
+    Raises
+    ------
+    ValueError
+        If there is no backend of that name.
+    BackendUnavailable
+        If it cannot be used on this machine.
+    """
+    if name == "auto":
+        return next(backend for backend in _BACKENDS if not backend.missing())
+    by_name = {backend.name: backend for backend in _BACKENDS}
+    if name not in by_name:
+        raise ValueError(f"There is no backend {name!r}: use auto, {', '.join(by_name)}.")
+    reason = by_name[name].missing()
+    if reason:
+        raise BackendUnavailable(
+            f"Backend {name!r} cannot be used here: {reason}. Backend 'auto' takes what works."
+        )
+    return by_name[name]

@@ -1,0 +1,185 @@
+"""Many rays walking a wide tree together, in NumPy.
+
+The unit of work is a pair of a ray and a node. A block of pairs is tested against the children's
+boxes in float32; pairs of a ray and an inner child make new blocks, pairs with a leaf are tested
+against its triangles. Blocks are taken last in, first out and are limited in size, so memory
+stays bounded whatever the scene, and hits found early spare later blocks the search behind them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import triangle as exact
+from .backend import Found
+from .clip import TINY, clip
+from .mesh import LocalMesh
+from .tree import LEAF_BITS, PAD, WideTree
+
+Float = NDArray[np.float64]
+Single = NDArray[np.float32]
+Index = NDArray[np.intp]
+
+_BLOCK = 1 << 14  # pairs: the arrays of one step stay within a few hundred kilobytes
+_SLACK = 2.0**-20  # on limits of distance in float32: far more than their rounding
+
+
+@dataclass
+class _Best:
+    """Closest hits so far: local distance, row of `faces`, weights; one entry a ray."""
+
+    t: Float
+    triangle: NDArray[np.int32]
+    u: Float
+    v: Float
+
+
+@dataclass(frozen=True)
+class _Bundle:
+    """Rays ready to walk, in local coordinates.
+
+    Attributes
+    ----------
+    entry
+        float64 (n,): where the ray enters the scene's box, 0 when it starts inside. The float32
+        part starts there, so that its rounding errors do not grow with the ray's way to the
+        scene.
+    scaled_origin, inverse
+        float32 (3, n): ``origin / direction`` and ``1 / direction``.
+    near
+        intp (3, n): 1 where the ray meets the upper plane of a box first, else 0.
+    limit
+        float32 (n,): no hit farther than this from `entry` is of use; shrinks.
+    sheared
+        The rays for the exact test.
+    """
+
+    entry: Float
+    scaled_origin: Single
+    inverse: Single
+    near: Index
+    limit: Single
+    sheared: exact.ShearedRays
+
+
+class Walker:
+    """Finds closest hits in a tree over a mesh."""
+
+    def __init__(self, mesh: LocalMesh, tree: WideTree) -> None:
+        nodes, _, self._width = tree.low.shape
+        self._nodes = nodes
+        # planes[axis]: lower planes of all nodes, then upper ones: row node + side * nodes
+        self._planes = [
+            np.concatenate([tree.low[:, axis], tree.high[:, axis]]) for axis in range(3)
+        ]
+        self._child = tree.child.astype(np.intp)
+        self._corners = np.ascontiguousarray(mesh.corners[tree.order])
+        self._face = mesh.index[tree.order]
+        low, high = mesh.box
+        self._low, self._high = low - PAD, high + PAD
+
+    def closest(self, origins: Float, directions: Float, t_min: float, t_max: float) -> Found:
+        """Closest hits with ``t_min <= t <= t_max``; all lengths are local.
+
+        Parameters
+        ----------
+        origins, directions
+            float64 (n, 3).
+        """
+        entry, leave = clip(self._low, self._high, origins, directions)
+        row = np.flatnonzero((entry <= leave) & (entry <= t_max + PAD) & (leave >= t_min - PAD))
+        best = _Best(
+            np.full(len(row), t_max),
+            np.full(len(row), -1, np.int32),
+            np.zeros(len(row)),
+            np.zeros(len(row)),
+        )
+        if len(row):
+            rays = _bundle(origins[row], directions[row], entry[row], t_max)
+            self._walk(rays, best, t_min)
+        hit = best.triangle >= 0
+        return Found(row[hit], best.t[hit], best.triangle[hit], best.u[hit], best.v[hit])
+
+    def _walk(self, rays: _Bundle, best: _Best, t_min: float) -> None:
+        n = len(rays.entry)
+        blocks: list[tuple[Index, Index]] = [(np.arange(n), np.zeros(n, np.intp))]
+        while blocks:
+            ray, node = blocks.pop()
+            if len(ray) > _BLOCK:
+                blocks.append((ray[_BLOCK:], node[_BLOCK:]))
+                ray, node = ray[:_BLOCK], node[:_BLOCK]
+            met = np.flatnonzero(self._meets(rays, ray, node))
+            child = self._child.take(node, axis=0).reshape(-1).take(met)
+            ray = ray.take(met // self._width)
+            inner = child >= 0
+            leaf = ~inner
+            self._test(rays, best, t_min, ray[leaf], ~child[leaf])
+            if inner.any():
+                blocks.append((ray[inner], child[inner]))
+
+    def _meets(self, rays: _Bundle, ray: Index, node: Index) -> NDArray[np.bool_]:
+        """Which children's boxes each ray meets before its limit: (m * width,)."""
+        enter = np.zeros((len(ray), self._width), np.float32)
+        leave = np.empty_like(enter)
+        leave[:] = rays.limit.take(ray)[:, None]
+        for axis, planes in enumerate(self._planes):
+            side = rays.near[axis].take(ray)
+            inverse = rays.inverse[axis].take(ray)[:, None]
+            shift = rays.scaled_origin[axis].take(ray)[:, None]
+            near = planes.take(node + side * self._nodes, axis=0)
+            near *= inverse
+            near -= shift
+            np.maximum(enter, near, out=enter)
+            far = planes.take(node + (1 - side) * self._nodes, axis=0)
+            far *= inverse
+            far -= shift
+            np.minimum(leave, far, out=leave)
+        return (enter <= leave).reshape(-1)
+
+    def _test(self, rays: _Bundle, best: _Best, t_min: float, ray: Index, leaf: Index) -> None:
+        """Test rays against the triangles of leaves and keep what is closer."""
+        if not len(ray):
+            return
+        count = (leaf & ((1 << LEAF_BITS) - 1)) + 1
+        first = leaf >> LEAF_BITS
+        ray = np.repeat(ray, count)
+        step = np.arange(len(ray)) - np.repeat(np.cumsum(count) - count, count)
+        place = np.repeat(first, count) + step
+        a, b, c, det, t = exact.intersect(rays.sheared, ray, self._corners, place)
+        ok = np.flatnonzero(exact.inside(a, b, c, det) & (t >= t_min) & (t <= best.t.take(ray)))
+        if not len(ok):
+            return
+        ray, face, t = ray[ok], self._face[place[ok]], t[ok]
+        order = np.lexsort((face, t, ray))
+        order = order[np.diff(ray[order], prepend=-1) != 0]  # the closest of each ray
+        ray, face, t = ray[order], face[order], t[order]
+        old = best.triangle[ray]
+        # Of equals the lowest row wins; a ray without a hit yet has t_max, which counts as well.
+        better = (t < best.t[ray]) | (old < 0) | (face < old)
+        ray, ok = ray[better], ok[order][better]
+        best.t[ray], best.triangle[ray] = t[better], face[better]
+        best.u[ray], best.v[ray] = b[ok] / det[ok], c[ok] / det[ok]
+        rays.limit[ray] = _limit(best.t[ray], rays.entry[ray])
+
+
+def _bundle(origins: Float, directions: Float, entry: Float, t_max: float) -> _Bundle:
+    start = (origins + entry[:, None] * directions).T.astype(np.float32)
+    along = directions.T.astype(np.float32)
+    along = np.where(np.abs(along) < TINY, np.copysign(np.float32(TINY), along), along)
+    inverse = np.float32(1) / along
+    return _Bundle(
+        entry,
+        start * inverse,
+        inverse,
+        (along < 0).astype(np.intp),
+        _limit(np.full(len(entry), t_max), entry),
+        exact.shear(origins, directions),
+    )
+
+
+def _limit(t: Float, entry: Float) -> Single:
+    """Distances from `entry` in float32, never less than the exact ones."""
+    return ((t - entry) * (1 + _SLACK) + _SLACK).astype(np.float32)

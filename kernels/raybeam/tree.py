@@ -1,0 +1,153 @@
+"""The tree that rays walk: a binary hierarchy made wide and flat.
+
+Boxes are rounded and padded outwards, so that a test of a ray against them in float32 never
+loses a triangle that the ray meets in exact arithmetic:
+
+With u = 2**-24, local coordinates and origins within [-1, 1] and unit directions, a plane's
+parameter is computed from an origin that is off by u, a reciprocal direction that is off by 2u
+relative, and with up to three more roundings of values up to 2. Expressed as a shift of the
+plane that is at most 12 u. Boxes are padded by 20 u, of which storing them in float32 takes
+at most u.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import ploc
+
+PAD = 20 * 2.0**-24  # local units
+LEAF_BITS = 3
+MAX_LEAF = 1 << LEAF_BITS
+
+
+@dataclass(frozen=True)
+class WideTree:
+    """Nodes with up to `width` children each; node 0 is the root.
+
+    Attributes
+    ----------
+    low, high
+        float32 (m, 3, width): the children's boxes, padded by `PAD`; an empty place holds a
+        box turned inside out, which no ray meets.
+    child
+        int32 (m, width): number of a node, or ``~(first << LEAF_BITS | count - 1)`` for a leaf
+        that holds the triangles ``order[first : first + count]``; 0 in an empty place.
+    order
+        int32 (k,): triangles in the order of the leaves.
+    """
+
+    low: NDArray[np.float32]
+    high: NDArray[np.float32]
+    child: NDArray[np.int32]
+    order: NDArray[np.int32]
+
+
+def build_tree(corners: NDArray[np.float64], width: int, leaf_size: int) -> WideTree:
+    """Build a tree over triangles.
+
+    Parameters
+    ----------
+    corners
+        float64 (k, 3, 3): local corners; k may be 0.
+    width
+        Most children of a node.
+    leaf_size
+        Most triangles of a leaf, at most `MAX_LEAF`.
+    """
+    if not len(corners):
+        empty = np.full((1, 3, width), np.inf, np.float32)
+        return WideTree(empty, -empty, np.zeros((1, width), np.int32), np.zeros(0, np.int32))
+    low = np.ascontiguousarray((corners.min(axis=1) - PAD).T.astype(np.float32))
+    high = np.ascontiguousarray((corners.max(axis=1) + PAD).T.astype(np.float32))
+    binary = ploc.build(low, high)
+    count, leaf = _leaves(binary, leaf_size)
+    first = _positions(binary, count)
+    n = len(corners)
+    order = np.empty(n, np.int32)
+    order[first[:n]] = np.arange(n, dtype=np.int32)
+    code = np.where(leaf, ~(first << LEAF_BITS | (count - 1)), 0).astype(np.int32)
+    return _widen(binary, leaf, code, order, width)
+
+
+def _leaves(tree: ploc.BinaryTree, leaf_size: int) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
+    """Triangles under each node, and the nodes that are better kept as one leaf.
+
+    By the surface area heuristic, a triangle test taken to cost as much as a box test.
+    """
+    n = (len(tree.left) + 1) // 2
+    area = tree.area
+    count = np.ones(len(area), np.int32)
+    cost = area.copy()
+    leaf = np.ones(len(area), np.bool_)
+    for start, stop in tree.rounds:
+        left, right = tree.left[start:stop], tree.right[start:stop]
+        count[start:stop] = count[left] + count[right]
+        whole = area[start:stop] * count[start:stop]
+        split = area[start:stop] + cost[left] + cost[right]
+        keep = (count[start:stop] <= leaf_size) & (whole <= split)
+        leaf[start:stop] = keep
+        cost[start:stop] = np.where(keep, whole, split)
+    assert leaf[:n].all()
+    return count, leaf
+
+
+def _positions(tree: ploc.BinaryTree, count: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Where each node's triangles begin when they are listed from left to right."""
+    first = np.zeros(len(count), np.int32)
+    for start, stop in reversed(tree.rounds):
+        left, right = tree.left[start:stop], tree.right[start:stop]
+        first[left] = first[start:stop]
+        first[right] = first[start:stop] + count[left]
+    return first
+
+
+def _widen(
+    tree: ploc.BinaryTree,
+    leaf: NDArray[np.bool_],
+    code: NDArray[np.int32],
+    order: NDArray[np.int32],
+    width: int,
+) -> WideTree:
+    """Nodes of up to `width` children: level by level, the largest child is opened first."""
+    area = np.where(leaf, -1, tree.area)
+    lows, highs, children = [], [], []
+    roots = np.array([len(leaf) - 1])
+    total = 1
+    while len(roots):
+        slots = _open(tree, area, roots, width)
+        used = slots >= 0
+        lows.append(np.where(used, tree.low[:, slots], np.inf).astype(np.float32))
+        highs.append(np.where(used, tree.high[:, slots], -np.inf).astype(np.float32))
+        inner = used & ~leaf[slots]
+        child = np.where(used, code[slots], 0).astype(np.int32)
+        roots = slots[inner]
+        child[inner] = np.arange(total, total + len(roots), dtype=np.int32)
+        total += len(roots)
+        children.append(child)
+    low = np.concatenate(lows, axis=1).transpose(1, 0, 2)
+    high = np.concatenate(highs, axis=1).transpose(1, 0, 2)
+    return WideTree(
+        np.ascontiguousarray(low), np.ascontiguousarray(high), np.concatenate(children), order
+    )
+
+
+def _open(
+    tree: ploc.BinaryTree, area: NDArray[np.float32], roots: NDArray[np.intp], width: int
+) -> NDArray[np.intp]:
+    """Binary nodes below each root, at most `width`; -1 fills up: (len(roots), width)."""
+    slots = np.full((len(roots), width), -1)
+    slots[:, 0] = roots
+    row = np.arange(len(roots))
+    for free in range(1, width):
+        size = np.where(slots >= 0, area[slots], -1)
+        widest = np.argmax(size, axis=1)
+        can = size[row, widest] > 0
+        rows, places = row[can], widest[can]
+        opened = slots[rows, places]
+        slots[rows, places] = tree.left[opened]
+        slots[rows, free] = tree.right[opened]
+    return slots
