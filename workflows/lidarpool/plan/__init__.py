@@ -1,1 +1,16 @@
-"""Placeholder."""
+"""Path planning: particle swarms look for a short way around discs in the plane."""
+
+from .plan import Plan, best
+from .planning import Planning
+from .tangents import shortest_path_length
+from .trial import Trial, TrialCancelledError, run_trial
+
+__all__ = [
+    "Plan",
+    "Planning",
+    "Trial",
+    "TrialCancelledError",
+    "best",
+    "run_trial",
+    "shortest_path_length",
+]

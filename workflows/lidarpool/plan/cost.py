@@ -1,0 +1,173 @@
+"""What a path costs: its length, and a price on entering discs that no short cut is worth.
+
+Everything here is made to be evaluated hundreds of thousands of times a second by one thread:
+single precision, the particles along the last, contiguous axis, every result written into a
+buffer made beforehand. Only + - x / and square roots are used, and sums run over leading axes
+only, so that the order of additions is ours: the same numbers on every machine.
+"""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .geometry import Floats
+
+Singles: TypeAlias = NDArray[np.float32]
+
+# Discs are made larger by this share of their distance and size: some 30 rounding errors of
+# single precision, so that a path which passes here also passes the exact check.
+_MARGIN = 4e-6
+_SLOPE = 8.0  # price of a depth of 1; a waypoint pushed 1 into a disc shortens the path by < 2
+_TOUCH = np.float32(1e-5)  # price below which an entry is a rounding error, well under _MARGIN
+_NOTHING = np.float32(1e-15)  # added to steps, so that one of length 0 has a direction too
+_BLOCK_ELEMENTS = 40_000  # of each buffer: three of them stay in a second-level cache
+
+
+class PathCost:
+    """The cost of many paths between the same two ends, in the coordinates of `Frame`.
+
+    A path that enters no disc costs its length. One that does costs, on top, more than any
+    detour around all discs is long, and `_SLOPE` to twice that for each unit of depth in each
+    disc: it never beats a path that is free, and its way out leads downhill.
+
+    Parameters
+    ----------
+    centres, radii
+        The discs, in the frame's coordinates: (m, 2) and (m,).
+    waypoints
+        Corners of each path between the two ends.
+    particles
+        Number of paths.
+
+    Attributes
+    ----------
+    waypoints : float32 (waypoints, 2, particles)
+        The paths, contiguous. Write to it, then call `evaluate`.
+    entry_price : float
+        The fixed part of the price of entering discs.
+    """
+
+    def __init__(self, centres: Floats, radii: Floats, waypoints: int, particles: int) -> None:
+        self._points = np.zeros((waypoints + 2, 2, particles), np.float32)
+        self._points[0, 0], self._points[-1, 0] = -0.5, 0.5
+        self.waypoints: Singles = self._points[1:-1]
+        # The boundaries of all discs together are at least as long as any way around them.
+        self.entry_price = 2.0 + 2 * np.pi * float(radii.sum())
+        self._cost = np.empty(particles, np.float32)
+        discs, segments = len(radii), waypoints + 1
+        count = -(-particles * discs * segments // _BLOCK_ELEMENTS)  # rounded up
+        width = -(-particles // max(1, count))
+        self._blocks = [slice(at, at + width) for at in range(0, particles, width)]
+        self._work = _Workspace(_grown(centres, radii), centres, segments, width)
+
+    def evaluate(self) -> Singles:
+        """Costs of the paths in `waypoints`: (particles,), the same buffer at every call."""
+        for block in self._blocks:
+            self._work.evaluate(self._points[..., block], self._cost[block], self.entry_price)
+        return self._cost
+
+
+def _grown(centres: Floats, radii: Floats) -> Floats:
+    """Radii with a margin for rounding, which does not reach either end of the path."""
+    distance = np.sqrt(centres[:, 0] ** 2 + centres[:, 1] ** 2)
+    to_ends = [np.sqrt((centres[:, 0] - x) ** 2 + centres[:, 1] ** 2) for x in (-0.5, 0.5)]
+    nearest = np.maximum(np.minimum(*to_ends), radii)
+    return np.asarray(np.minimum(radii + _MARGIN * (1 + distance + radii), nearest))
+
+
+class _Workspace:
+    """Buffers for a block of paths, and the arithmetic on them.
+
+    For a segment with unit direction e, middle M and half length h, and a disc around C, let
+    u = (C - M) · e and c = (C - M) x e. The point of the segment closest to C is
+    √(c² + max(|u| - h, 0)²) away. All lengths are doubled here (2C, 2M = the sum of both ends,
+    2h = the length), which saves the halving; max(|u| - h, 0) = |u| - min(|u|, h), since NumPy
+    has a vectorised minimum of two arrays, and none of an array and a number.
+
+    Axes are (disc, segment, particle): the last two of each factor are contiguous, so that a
+    product with a disc's coordinate is one long loop.
+    """
+
+    def __init__(self, radii: Floats, centres: Floats, segments: int, width: int) -> None:
+        def singles(*shape: int) -> Singles:
+            return np.empty(shape, np.float32)
+
+        doubled = (2 * centres).astype(np.float32)
+        self._x, self._y = doubled[:, 0, None, None], doubled[:, 1, None, None]
+        squared = (4 * radii**2).astype(np.float32)
+        self._squared_radii = np.repeat(squared[:, None], width, axis=1)  # (disc, particle)
+        self._weights = (_SLOPE / (4 * radii)).astype(np.float32)[:, None]
+        discs = len(radii)
+        self._pairs = [singles(2, segments, width) for _ in range(3)]  # first axis: x, y
+        self._length = singles(segments, width)
+        self._wide = [singles(discs, segments, width) for _ in range(3)]
+        self._nearest = singles(discs, width)
+        self._price, self._entered = singles(width), np.empty(width, np.bool_)
+
+    def evaluate(self, points: Singles, cost: Singles, entry_price: float) -> None:
+        """Write to `cost`, (w,), what the paths through `points`, (k + 2, 2, w), cost."""
+        width = points.shape[-1]
+        direction, middle, scratch = (pair[..., :width] for pair in self._pairs)
+        length = self._length[:, :width]
+        first, last = points[:-1].transpose(1, 0, 2), points[1:].transpose(1, 0, 2)
+        np.subtract(last, first, out=direction)
+        np.add(direction[0], _NOTHING, out=direction[0])
+        np.square(direction, out=scratch)
+        np.add(scratch[0], scratch[1], out=length)
+        np.sqrt(length, out=length)
+        np.add.reduce(length, axis=0, out=cost)
+        if not len(self._nearest):
+            return
+        np.divide(direction, length, out=direction)
+        np.add(last, first, out=middle)
+        self._measure(direction, middle, scratch, length)
+        self._charge(cost, entry_price)
+
+    def _measure(
+        self, direction: Singles, middle: Singles, scratch: Singles, length: Singles
+    ) -> None:
+        """Write to `_nearest` the squared distance, times 4, of each path to each disc."""
+        width = length.shape[-1]
+        along, across, spare = (wide[..., :width] for wide in self._wide)
+        (east, north), offset = direction, scratch[0]
+
+        np.multiply(self._x, east, out=along)
+        np.multiply(self._y, north, out=spare)
+        np.add(along, spare, out=along)
+        np.multiply(middle, direction, out=scratch)
+        np.add(scratch[0], scratch[1], out=offset)
+        np.subtract(along, offset, out=along)
+
+        np.multiply(self._x, north, out=across)
+        np.multiply(self._y, east, out=spare)
+        np.subtract(across, spare, out=across)
+        np.multiply(middle, direction[::-1], out=scratch)
+        np.subtract(scratch[0], scratch[1], out=offset)
+        np.subtract(across, offset, out=across)
+
+        np.abs(along, out=along)
+        np.minimum(along, length, out=spare)
+        np.subtract(along, spare, out=along)
+        np.square(along, out=along)
+        np.square(across, out=across)
+        np.add(along, across, out=along)
+        np.minimum.reduce(along, axis=1, out=self._nearest[:, :width])
+
+    def _charge(self, cost: Singles, entry_price: float) -> None:
+        """Add to `cost` the price of entering discs, from `_nearest`."""
+        width = len(cost)
+        nearest, price, entered = self._nearest, self._price, self._entered
+        nearest, price, entered = nearest[:, :width], price[:width], entered[:width]
+        squared_radii = self._squared_radii[:, :width]
+        # (r² - d²) / r lies between the depth and twice the depth
+        np.minimum(nearest, squared_radii, out=nearest)
+        np.subtract(squared_radii, nearest, out=nearest)
+        np.multiply(nearest, self._weights, out=nearest)
+        np.add.reduce(nearest, axis=0, out=price)
+        np.greater(price, _TOUCH, out=entered)
+        np.add(cost, price, out=cost)
+        np.multiply(entered, np.float32(entry_price), out=price)
+        np.add(cost, price, out=cost)

@@ -1,0 +1,150 @@
+"""What is to be planned: two ends, the discs between them, and how hard to search."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from numbers import Integral
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..errors import LidarpoolError
+from .geometry import Floats, segment_distances
+
+
+@dataclass(frozen=True, eq=False)
+class Planning:
+    """A path to be found in the plane, from `start` to `target`, that enters no disc.
+
+    It is searched by `trials` particle swarms that know nothing of each other; see `run_trial`.
+
+    Parameters
+    ----------
+    start, target
+        x and y of either end, in metres.
+    centres
+        Centres of the discs to keep out of: (m, 2), metres; m may be 0.
+    radii
+        Their radii in metres, above 0: (m,), or one number for all.
+    trials
+        Swarms to run, each with a seed of its own.
+    particles
+        Particles of a swarm; each is one path.
+    iterations
+        Times that the particles of a swarm move.
+    waypoints
+        Corners of a path between its two ends. A path can turn about so many discs; more of
+        them cost time in proportion and converge more slowly.
+    seed
+        0 or above. The same seed gives the same plan, to the bit, wherever the trials run.
+
+    Raises
+    ------
+    LidarpoolError
+        If an end lies within a disc, both ends are the same point, or a value is outside its
+        range.
+
+    Examples
+    --------
+    >>> planning = Planning((0, 0), (10, 0), centres=[(5, 0)], radii=2.0)
+    >>> planning.radii
+    array([2.])
+    """
+
+    start: tuple[float, float] = (25.0, 25.0)
+    target: tuple[float, float] = (-30.0, -20.0)
+    centres: Floats = field(default_factory=lambda: np.empty((0, 2)))  # (m, 2), metres
+    radii: Floats = field(default_factory=lambda: np.empty(0))  # (m,), metres
+    trials: int = 100
+    particles: int = 1000
+    iterations: int = 300
+    waypoints: int = 5
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("trials", "particles", "iterations", "waypoints"):
+            _check_count(name, getattr(self, name), least=1)
+        _check_count("seed", self.seed, least=0)
+        start, target = (_point(name, getattr(self, name)) for name in ("start", "target"))
+        if start == target:
+            raise LidarpoolError(
+                f"start and target of the path are both {start}: there is nothing to plan. "
+                "Move one of them."
+            )
+        centres, radii = _discs(self.centres, self.radii)
+        _check_outside({"start": start, "target": target}, centres, radii)
+        for name, value in (
+            ("start", start), ("target", target), ("centres", centres), ("radii", radii)
+        ):  # fmt: skip
+            object.__setattr__(self, name, value)
+
+    def __repr__(self) -> str:
+        return (
+            f"Planning({self.start} to {self.target} around {len(self.radii)} discs, "
+            f"{self.trials} trials of {self.particles} particles x {self.iterations} iterations, "
+            f"seed {self.seed})"
+        )
+
+
+def _check_count(name: str, value: Any, least: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
+        raise LidarpoolError(
+            f"planning: {name} is {value!r}; it must be a whole number, at least {least}."
+        )
+
+
+def _point(name: str, value: ArrayLike) -> tuple[float, float]:
+    numbers = _floats(name, value)
+    if numbers.shape != (2,):
+        raise LidarpoolError(f"planning: {name} is {value!r}; it must be two finite numbers, x, y.")
+    return float(numbers[0]), float(numbers[1])
+
+
+def _discs(centres: ArrayLike, radii: ArrayLike) -> tuple[Floats, Floats]:
+    where = _floats("centres", centres)
+    where = where.reshape(0, 2) if where.size == 0 else where
+    if where.ndim != 2 or where.shape[1] != 2:
+        raise LidarpoolError(
+            f"planning: centres have shape {where.shape}; one x and y for each disc is expected, "
+            "(m, 2)."
+        )
+    widths = _floats("radii", radii)
+    if widths.shape not in ((), (len(where),)):
+        raise LidarpoolError(
+            f"planning: {widths.size} radii for {len(where)} discs; give one for each, or one "
+            "number for all."
+        )
+    widths = np.broadcast_to(widths, (len(where),)).copy()
+    if (widths <= 0).any():
+        raise LidarpoolError(
+            f"planning: the radius of disc {int(np.argmax(widths <= 0))} is {widths.min():g}; "
+            "it must be above 0. Leave the disc out if there is nothing to go around."
+        )
+    for array in (where, widths):
+        array.setflags(write=False)
+    return where, widths
+
+
+def _floats(name: str, value: ArrayLike) -> Floats:
+    """Return `value` as a new float64 array; an error where it is no array of finite numbers."""
+    try:
+        numbers = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise LidarpoolError(f"planning: {name} is {value!r}; it must be numbers.") from None
+    if not np.isfinite(numbers).all():
+        raise LidarpoolError(f"planning: {name} holds a number that is not finite: {value!r}.")
+    return numbers
+
+
+def _check_outside(ends: dict[str, tuple[float, float]], centres: Floats, radii: Floats) -> None:
+    for name, end in ends.items():
+        point = np.array([end])
+        within = np.flatnonzero(segment_distances(point, point, centres)[0] < radii)
+        if len(within):
+            disc = int(within[0])
+            x, y = centres[disc]
+            raise LidarpoolError(
+                f"The path's {name} ({end[0]:g}, {end[1]:g}) lies within disc {disc} of radius "
+                f"{radii[disc]:g} at ({x:g}, {y:g}): move the {name} out of it."
+            )

@@ -1,0 +1,197 @@
+"""The shortest path around discs, exactly, through the graph of their tangents.
+
+A shortest path in the plane around discs is made of straight pieces that touch the discs they
+meet and of arcs along them (the string pulled taut). So it is a shortest path of the graph
+whose nodes are the points of contact of all common tangents, and whose edges are the tangents
+that no disc blocks and the arcs between neighbouring contacts: the tangent visibility graph of
+Pocchiola and Vegter (1996), here without their sweep, every tangent against every disc.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections import defaultdict
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .geometry import Floats, segment_distances
+
+# A tangent that comes this close to a disc, as a share of the scene's size, passes it. Three
+# discs with one common tangent are usual in drawn scenes, and rounding must not close them.
+_TOLERANCE = 1e-10
+_TANGENTS_AT_ONCE = 4096  # of a scene with many discs, to bound the memory of the check
+
+Graph = dict[int, list[tuple[int, float]]]  # {node: [(neighbour, length of the edge)]}
+
+
+class _Tangents(NamedTuple):
+    """Common tangents; tangent t touches circle `circles[t, 0]` at `contacts[t, 0]`, and so on."""
+
+    circles: NDArray[np.intp]  # (t, 2)
+    contacts: Floats  # (t, 2, 2)
+
+
+def shortest_path_length(
+    start: tuple[float, float], target: tuple[float, float], centres: ArrayLike, radii: ArrayLike
+) -> float:
+    """Length of the shortest path from `start` to `target` that enters no disc.
+
+    Discs may overlap, touch and contain one another; a path may touch a disc's edge.
+
+    Parameters
+    ----------
+    start, target
+        x and y of either end.
+    centres, radii
+        The discs: (m, 2) and (m,), with radii above 0. m may be 0.
+
+    Returns
+    -------
+    The length; inf where discs cut the target off from the start, or hold either of them.
+
+    Notes
+    -----
+    Takes m³ distance checks: milliseconds for 12 discs, about a second for 100.
+
+    Examples
+    --------
+    >>> shortest_path_length((0, 0), (3, 4), [], [])
+    5.0
+    """
+    if start == target:
+        return 0.0
+    centres_, radii_ = _outermost(
+        np.asarray(centres, float).reshape(-1, 2), np.asarray(radii, float).reshape(-1)
+    )
+    # The two ends are circles without radius, numbers 0 and 1.
+    circles = np.vstack([np.asarray([start, target], float), centres_])
+    widths = np.concatenate([[0.0, 0.0], radii_])
+    tolerance = _TOLERANCE * float(np.ptp(circles, axis=0).max() + widths.max())
+    tangents = _unblocked(_all_tangents(circles, widths), circles, widths, tolerance)
+    return _dijkstra(_graph(tangents, circles, widths), source=0, sink=1)
+
+
+def _outermost(centres: Floats, radii: Floats) -> tuple[Floats, Floats]:
+    """Return the discs without those that lie within another."""
+    order = np.argsort(-radii, kind="stable")
+    kept: list[int] = []
+    for disc in order:
+        gaps = centres[kept] - centres[disc]
+        if not (np.sqrt((gaps**2).sum(axis=1)) + radii[disc] <= radii[kept]).any():
+            kept.append(int(disc))
+    return centres[kept], radii[kept]
+
+
+def _all_tangents(centres: Floats, radii: Floats) -> _Tangents:
+    """Return the common tangents of every two circles.
+
+    The line {x: n·x = c} touches circle i at centre_i + side_i · radius_i · n. Two circles share
+    it when n · (centre_j - centre_i) = side_i · radius_i - side_j · radius_j, which for given
+    sides has two solutions n, mirror images in the line of centres. Turning n and both sides
+    around gives the same line, so side_i = 1 is enough.
+    """
+    i, j = np.triu_indices(len(radii), k=1)
+    between = centres[j] - centres[i]
+    distance = np.sqrt((between**2).sum(axis=1))
+    circles, contacts = [], []
+    for side in (1.0, -1.0):
+        # Equality is a point on a circle's edge, or two circles that touch; rounding may not
+        # tell them apart. Side -1 of a point is its side 1 over again.
+        fits = distance * (1 + _TOLERANCE) >= np.abs(radii[i] - side * radii[j])
+        fits &= (distance > 0) & ((radii[j] > 0) | (side > 0))
+        first, second, gap = i[fits], j[fits], distance[fits, None]
+        unit = between[fits] / gap
+        across = np.stack([-unit[:, 1], unit[:, 0]], axis=1)
+        cosine = np.clip((radii[first] - side * radii[second])[:, None] / gap, -1.0, 1.0)
+        for sine in (np.sqrt(1 - cosine**2), -np.sqrt(1 - cosine**2)):
+            normal = cosine * unit + sine * across
+            ends = [
+                centres[first] + radii[first, None] * normal,
+                centres[second] + side * radii[second, None] * normal,
+            ]
+            circles.append(np.stack([first, second], axis=1))
+            contacts.append(np.stack(ends, axis=1))
+    return _Tangents(np.concatenate(circles), np.concatenate(contacts))
+
+
+def _unblocked(tangents: _Tangents, centres: Floats, radii: Floats, tolerance: float) -> _Tangents:
+    """Return the tangents that enter no disc."""
+    free = []
+    for begin in range(0, len(tangents.circles), _TANGENTS_AT_ONCE):
+        part = slice(begin, begin + _TANGENTS_AT_ONCE)
+        ends, own = tangents.contacts[part], tangents.circles[part]
+        enters = segment_distances(ends[:, 0], ends[:, 1], centres) < radii - tolerance
+        np.put_along_axis(enters, own, False, axis=1)  # it touches these two by construction
+        free.append(~enters.any(axis=1))
+    chosen = np.concatenate(free)
+    return _Tangents(tangents.circles[chosen], tangents.contacts[chosen])
+
+
+def _graph(tangents: _Tangents, centres: Floats, radii: Floats) -> Graph:
+    """Return the graph of tangents and arcs; nodes 0 and 1 are start and target."""
+    graph: Graph = defaultdict(list)
+
+    def connect(one: int, other: int, length: float) -> None:
+        graph[one].append((other, length))
+        graph[other].append((one, length))
+
+    owners = tangents.circles.reshape(-1)
+    nodes = np.where(owners < 2, owners, 2 + np.arange(len(owners)))
+    spans = tangents.contacts[:, 1] - tangents.contacts[:, 0]
+    lengths = np.sqrt((spans**2).sum(axis=1))
+    for (one, other), length in zip(nodes.reshape(-1, 2).tolist(), lengths.tolist(), strict=True):
+        connect(one, other, length)
+    points = tangents.contacts.reshape(-1, 2)
+    for circle in range(2, len(radii)):
+        on_circle = np.flatnonzero(owners == circle)
+        offsets = points[on_circle] - centres[circle]
+        angles = np.arctan2(offsets[:, 1], offsets[:, 0])
+        order = np.argsort(angles, kind="stable")
+        for place, next_place, angle in _open_arcs(angles[order], circle, centres, radii):
+            one, other = (int(nodes[on_circle[order[p]]]) for p in (place, next_place))
+            connect(one, other, angle * float(radii[circle]))
+    return graph
+
+
+def _open_arcs(
+    angles: Floats, circle: int, centres: Floats, radii: Floats
+) -> list[tuple[int, int, float]]:
+    """Arcs of `circle` between neighbours of the sorted `angles` that no disc blocks.
+
+    A contact lies in no other disc, so a disc that overlaps the circle covers a stretch between
+    two contacts: the arc that holds the middle of that stretch is blocked.
+    """
+    if len(angles) < 2:
+        return []
+    gaps = centres - centres[circle]
+    overlaps = np.sqrt((gaps**2).sum(axis=1)) < radii + radii[circle]
+    overlaps[circle] = False
+    overlaps[:2] = False
+    middles = np.arctan2(gaps[overlaps, 1], gaps[overlaps, 0])
+    blocked = np.zeros(len(angles), bool)
+    blocked[np.searchsorted(angles, middles) - 1] = True  # before the first: the last arc, -1
+    turns = np.diff(angles, append=angles[0] + 2 * np.pi)
+    return [
+        (place, (place + 1) % len(angles), float(turns[place]))
+        for place in np.flatnonzero(~blocked).tolist()
+    ]
+
+
+def _dijkstra(graph: Graph, source: int, sink: int) -> float:
+    """Length of the shortest path of `graph` from `source` to `sink`; inf without one."""
+    best = {source: 0.0}
+    queue = [(0.0, source)]
+    while queue:
+        length, node = heapq.heappop(queue)
+        if node == sink:
+            return length
+        if length > best[node]:
+            continue
+        for neighbour, step in graph[node]:
+            further = length + step
+            if further < best.get(neighbour, float("inf")):
+                best[neighbour] = further
+                heapq.heappush(queue, (further, neighbour))
+    return float("inf")

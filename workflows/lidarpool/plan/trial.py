@@ -1,0 +1,122 @@
+"""One trial: a swarm run to its end, on whatever worker."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import LidarpoolError
+from .cost import PathCost
+from .frame import Frame
+from .geometry import Floats, clearance, path_length, segment_distances
+from .planning import Planning
+from .randoms import Randoms
+from .swarm import Swarm, group_count
+
+_ITERATIONS_PER_LOOK = 8  # at whether the trial is cancelled: about every millisecond
+
+
+class TrialCancelledError(LidarpoolError):
+    """A trial was told to stop before its end; there is no result."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """What one swarm found.
+
+    The same `Planning` and number give the same trial, to the bit, except for `seconds`.
+
+    Parameters
+    ----------
+    trial
+        Number of the trial, from 0.
+    seed
+        Seed of its random numbers.
+    length
+        Length of the path in metres.
+    waypoints
+        Corners of the path between its two ends, in metres: (k, 2).
+    collision_free
+        Whether the path enters no disc, by the exact check.
+    history
+        Lowest cost met so far, in metres, at each iteration: (iterations,). It is the length
+        of a path where that is free, and above any sensible length where it is not.
+    seconds
+        Time that the trial took.
+    """
+
+    trial: int
+    seed: int
+    length: float
+    waypoints: Floats
+    collision_free: bool
+    history: NDArray[np.float32]
+    seconds: float = field(compare=False)
+
+
+def trial_seed(planning: Planning, trial: int) -> int:
+    """Seed of trial number `trial`, independent of all others' (`numpy.random.SeedSequence`)."""
+    sequence = np.random.SeedSequence(entropy=planning.seed, spawn_key=(trial,))
+    return int(sequence.generate_state(1, np.uint64)[0])
+
+
+def run_trial(planning: Planning, trial: int, cancelled: Callable[[], bool] | None = None) -> Trial:
+    """Search for a path with one particle swarm.
+
+    A pure function on one thread: the result depends on `planning` and `trial` alone, not on
+    where or beside what it runs.
+
+    Parameters
+    ----------
+    planning
+        The problem.
+    trial
+        Number of the trial, from 0.
+    cancelled
+        Asked about every millisecond, if given; the trial ends when it says True.
+
+    Raises
+    ------
+    TrialCancelledError
+        If `cancelled` said so.
+    """
+    begun = time.perf_counter()
+    seed = trial_seed(planning, trial)
+    frame = Frame(planning.start, planning.target)
+    swarm = prepare_swarm(planning, frame, seed)
+    lowest = np.empty((planning.iterations, group_count(planning.particles)), np.float32)
+    for iteration in range(planning.iterations):
+        if cancelled is not None and iteration % _ITERATIONS_PER_LOOK == 0 and cancelled():
+            raise TrialCancelledError(f"Trial {trial} was cancelled at iteration {iteration}.")
+        swarm.step(lowest[iteration])
+    waypoints = frame.to_plane(swarm.best().astype(np.float64))
+    path = with_ends(planning, waypoints)
+    return Trial(
+        trial=trial,
+        seed=seed,
+        length=path_length(path),
+        waypoints=waypoints,
+        collision_free=clearance(path, planning.centres, planning.radii) >= 0,
+        history=lowest.min(axis=1) * np.float32(frame.unit_m),
+        seconds=time.perf_counter() - begun,
+    )
+
+
+def with_ends(planning: Planning, waypoints: Floats) -> Floats:
+    """Return the whole path, (k + 2, 2): start, waypoints, target."""
+    return np.vstack([planning.start, waypoints, planning.target])
+
+
+def prepare_swarm(planning: Planning, frame: Frame, seed: int) -> Swarm:
+    """Return the swarm of `planning`, spread as widely as a way around the discs may reach."""
+    centres, radii = frame.to_local(planning.centres), planning.radii / frame.unit_m
+    cost = PathCost(centres, radii, planning.waypoints, planning.particles)
+    line = np.array([[-0.5, 0.0], [0.5, 0.0]])
+    edges = segment_distances(line[:1], line[1:], centres)[0] + radii
+    # No path worth having leaves the line by more than half its length.
+    widest = min(float(edges.max(initial=0.0)), cost.entry_price / 2)
+    return Swarm(cost, widest, Randoms(seed))
