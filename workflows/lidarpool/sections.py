@@ -1,0 +1,219 @@
+"""The sections of a scenario file: their fields, limits and defaults."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, Strict, model_validator
+
+from .sensor import Sensor
+from .transform import Transform
+
+# Their directions take 2.4 GB; real lidars have five million.
+RAY_LIMIT = 100_000_000
+
+# Nothing on Earth is farther from the origin of its map.
+Coordinate = Annotated[float, Field(ge=-1e8, le=1e8)]
+Angle = Annotated[float, Field(ge=-36_000, le=36_000)]
+Factor = Annotated[float, Field(ge=-1e9, le=1e9)]
+# YAML has lists only, which strict validation would not take for tuples.
+Pair = Annotated[tuple[Coordinate, Coordinate], Strict(False)]
+Triple = Annotated[tuple[Coordinate, Coordinate, Coordinate], Strict(False)]
+Angles = Annotated[tuple[Angle, Angle, Angle], Strict(False)]
+Factors = Annotated[tuple[Factor, Factor, Factor], Strict(False)]
+Row = Annotated[tuple[Factor, Factor, Factor, Factor], Strict(False)]
+Matrix = Annotated[tuple[Row, Row, Row, Row], Strict(False)]
+
+
+class Section(BaseModel):
+    """Fields of a scenario: no others, finite numbers, no conversion of text to numbers."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+class MeshFile(Section):
+    """A mesh file and where it stands; in YAML the file's name alone will do.
+
+    The mesh is scaled, turned about the world's x, y and z axes, and moved; or `matrix` says
+    it all. Relative names start from the scenario's folder.
+    """
+
+    file: Annotated[str, Field(min_length=1, max_length=4096)]
+    unit: Literal["um", "mm", "cm", "dm", "m", "km", "in", "ft", "yd", "mi"] | None = None
+    up_axis: Literal["x", "y", "z"] | None = None
+    translation: Triple = (0.0, 0.0, 0.0)
+    rotation_deg: Angles = (0.0, 0.0, 0.0)
+    scale: Factors = (1.0, 1.0, 1.0)
+    matrix: Matrix | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short_forms(cls, value: Any) -> Any:
+        if isinstance(value, str):
+            return {"file": value}
+        if isinstance(value, dict) and type(value.get("scale")) in (int, float):
+            return value | {"scale": [value["scale"]] * 3}
+        return value
+
+    @model_validator(mode="after")
+    def _one_placement(self) -> MeshFile:
+        placed = self.model_fields_set & {"translation", "rotation_deg", "scale"}
+        if self.matrix is not None and placed:
+            raise ValueError(f"give either matrix or {', '.join(sorted(placed))}, not both.")
+        if 0 in self.scale:
+            raise ValueError("scale is 0 along an axis, which flattens the mesh.")
+        return self
+
+    def transform(self) -> Transform:
+        """Return the placement in the world."""
+        if self.matrix is not None:
+            return Transform.from_matrix(self.matrix)
+        return Transform.place(self.translation, self.rotation_deg, self.scale)
+
+
+class Ground(Section):
+    """A level rectangle under the scene, `margin_m` wider than it on each side."""
+
+    height_m: Coordinate = 0.0
+    margin_m: Annotated[float, Field(ge=0, le=1e6)] = 5.0
+
+
+class SceneSection(Section):
+    """What is scanned: mesh files, the six default objects, or both.
+
+    `preset` is 'seed' where no files are given, else 'none'.
+    """
+
+    preset: Literal["seed", "none"] | None = None
+    files: Annotated[tuple[MeshFile, ...], Strict(False), Field(max_length=10_000)] = ()
+    ground: Ground | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short_forms(cls, value: Any) -> Any:
+        if isinstance(value, str):
+            return {"preset": value} if value in ("seed", "none") else {"files": [value]}
+        if isinstance(value, dict) and isinstance(value.get("files"), str):
+            return value | {"files": [value["files"]]}
+        return {"files": value} if isinstance(value, list) else value
+
+    @model_validator(mode="after")
+    def _something(self) -> SceneSection:
+        if self.preset == "none" and not self.files:
+            raise ValueError("there is nothing to scan: give files, or preset: seed.")
+        return self
+
+    @property
+    def has_seed(self) -> bool:
+        """Whether the six default objects are in it."""
+        return self.preset == "seed" or (self.preset is None and not self.files)
+
+
+class SensorSection(Section):
+    """The lidar; see `Sensor`."""
+
+    rays_per_revolution: Annotated[int, Field(ge=1, le=10_000_000)] = 1000
+    layers: Annotated[int, Field(ge=1, le=65_535)] = 40
+    vertical_fov_deg: Annotated[float, Field(gt=0, le=180)] = 60.0
+    step_deg: Annotated[float, Field(gt=0, le=360)] = 10.0
+    min_range_m: Annotated[float, Field(ge=0, le=1e8)] = 0.0
+    max_range_m: Annotated[float, Field(gt=0, allow_inf_nan=True)] = float("inf")
+
+    @model_validator(mode="after")
+    def _bounded(self) -> SensorSection:
+        rays = self.rays_per_revolution * self.layers
+        if rays > RAY_LIMIT:
+            raise ValueError(
+                f"rays_per_revolution times layers is {rays:,}; at most {RAY_LIMIT:,} rays make "
+                "a revolution."
+            )
+        return self
+
+    def sensor(self) -> Sensor:
+        """Return the lidar; LidarpoolError where the fields do not fit together."""
+        return Sensor(**self.model_dump())
+
+
+class PoseSection(Section):
+    """Where the sensor stands, in world coordinates; in YAML [x, y, z] will do."""
+
+    position: Triple
+    yaw_deg: Angle = 0.0
+    pitch_deg: Angle = 0.0
+    roll_deg: Angle = 0.0
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short_form(cls, value: Any) -> Any:
+        return {"position": value} if isinstance(value, list) else value
+
+
+class CloudSection(Section):
+    """What is kept of the hits."""
+
+    keep_every: Annotated[int, Field(ge=1, le=1_000_000)] = 5
+    precision_m: Annotated[float, Field(ge=1e-6, le=1000)] = 0.01
+
+
+class Obstacle(Section):
+    """A disc to keep out of; or the bounding circle of the objects of a name.
+
+    `object` may hold * and ?, and is all of the entry in the short form: `- Shelf*`.
+    """
+
+    object: Annotated[str, Field(min_length=1)] | None = None
+    centre: Pair | None = None
+    radius_m: Annotated[float, Field(gt=0, le=1e6)] | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short_form(cls, value: Any) -> Any:
+        return {"object": value} if isinstance(value, str) else value
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> Obstacle:
+        disc = self.centre is not None and self.radius_m is not None
+        if (self.object is None) != disc or (
+            self.object is not None and self.model_fields_set > {"object"}
+        ):
+            raise ValueError("give either object, or both centre and radius_m.")
+        return self
+
+
+class PlanningSection(Section):
+    """The path planned beside the survey, in the plane, world coordinates.
+
+    `enabled` is as given, else whether there are a start and a target. `obstacles` is 'auto'
+    (the bounding circle of each object that is not flat) or a list; `clearance_m` is added to
+    each radius.
+    """
+
+    enabled: bool | None = None
+    start: Pair | None = None
+    target: Pair | None = None
+    obstacles: Annotated[tuple[Obstacle, ...], Strict(False)] | None = None
+    clearance_m: Annotated[float, Field(ge=0, le=1000)] = 0.0
+    trials: Annotated[int, Field(ge=1, le=1_000_000)] = 100
+    particles: Annotated[int, Field(ge=1, le=10_000_000)] = 1000
+    iterations: Annotated[int, Field(ge=1, le=1_000_000)] = 300
+    waypoints: Annotated[int, Field(ge=1, le=100)] = 5
+    seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 0
+
+    @model_validator(mode="before")
+    @classmethod
+    def _auto(cls, value: Any) -> Any:
+        if isinstance(value, dict) and value.get("obstacles") == "auto":
+            return value | {"obstacles": None}
+        return value
+
+
+class PoolSection(Section):
+    """The partitions, and what runs on them; sizes that are not given follow the machine."""
+
+    gpu: Annotated[int, Field(ge=1, le=10_000)] | None = None
+    lidar: Annotated[int, Field(ge=1, le=10_000)] | None = None
+    other: Annotated[int, Field(ge=1, le=10_000)] | None = None
+    threads: Annotated[int, Field(ge=1, le=1024)] | None = None
+    collectors: Annotated[int, Field(ge=1, le=64)] = 2
+    queue_capacity: Annotated[int, Field(ge=1, le=100_000)] = 10
+    backend: Literal["auto", "cuda", "embree", "numpy"] = "auto"
