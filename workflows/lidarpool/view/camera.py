@@ -1,0 +1,107 @@
+"""A perspective camera: from pixels to rays, from points to pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera.
+
+    Pixel coordinates are continuous: x to the right, y down, the centre of the first pixel at
+    (0.5, 0.5).
+
+    Parameters
+    ----------
+    eye
+        (3,) metres.
+    axes
+        (3, 3), rows: unit vectors to the right, up and forward.
+    focal
+        Focal length in pixels.
+    centre
+        (2,) pixel that looks straight ahead; it may lie outside the image.
+    size
+        Width and height in pixels.
+    """
+
+    eye: Floats
+    axes: Floats
+    focal: float
+    centre: Floats
+    size: tuple[int, int]
+
+    def rays(self, pixels: ArrayLike) -> Floats:
+        """Return unit directions (n, 3) through pixel coordinates (n, 2)."""
+        plane = (np.asarray(pixels, dtype=np.float64) - self.centre) / self.focal
+        rays = plane[:, :1] * self.axes[0] - plane[:, 1:] * self.axes[1] + self.axes[2]
+        rays /= np.sqrt((rays * rays).sum(axis=1, keepdims=True))
+        return rays
+
+    def project(self, points: ArrayLike) -> tuple[Floats, Floats]:
+        """Pixel coordinates (n, 2) and distances from the eye (n,) of points (n, 3).
+
+        Points beside or behind the eye have NaN coordinates.
+        """
+        offset = np.asarray(points, dtype=np.float64) - self.eye
+        side, up, ahead = (offset @ self.axes.T).T
+        ahead = np.where(ahead > 1e-9 * np.abs(offset).max(initial=0.0), ahead, np.nan)
+        pixels = np.stack([side / ahead, -up / ahead], axis=1) * self.focal + self.centre
+        return pixels, np.sqrt((offset * offset).sum(axis=1))
+
+    def footprint(self, distance: ArrayLike) -> Floats:
+        """Width in metres that one pixel covers at a distance, seen face on."""
+        return np.asarray(distance, dtype=np.float64) / self.focal
+
+
+def fit_camera(
+    points: ArrayLike,
+    size: tuple[int, int],
+    frame: tuple[float, float, float, float],
+    azimuth_deg: float = -60.0,
+    elevation_deg: float = 30.0,
+) -> Camera:
+    """Place a camera so that points fill a frame within its image.
+
+    The eye stands on the given side of the points, at 7 times their radius, which keeps
+    uprights upright; focal length and image centre are then chosen so that the
+    projected points touch the frame.
+
+    Parameters
+    ----------
+    points
+        (n, 3), not all in one place.
+    size
+        Width and height of the image in pixels.
+    frame
+        Left, top, right and bottom of the frame, as fractions of the image.
+    azimuth_deg, elevation_deg
+        Where the eye is, seen from the points.
+    """
+    corners = np.asarray(points, dtype=np.float64)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    azimuth, elevation = np.radians([azimuth_deg, elevation_deg])
+    back = np.array(
+        [
+            np.cos(azimuth) * np.cos(elevation),
+            np.sin(azimuth) * np.cos(elevation),
+            np.sin(elevation),
+        ]
+    )
+    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+    axes = np.stack([right, np.cross(back, right), -back])
+    eye = (low + high) / 2 + back * 7.0 * np.linalg.norm(high - low) / 2
+    flat, _ = Camera(eye, axes, 1.0, np.zeros(2), size).project(corners)
+    least, most = flat.min(axis=0), flat.max(axis=0)
+    inner = np.array(
+        [(frame[2] - frame[0]) * size[0], (frame[3] - frame[1]) * size[1]], dtype=np.float64
+    )
+    middle = np.array([(frame[0] + frame[2]) * size[0], (frame[1] + frame[3]) * size[1]]) / 2
+    focal = float((inner / (most - least)).min())
+    return Camera(eye, axes, focal, middle - focal * (least + most) / 2, size)

@@ -1,0 +1,219 @@
+"""The finished picture: a rendered image with axes, legend, colour bar and title, as PNG."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import ListedColormap, LogNorm, Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
+from numpy.typing import NDArray
+
+from ..errors import LidarpoolError
+from .labels import axis_labels
+from .overlay import visible, visible_runs
+from .shot import Shot
+from .theme import Theme
+
+Floats = NDArray[np.float64]
+
+DPI = 200
+FONT = {"fontfamily": "DejaVu Sans"}
+MANY_POSES = 40  # more than this are drawn as small dots
+MOST_POSES = 3000
+LEGEND_ROWS = 30
+LEGEND_LETTERS = 21
+
+
+class Page:
+    """One picture being put together.
+
+    Parameters
+    ----------
+    size
+        Width and height in pixels.
+    theme
+        Its colours.
+    """
+
+    def __init__(self, size: tuple[int, int], theme: Theme) -> None:
+        self.theme = theme
+        self.size = size
+        self.figure = Figure(figsize=(size[0] / DPI, size[1] / DPI), dpi=DPI, facecolor=theme.page)
+        FigureCanvasAgg(self.figure)
+        self.unit = size[0] / 1600  # fonts and lines grow with the picture
+
+    def show(self, shot: Shot, image: Floats) -> Axes:
+        """Fill the page with a painted shot and put numbers along its axes.
+
+        The axes that come back have the shot's pixels as coordinates.
+        """
+        axes = self.figure.add_axes((0, 0, 1, 1))
+        axes.set_axis_off()
+        width, height = shot.camera.size
+        axes.imshow(image, extent=(0, width, height, 0), interpolation="bilinear", aspect="auto")
+        axes.set(xlim=(0, width), ylim=(height, 0))
+        labels, lines = axis_labels(shot.stage, shot.camera)
+        marks = [label.mark for label in labels if label.mark is not None]
+        axes.add_collection(
+            LineCollection([*marks, *lines], colors=self.theme.muted, linewidths=0.6 * self.unit)
+        )
+        for label in labels:
+            title = label.mark is None
+            axes.text(
+                *label.place, label.text, rotation=label.angle_deg, ha="center", va="center",
+                fontsize=(7.2 if title else 6.6) * self.unit,
+                color=self.theme.ink if title else self.theme.muted, **FONT,
+            )  # fmt: skip
+        return axes
+
+    def title(self, text: str, detail: str = "") -> None:
+        """Write a title at the top left, and a line of detail under it."""
+        top = 1 - 0.05 * self.size[0] / self.size[1] / 1.6
+        self.figure.text(
+            0.03, top, text, fontsize=11 * self.unit, fontweight="bold",
+            color=self.theme.ink, va="center", **FONT,
+        )  # fmt: skip
+        self.figure.text(
+            0.03, top - 0.042, detail, fontsize=7.2 * self.unit, color=self.theme.muted,
+            va="center", **FONT,
+        )  # fmt: skip
+
+    def sensors(self, axes: Axes, shot: Shot, poses: Floats) -> None:
+        """Mark sensor positions (p, 3), hollow where something hides them, each on a stem."""
+        many = len(poses) > MANY_POSES
+        poses = poses[np.linspace(0, len(poses) - 1, min(len(poses), MOST_POSES)).astype(int)]
+        pixels, seen = visible(shot, poses)
+        if not many:
+            feet = poses.copy()
+            feet[:, 2] = shot.stage.level
+            self.lines(axes, shot, np.stack([poses, feet], axis=1), self.theme.sensor, 0.8, 0.7)
+        drawn = np.isfinite(pixels).all(axis=1)
+        colours = [self.theme.sensor if s else "none" for s in seen[drawn]]
+        axes.scatter(
+            *pixels[drawn].T, s=(5 if many else 20) * self.unit**2, c=colours or None, zorder=5,
+            edgecolors=[self.theme.page if s else self.theme.sensor for s in seen[drawn]],
+            linewidths=(0.2 if many else 0.7) * self.unit,
+        )  # fmt: skip
+
+    def lines(
+        self, axes: Axes, shot: Shot, segments: Floats, colour: str, width: float, alpha: float
+    ) -> None:
+        """Draw the parts of segments (n, 2, 3) that nothing hides."""
+        axes.add_collection(
+            LineCollection(
+                visible_runs(shot, segments), colors=colour, linewidths=width * self.unit,
+                alpha=alpha, capstyle="round", zorder=4,
+            )
+        )  # fmt: skip
+
+    def legend(self, entries: Sequence[tuple[str, object]], sensors: bool = False) -> None:
+        """Name colours in the page's right margin.
+
+        Parameters
+        ----------
+        entries
+            (name, colour); what does not fit is counted in a last line.
+        sensors
+            Whether a line for the sensor marker is added.
+        """
+        rows = [(name, colour, "s") for name, colour in entries[:LEGEND_ROWS]]
+        if sensors:
+            rows.append(("Sensor", self.theme.sensor, "o"))
+        if len(entries) > LEGEND_ROWS:
+            rows.append((f"and {len(entries) - LEGEND_ROWS:,} more", "none", "s"))
+        size = min(7.4, 175 / max(len(rows), 1))
+        self.key(
+            [
+                Line2D([], [], ls="", marker=marker, color=colour, ms=0.85 * size * self.unit,
+                       mec="none", label=shortened(name))
+                for name, colour, marker in rows
+            ],
+            size,
+        )  # fmt: skip
+
+    def key(self, handles: list[Line2D], size: float) -> None:
+        """Put a legend of handles into the page's right margin; `size` of the font in points."""
+        if handles:
+            self.figure.legend(
+                handles=handles, loc="center left", bbox_to_anchor=(0.822, 0.5), frameon=False,
+                labelcolor=self.theme.ink, labelspacing=0.55, handletextpad=0.5, borderpad=0,
+                handlelength=1.4, prop={"family": "DejaVu Sans", "size": size * self.unit},
+            )  # fmt: skip
+
+    def colour_bar(self, colours: Floats, norm: Normalize, title: str) -> None:
+        """Draw a colour bar of colours (n, 3) in the right margin, its title beside it."""
+        axes = self.figure.add_axes((0.862, 0.27, 0.014, 0.46))
+        bar = self.figure.colorbar(ScalarMappable(norm, ListedColormap(colours)), cax=axes)
+        bar.outline.set_visible(False)
+        bar.set_label(title, fontsize=7.6 * self.unit, color=self.theme.ink, **FONT)
+        axes.tick_params(
+            which="both", labelsize=6.6 * self.unit, color=self.theme.muted, width=0.6 * self.unit,
+            labelcolor=self.theme.muted, labelfontfamily="DejaVu Sans", length=2.5 * self.unit,
+        )  # fmt: skip
+        axes.tick_params(which="minor", length=1.5 * self.unit)
+        if isinstance(norm, LogNorm):
+            axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+            axes.yaxis.set_minor_formatter(lambda value, _: "")
+
+    def note(self, axes: Axes, text: str) -> None:
+        """Write a remark into the middle of the picture."""
+        halo = [withStroke(linewidth=3 * self.unit, foreground=self.theme.page)]
+        axes.text(
+            0.43, 0.5, text, transform=axes.transAxes, ha="center", va="center",
+            fontsize=9 * self.unit, color=self.theme.muted, path_effects=halo, **FONT,
+        )  # fmt: skip
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write the page as PNG under a temporary name in the same folder, then rename it.
+
+        Raises
+        ------
+        LidarpoolError
+            If the folder is not there or cannot be written to. A file that was there before is
+            left as it was.
+        """
+        target = Path(path)
+        try:
+            handle, name = tempfile.mkstemp(
+                prefix=f".{target.stem}-", suffix=".png", dir=target.parent
+            )
+        except OSError as error:
+            raise cannot_write(target, error) from error
+        temporary = Path(name)
+        try:
+            with os.fdopen(handle, "wb") as file:
+                # No version of matplotlib in the file: the same picture is the same bytes.
+                self.figure.savefig(file, format="png", dpi=DPI, metadata={"Software": None})
+            temporary.chmod(0o644)
+            temporary.replace(target)
+        except OSError as error:
+            raise cannot_write(target, error) from error
+        finally:
+            temporary.unlink(missing_ok=True)
+        return target
+
+
+def cannot_write(target: Path, error: OSError) -> LidarpoolError:
+    """Say why a picture could not be written."""
+    return LidarpoolError(
+        f"The picture {target} could not be written: {error.strerror or error}. "
+        "Choose a folder that exists, can be written to and has room."
+    )
+
+
+def shortened(name: str) -> str:
+    """Cut a long name in its middle, so that it fits the legend."""
+    if len(name) <= LEGEND_LETTERS:
+        return name
+    keep = LEGEND_LETTERS - 1
+    return f"{name[: keep - keep // 2]}…{name[-(keep // 2) :]}"
