@@ -127,6 +127,8 @@ class RayCaster:
     ) -> Returns:
         """Cast a pattern of directions from one pose: the fastest way for a lidar.
 
+        In the result, rays are numbered from 0 at the window's start.
+
         Parameters
         ----------
         pattern
@@ -140,11 +142,6 @@ class RayCaster:
             Rows ``start <= row < stop`` of the pattern to cast; None for all.
         t_min, t_max
             As in `cast`.
-
-        Returns
-        -------
-        :
-            Rays are numbered from 0 at the window's start.
 
         Raises
         ------

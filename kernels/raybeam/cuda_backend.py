@@ -1,27 +1,185 @@
-"""Placeholder."""
+"""Ray casting on a CUDA device, through CuPy."""
 
 from __future__ import annotations
 
+import importlib.resources
 import importlib.util
-from typing import ClassVar
+from functools import lru_cache
+from typing import Any, ClassVar
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
 
 from .backend import Backend, Found
-from .rays import Rays
+from .hits import Returns
+from .layout import lay_out
+from .mesh import LocalMesh
+from .rays import Pattern, Rays
+
+_BLOCK = 128  # threads; intersect.cu is bound to it
+_STACK_STEP = 32
 
 
 class CudaBackend(Backend):
-    """CUDA."""
+    """The walk of intersect.cu, one thread a ray; only hits come back from the device."""
 
     name: ClassVar[str] = "cuda"
-    chunk: ClassVar[int] = 1 << 22
+    chunk: ClassVar[int] = 1 << 22  # rays: some 150 MB on the device
 
     @classmethod
     def missing(cls) -> str:
         """See `Backend.missing`."""
         if importlib.util.find_spec("cupy") is None:
             return "CuPy is not installed: pip install cupy-cuda12x or cupy-cuda13x"
-        return "not ready"
+        try:
+            import cupy
+        except ImportError as error:
+            return f"CuPy does not load ({error})"
+        try:
+            count = cupy.cuda.runtime.getDeviceCount()
+        except cupy.cuda.runtime.CUDARuntimeError as error:
+            return f"CuPy finds no CUDA device ({error})"
+        return "" if count else "there is no CUDA device"
+
+    def __init__(
+        self, mesh: LocalMesh, threads: int | None = None, device: int | None = None
+    ) -> None:
+        import cupy
+
+        super().__init__(mesh, threads, device)
+        self._cupy = cupy
+        self._device = _device(cupy, device)
+        layout = lay_out(mesh)
+        with self._device:
+            _check_memory(cupy, layout.nbytes)
+            tables = (layout.nodes, layout.triangles, layout.corners, layout.faces, layout.frame)
+            self._scene = tuple(cupy.asarray(table) for table in tables)
+            stack = -(-max(layout.stack, 1) // _STACK_STEP) * _STACK_STEP
+            self._module = _module(self._device.id, stack)
+        # {pattern: its directions on the device}
+        self._patterns: WeakKeyDictionary[Pattern, Any] = WeakKeyDictionary()
 
     def closest(self, rays: Rays) -> Found:
         """See `Backend.closest`."""
-        raise NotImplementedError
+        cp = self._cupy
+        with self._device:
+            table = self._upload(rays)
+            ray, t, place = self._cast(table, rays)
+            u, v = cp.empty(len(ray)), cp.empty(len(ray))
+            corners, faces, frame = self._scene[2:]
+            ray = ray.astype(np.int64)
+            hits = (corners, frame, *table, ray, place, np.int64(len(ray)), u, v)
+            self._launch("weigh_table", len(ray), hits)
+            return Found(ray.get(), t.get(), faces[place].get(), u.get(), v.get())
+
+    def returns(self, rays: Rays) -> Returns:
+        """See `Backend.returns`."""
+        parts = []
+        with self._device:
+            for start in range(0, len(rays), self.chunk):
+                part = rays.part(start, start + self.chunk)
+                parts.append(self._to_host(start, *self._cast(self._upload(part), part)))
+        return _joined(parts)
+
+    def scan(
+        self,
+        pattern: Pattern,
+        window: tuple[int, int],
+        origin: NDArray[np.float64],
+        rotation: NDArray[np.float64] | None,
+        interval: tuple[float, float],
+    ) -> Returns:
+        """See `Backend.scan`; the rays are made on the device."""
+        cp = self._cupy
+        parts = []
+        turn = np.eye(3) if rotation is None else rotation
+        with self._device:
+            if pattern not in self._patterns:
+                self._patterns[pattern] = cp.asarray(pattern.directions)
+            directions = self._patterns[pattern][slice(*window)]
+            pose = cp.asarray(np.concatenate([origin.ravel(), turn.ravel()]))
+            limits = [np.float64(t * self._mesh.scale) for t in interval]
+            for start in range(0, len(directions), self.chunk):
+                part = directions[start : start + self.chunk]
+                rays = (pose, np.int32(rotation is not None), part, np.int64(len(part)), *limits)
+                parts.append(self._to_host(start, *self._hits("cast_pattern", len(part), rays)))
+        return _joined(parts)
+
+    def _upload(self, rays: Rays) -> tuple[Any, ...]:
+        """Origins, their stride and directions, as the kernels take them."""
+        cp = self._cupy
+        stride = np.int32(0 if len(rays.origins) == 1 else 3)
+        return cp.asarray(rays.origins), stride, cp.asarray(rays.directions)
+
+    def _cast(self, table: tuple[Any, ...], rays: Rays) -> tuple[Any, Any, Any]:
+        scale = self._mesh.scale
+        limits = (np.float64(rays.t_min * scale), np.float64(rays.t_max * scale))
+        return self._hits("cast_table", len(rays), (*table, np.int64(len(rays)), *limits))
+
+    def _hits(self, kernel: str, n: int, rays: tuple[Any, ...]) -> tuple[Any, Any, Any]:
+        """Run a cast and keep the hits: ray, local distance, place; on the device."""
+        cp = self._cupy
+        t, place = cp.empty(n), cp.empty(n, np.int32)
+        self._launch(kernel, n, (*self._scene, *rays, t, place))
+        # Compacted by a scan in ray order, not by atomics: the same bytes on every run.
+        ray = cp.flatnonzero(place >= 0)
+        return ray, t[ray], place[ray]
+
+    def _to_host(self, start: int, ray: Any, t: Any, place: Any) -> Returns:
+        rows = ray.astype(np.int32).get().astype(np.int64) + start  # half the bytes on the way
+        return Returns(rows, t.get() / self._mesh.scale, self._scene[3][place].get())
+
+    def _launch(self, kernel: str, n: int, arguments: tuple[Any, ...]) -> None:
+        if n:
+            self._module.get_function(kernel)((-(-n // _BLOCK),), (_BLOCK,), arguments)
+
+
+def source() -> str:
+    """Text of intersect.cu, with its name for the compiler's messages."""
+    text = importlib.resources.files(__package__).joinpath("intersect.cu").read_text("utf-8")
+    return f'#line 1 "intersect.cu"\n{text}'
+
+
+def options(stack: int) -> tuple[str, ...]:
+    """Compiler options for `source`; `stack` is the most nodes that may wait in a walk."""
+    return ("-std=c++17", "-fmad=false", f"-DSTACK={stack}")
+
+
+@lru_cache(maxsize=32)
+def _module(device: int, stack: int) -> Any:
+    """Compile for the current device, once."""
+    import cupy
+
+    module = cupy.RawModule(code=source(), options=options(stack))
+    module.compile()
+    return module
+
+
+def _device(cupy: Any, number: int | None) -> Any:
+    """Return the device of that number, or the current one; raises ValueError if it is none."""
+    count = cupy.cuda.runtime.getDeviceCount()
+    if number is not None and not 0 <= number < count:
+        raise ValueError(f"There is no CUDA device {number}: this process sees {count}, from 0.")
+    return cupy.cuda.Device(number)
+
+
+def _check_memory(cupy: Any, need: int) -> None:
+    """Raise MemoryError when the tables, and room to work, do not fit on the device."""
+    free = cupy.cuda.runtime.memGetInfo()[0] + cupy.get_default_memory_pool().free_bytes()
+    work = 1 << 28
+    if need + work > free:
+        raise MemoryError(
+            f"The mesh needs {(need + work) / 2**20:.0f} MiB on the CUDA device and "
+            f"{free / 2**20:.0f} MiB are free: use a smaller mesh or backend 'embree'."
+        )
+
+
+def _joined(parts: list[Returns]) -> Returns:
+    if not parts:
+        return Returns(np.zeros(0, np.int64), np.zeros(0), np.zeros(0, np.int32))
+    return Returns(
+        np.concatenate([part.ray for part in parts]),
+        np.concatenate([part.distance for part in parts]),
+        np.concatenate([part.triangle for part in parts]),
+    )

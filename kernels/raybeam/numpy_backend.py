@@ -12,8 +12,8 @@ from .rays import Rays
 from .traverse import Walker
 from .tree import build_tree
 
-_WIDTH = 4
-_LEAF_SIZE = 2
+_WIDTH = 8
+_LEAF_SIZE = 4
 
 
 class NumpyBackend(Backend):

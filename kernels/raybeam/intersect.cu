@@ -1,0 +1,407 @@
+// Closest hits of rays with triangles: a walk through a four-wide bounding volume hierarchy.
+//
+// Compiled by NVRTC, which has no standard headers, so there are none here; the tests compile the
+// same text for the CPU. One thread a ray, blocks of 128 threads, a grid of one dimension.
+// STACK (a number) is defined on the command line: places for nodes that wait their turn.
+//
+// All lengths are local: coordinates within [-1, 1], see mesh.py. layout.py makes the tables:
+//   nodes      8 float4 (one 128-byte line) a node: low x, y, z of four children, then high x, y,
+//              z, then the children's codes as integer bits, then nothing. A code >= 0 is a
+//              node, a negative one ~(first << 3 | count - 1) the triangles of a leaf. An empty
+//              place holds a box turned inside out.
+//   triangles  3 float4 a triangle, in the order of the leaves: corner and band of b, edge to
+//              the second corner and band of c, edge to the third and band of t.
+//   corners    9 doubles a triangle, in the same order.
+//   faces      the caller's number of each triangle.
+//   frame      10 doubles: centre (3), scale, low corner of the scene's box (3), high corner (3).
+//
+// Two tests a triangle. `may_hit` is Moeller and Trumbore (1997) in float, with bands as wide as
+// its rounding errors can be, so it never loses a hit; it sends nearly all triangles away.
+// `decide` is the watertight test of triangle.py in double, operation by operation: compiled
+// without fused multiply-add (-fmad=false) its results have the same bits as NumPy's. What fma
+// there is in the float part is written out.
+//
+// Comparisons are written so that one with NaN is false, and false means "no hit".
+
+typedef long long Count;
+
+#define LEAF_BITS 3
+#define DONE ((int)0x80000000)
+#define TINY 8.673617379884035e-19  // 2^-60: stands for a direction component of zero
+#define SLACK 9.5367431640625e-07   // 2^-20: on limits in float, far more than their rounding
+#define ACROSS 4.0                  // more than the diagonal of any scene
+
+struct Scene {
+    const float4* nodes;
+    const float4* triangles;
+    const double* corners;
+    const int* faces;
+    const double* frame;
+};
+
+// Local origin and unit direction.
+struct Ray {
+    double ox, oy, oz, dx, dy, dz;
+};
+
+// What `decide` found: weights of the corners times det, and distance.
+struct Exact {
+    double a, b, c, det, t;
+};
+
+// The closest hit so far: local distance, and place in the tables (-1: none yet).
+struct Best {
+    double t;
+    int place;
+};
+
+// ---- where rays come from ----
+
+__device__ __forceinline__ void place_origin(const Scene& scene, const double* origin, Ray& ray)
+{
+    const double* f = scene.frame;
+    ray.ox = (origin[0] - f[0]) * f[3];
+    ray.oy = (origin[1] - f[1]) * f[3];
+    ray.oz = (origin[2] - f[2]) * f[3];
+}
+
+// Origins and directions from memory; one origin for all where stride is 0, else 3.
+struct TableRays {
+    const double* origins;
+    int stride;
+    const double* directions;
+
+    __device__ __forceinline__ Ray load(const Scene& scene, Count i) const
+    {
+        Ray ray;
+        place_origin(scene, origins + i * stride, ray);
+        const double* d = directions + 3 * i;
+        ray.dx = d[0];
+        ray.dy = d[1];
+        ray.dz = d[2];
+        return ray;
+    }
+};
+
+// Directions of a pattern, turned by a pose: origin (3), rotation (9, by rows).
+struct PatternRays {
+    const double* pose;
+    const double* directions;
+    int turned;
+
+    __device__ __forceinline__ Ray load(const Scene& scene, Count i) const
+    {
+        Ray ray;
+        place_origin(scene, pose, ray);
+        const double x = directions[3 * i], y = directions[3 * i + 1], z = directions[3 * i + 2];
+        const double* r = pose + 3;
+        ray.dx = turned ? (x * r[0] + y * r[1]) + z * r[2] : x;
+        ray.dy = turned ? (x * r[3] + y * r[4]) + z * r[5] : y;
+        ray.dz = turned ? (x * r[6] + y * r[7]) + z * r[8] : z;
+        return ray;
+    }
+};
+
+// ---- the test that decides ----
+
+__device__ __forceinline__ double pick(int axis, double x, double y, double z)
+{
+    return axis == 0 ? x : (axis == 1 ? y : z);
+}
+
+__device__ __forceinline__ int next_axis(int axis) { return axis == 2 ? 0 : axis + 1; }
+
+__device__ __forceinline__ bool decide(const Scene& scene, const Ray& ray, int place, Exact& out)
+{
+    const double ax = fabs(ray.dx), ay = fabs(ray.dy), az = fabs(ray.dz);
+    const int kz = ax >= ay ? (ax >= az ? 0 : 2) : (ay >= az ? 1 : 2);
+    const int kx = next_axis(kz), ky = next_axis(kx);
+    const double along = pick(kz, ray.dx, ray.dy, ray.dz);
+    const double sx = pick(kx, ray.dx, ray.dy, ray.dz) / along;
+    const double sy = pick(ky, ray.dx, ray.dy, ray.dz) / along;
+    const double sz = 1.0 / along;
+    const double ox = pick(kx, ray.ox, ray.oy, ray.oz);
+    const double oy = pick(ky, ray.ox, ray.oy, ray.oz);
+    const double oz = pick(kz, ray.ox, ray.oy, ray.oz);
+    const double* p = scene.corners + 9 * (Count)place;
+    const double z0 = p[kz] - oz, z1 = p[3 + kz] - oz, z2 = p[6 + kz] - oz;
+    const double x0 = (p[kx] - ox) - sx * z0, y0 = (p[ky] - oy) - sy * z0;
+    const double x1 = (p[3 + kx] - ox) - sx * z1, y1 = (p[3 + ky] - oy) - sy * z1;
+    const double x2 = (p[6 + kx] - ox) - sx * z2, y2 = (p[6 + ky] - oy) - sy * z2;
+    out.a = x2 * y1 - y2 * x1;
+    out.b = x0 * y2 - y0 * x2;
+    out.c = x1 * y0 - y1 * x0;
+    out.det = (out.a + out.b) + out.c;
+    out.t = (((out.a * z0 + out.b * z1) + out.c * z2) / out.det) * sz;
+    const bool above = out.a >= 0 && out.b >= 0 && out.c >= 0;
+    const bool below = out.a <= 0 && out.b <= 0 && out.c <= 0;
+    return (above || below) && out.det != 0;
+}
+
+// ---- the walk ----
+
+// The ray in float, from where it enters the scene's box.
+struct Walk {
+    float ox, oy, oz, dx, dy, dz;  // start and direction
+    float ix, iy, iz;              // 1 / direction
+    float sx, sy, sz;              // start / direction
+    int nx, ny, nz;                // which float4 of a node holds the planes met first
+    double entry;                  // distance of the start from the origin
+    float from, to;                // hits before or behind these, from the start, are of no use
+};
+
+// A limit in float, counted from the start of the walk, that is never less than the exact one.
+__device__ __forceinline__ float limit(double t, double entry)
+{
+    const double left = (t - entry) * (1.0 + SLACK) + SLACK;
+    return (float)(left < ACROSS ? left : ACROSS);
+}
+
+// Narrow [entry, leave] to the part of the ray between two planes.
+__device__ __forceinline__ void clip(
+    double low, double high, double o, double d, double& entry, double& leave)
+{
+    const double along = fabs(d) < TINY ? (d < 0 ? -TINY : TINY) : d;
+    const double one = (low - o) / along, two = (high - o) / along;
+    entry = fmax(entry, fmin(one, two));
+    leave = fmin(leave, fmax(one, two));
+}
+
+__device__ __forceinline__ float reciprocal(float d)
+{
+    return 1.0f / (fabsf(d) < (float)TINY ? (d < 0.0f ? -(float)TINY : (float)TINY) : d);
+}
+
+// Prepare the walk; false when the ray does not meet the scene's box at all.
+__device__ __forceinline__ bool begin(
+    const Scene& scene, const Ray& ray, double t_min, double t_max, Walk& w)
+{
+    const double* low = scene.frame + 4;
+    const double* high = scene.frame + 7;
+    double entry = 0.0;
+    const bool inside = ray.ox >= low[0] && ray.ox <= high[0] && ray.oy >= low[1] &&
+                        ray.oy <= high[1] && ray.oz >= low[2] && ray.oz <= high[2];
+    if (!inside) {
+        double leave = t_max;
+        clip(low[0], high[0], ray.ox, ray.dx, entry, leave);
+        clip(low[1], high[1], ray.oy, ray.dy, entry, leave);
+        clip(low[2], high[2], ray.oz, ray.dz, entry, leave);
+        if (!(entry <= leave + SLACK)) return false;
+    }
+    w.entry = entry;
+    w.ox = (float)(ray.ox + entry * ray.dx);
+    w.oy = (float)(ray.oy + entry * ray.dy);
+    w.oz = (float)(ray.oz + entry * ray.dz);
+    w.dx = (float)ray.dx;
+    w.dy = (float)ray.dy;
+    w.dz = (float)ray.dz;
+    w.ix = reciprocal(w.dx);
+    w.iy = reciprocal(w.dy);
+    w.iz = reciprocal(w.dz);
+    w.sx = w.ox * w.ix;
+    w.sy = w.oy * w.iy;
+    w.sz = w.oz * w.iz;
+    w.nx = w.ix < 0.0f ? 3 : 0;
+    w.ny = w.iy < 0.0f ? 4 : 1;
+    w.nz = w.iz < 0.0f ? 5 : 2;
+    w.from = (float)fmax((t_min - entry) * (1.0 - SLACK) - SLACK, -ACROSS);
+    w.to = limit(t_max, entry);
+    return true;
+}
+
+// Where the ray enters a child's box; a great number when it does not, or only behind `to`.
+__device__ __forceinline__ float enter(
+    const Walk& w, float nx, float ny, float nz, float fx, float fy, float fz)
+{
+    const float near = fmaxf(fmaxf(fmaf(nx, w.ix, -w.sx), fmaf(ny, w.iy, -w.sy)),
+                             fmaxf(fmaf(nz, w.iz, -w.sz), 0.0f));
+    const float far = fminf(fminf(fmaf(fx, w.ix, -w.sx), fmaf(fy, w.iy, -w.sy)),
+                            fminf(fmaf(fz, w.iz, -w.sz), w.to));
+    return near <= far ? near : 1e30f;
+}
+
+// Put the nearer of two children first.
+__device__ __forceinline__ void order(float& t0, int& c0, float& t1, int& c1)
+{
+    const bool swap = t1 < t0;
+    const float t = swap ? t0 : t1;
+    const int c = swap ? c0 : c1;
+    t0 = swap ? t1 : t0;
+    c0 = swap ? c1 : c0;
+    t1 = t;
+    c1 = c;
+}
+
+// Nodes that wait, each with the distance at which the ray enters it.
+struct Stack {
+    int node[STACK];
+    float t[STACK];
+    int top;
+
+    __device__ __forceinline__ void push(int code, float at)
+    {
+        if (at < 1e30f) {
+            node[top] = code;
+            t[top] = at;
+            ++top;
+        }
+    }
+
+    __device__ __forceinline__ int pop(float to)
+    {
+        while (top > 0) {
+            --top;
+            if (t[top] <= to) return node[top];
+        }
+        return DONE;
+    }
+};
+
+// Test a node's children; the nearest that is met is next, the others wait.
+__device__ __forceinline__ int descend(const float4* nodes, int node, const Walk& w, Stack& stack)
+{
+    const float4* line = nodes + 8 * (Count)node;
+    const float4 nx = line[w.nx], ny = line[w.ny], nz = line[w.nz];
+    const float4 fx = line[3 - w.nx], fy = line[5 - w.ny], fz = line[7 - w.nz];
+    const float4 codes = line[6];
+    float t0 = enter(w, nx.x, ny.x, nz.x, fx.x, fy.x, fz.x);
+    float t1 = enter(w, nx.y, ny.y, nz.y, fx.y, fy.y, fz.y);
+    float t2 = enter(w, nx.z, ny.z, nz.z, fx.z, fy.z, fz.z);
+    float t3 = enter(w, nx.w, ny.w, nz.w, fx.w, fy.w, fz.w);
+    int c0 = __float_as_int(codes.x), c1 = __float_as_int(codes.y);
+    int c2 = __float_as_int(codes.z), c3 = __float_as_int(codes.w);
+    order(t0, c0, t1, c1);
+    order(t2, c2, t3, c3);
+    order(t0, c0, t2, c2);
+    order(t1, c1, t3, c3);
+    order(t1, c1, t2, c2);
+    stack.push(c3, t3);
+    stack.push(c2, t2);
+    stack.push(c1, t1);
+    return t0 < 1e30f ? c0 : stack.pop(w.to);
+}
+
+// Moeller and Trumbore in float: false only when the ray certainly misses the triangle, or meets
+// it outside [from, to].
+__device__ __forceinline__ bool may_hit(const float4* record, const Walk& w)
+{
+    const float4 v = record[0], e = record[1], g = record[2];
+    const float px = fmaf(w.dy, g.z, -(w.dz * g.y));
+    const float py = fmaf(w.dz, g.x, -(w.dx * g.z));
+    const float pz = fmaf(w.dx, g.y, -(w.dy * g.x));
+    const float det = fmaf(e.x, px, fmaf(e.y, py, e.z * pz));
+    const float size = fabsf(det);
+    const float sign = det < 0.0f ? -1.0f : 1.0f;
+    const float tx = w.ox - v.x, ty = w.oy - v.y, tz = w.oz - v.z;
+    const float b = sign * fmaf(tx, px, fmaf(ty, py, tz * pz));
+    const float qx = fmaf(ty, e.z, -(tz * e.y));
+    const float qy = fmaf(tz, e.x, -(tx * e.z));
+    const float qz = fmaf(tx, e.y, -(ty * e.x));
+    const float c = sign * fmaf(w.dx, qx, fmaf(w.dy, qy, w.dz * qz));
+    const float t = sign * fmaf(g.x, qx, fmaf(g.y, qy, g.z * qz));
+    return b >= -v.w && c >= -e.w && b + c <= size + (v.w + e.w) &&
+           t >= fmaf(w.from, size, -g.w) && t <= fmaf(w.to, size, g.w);
+}
+
+// Test the triangles of a leaf.
+template <class Rays>
+__device__ __forceinline__ void test_leaf(
+    const Scene& scene, const Rays& rays, Count i, int code, double t_min, Walk& w, Best& best)
+{
+    const int leaf = ~code;
+    const int first = leaf >> LEAF_BITS, last = first + (leaf & ((1 << LEAF_BITS) - 1));
+    for (int place = first; place <= last; ++place) {
+        if (!may_hit(scene.triangles + 3 * (Count)place, w)) continue;
+        Exact hit;
+        // The ray is loaded again: keeping it in double through the walk costs more registers
+        // than it saves time, since this happens once or twice a ray.
+        if (!decide(scene, rays.load(scene, i), place, hit) || !(hit.t >= t_min)) continue;
+        const bool tie = hit.t == best.t &&
+                         (best.place < 0 || scene.faces[place] < scene.faces[best.place]);
+        if (hit.t < best.t || tie) {
+            best.t = hit.t;
+            best.place = place;
+            w.to = limit(hit.t, w.entry);
+        }
+    }
+}
+
+template <class Rays>
+__device__ __forceinline__ Best closest(
+    const Scene& scene, const Rays& rays, Count i, double t_min, double t_max)
+{
+    Best best;
+    best.t = t_max;
+    best.place = -1;
+    Walk w;
+    if (!begin(scene, rays.load(scene, i), t_min, t_max, w)) return best;
+    Stack stack;
+    stack.top = 0;
+    int node = 0;
+    while (node != DONE) {
+        if (node >= 0) {
+            node = descend(scene.nodes, node, w, stack);
+        } else {
+            test_leaf(scene, rays, i, node, t_min, w, best);
+            node = stack.pop(w.to);
+        }
+    }
+    return best;
+}
+
+// ---- kernels: scene, rays in, hits out ----
+
+// Closest hits of rays from memory: local distance and place in the tables; -1 for a miss, whose
+// distance is not written.
+extern "C" __global__ void __launch_bounds__(128) cast_table(
+    const float4* __restrict__ nodes, const float4* __restrict__ triangles,
+    const double* __restrict__ corners, const int* __restrict__ faces,
+    const double* __restrict__ frame,
+    const double* __restrict__ origins, int origin_stride,
+    const double* __restrict__ directions, Count count, double t_min, double t_max,
+    double* __restrict__ distance, int* __restrict__ place)
+{
+    const Count i = blockIdx.x * (Count)blockDim.x + threadIdx.x;
+    if (i >= count) return;
+    const Scene scene = {nodes, triangles, corners, faces, frame};
+    const TableRays rays = {origins, origin_stride, directions};
+    const Best best = closest(scene, rays, i, t_min, t_max);
+    place[i] = best.place;
+    if (best.place >= 0) distance[i] = best.t;
+}
+
+// Closest hits of a pattern from one pose; the rest as in cast_table.
+extern "C" __global__ void __launch_bounds__(128) cast_pattern(
+    const float4* __restrict__ nodes, const float4* __restrict__ triangles,
+    const double* __restrict__ corners, const int* __restrict__ faces,
+    const double* __restrict__ frame,
+    const double* __restrict__ pose, int turned,
+    const double* __restrict__ directions, Count count, double t_min, double t_max,
+    double* __restrict__ distance, int* __restrict__ place)
+{
+    const Count i = blockIdx.x * (Count)blockDim.x + threadIdx.x;
+    if (i >= count) return;
+    const Scene scene = {nodes, triangles, corners, faces, frame};
+    const PatternRays rays = {pose, directions, turned};
+    const Best best = closest(scene, rays, i, t_min, t_max);
+    place[i] = best.place;
+    if (best.place >= 0) distance[i] = best.t;
+}
+
+// Weights of the second and third corner for hits of cast_table: hit k is ray[k] at place[k].
+extern "C" __global__ void __launch_bounds__(128) weigh_table(
+    const double* __restrict__ corners, const double* __restrict__ frame,
+    const double* __restrict__ origins, int origin_stride,
+    const double* __restrict__ directions,
+    const Count* __restrict__ ray, const int* __restrict__ place, Count count,
+    double* __restrict__ u, double* __restrict__ v)
+{
+    const Count k = blockIdx.x * (Count)blockDim.x + threadIdx.x;
+    if (k >= count) return;
+    const Scene scene = {0, 0, corners, 0, frame};
+    const TableRays rays = {origins, origin_stride, directions};
+    Exact hit;
+    decide(scene, rays.load(scene, ray[k]), place[k], hit);
+    u[k] = hit.b / hit.det;
+    v[k] = hit.c / hit.det;
+}

@@ -1,0 +1,116 @@
+"""A mesh and its tree as the tables that intersect.cu reads."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .mesh import LocalMesh
+from .tree import PAD, WideTree, build_tree
+
+_WIDTH = 4  # seven float4 a node: one 128-byte line
+_LEAF_SIZE = 4
+_UNIT = 2.0**-24  # half the distance from 1 to the next float32
+_FLOOR = 1e-36  # products of tiny edges round by this much where float32 underflows
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Tables for the device; see the head of intersect.cu for what their columns hold.
+
+    Attributes
+    ----------
+    nodes
+        float32 (m, 32).
+    triangles
+        float32 (k, 12).
+    corners
+        float64 (k, 9).
+    faces
+        int32 (k,).
+    frame
+        float64 (10,).
+    stack
+        Most nodes that can wait during a walk.
+    """
+
+    nodes: NDArray[np.float32]
+    triangles: NDArray[np.float32]
+    corners: NDArray[np.float64]
+    faces: NDArray[np.int32]
+    frame: NDArray[np.float64]
+    stack: int
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all tables."""
+        tables = (self.nodes, self.triangles, self.corners, self.faces, self.frame)
+        return sum(table.nbytes for table in tables)
+
+
+def lay_out(mesh: LocalMesh) -> Layout:
+    """Build the tree over a mesh and flatten both."""
+    tree = build_tree(mesh.corners, _WIDTH, _LEAF_SIZE)
+    corners = mesh.corners[tree.order]
+    low, high = mesh.box
+    return Layout(
+        _nodes(tree),
+        _records(corners),
+        corners.reshape(-1, 9),
+        mesh.index[tree.order],
+        np.concatenate([mesh.centre, [mesh.scale], low - PAD, high + PAD]),
+        _stack_need(tree),
+    )
+
+
+def _nodes(tree: WideTree) -> NDArray[np.float32]:
+    out = np.zeros((len(tree.child), 8, _WIDTH), np.float32)
+    out[:, 0:3] = tree.low
+    out[:, 3:6] = tree.high
+    out[:, 6] = tree.child.view(np.float32)
+    return out.reshape(-1, 32)
+
+
+def _records(corners: NDArray[np.float64]) -> NDArray[np.float32]:
+    """First corner, two edges, and how far rounding can move the test's numbers.
+
+    With u = 2**-24, coordinates within [-1, 1], unit directions d, edges e and g, and
+    t = origin - corner, each of which is rounded to float32 first:
+
+    - ``det = e . (d x g)`` is off by at most 10 u |e| |g|;
+    - ``b = t . (d x g)`` by 40 u |g|: |t| reaches 3.5 and is off by 7 u, the cross product is
+      off by 6 u |g|, the dot product rounds by another 3 u |t| |g|;
+    - ``c = d . (t x e)`` by 45 u |e|, in the same way;
+    - ``g . (t x e)`` by 40 u |e| |g|.
+
+    A comparison with `det` adds its error twice (its sign may come out wrong as well), times
+    the distance, at most 4, for the last one. The numbers below are these with some room.
+    """
+    first = corners[:, 0]
+    edge, other = corners[:, 1] - first, corners[:, 2] - first
+    e, g = np.linalg.norm(edge, axis=1), np.linalg.norm(other, axis=1)
+    out = np.empty((len(corners), 3, 4), np.float32)
+    out[:, 0, :3], out[:, 1, :3], out[:, 2, :3] = first, edge, other
+    out[:, 0, 3] = _UNIT * g * (48 + 24 * e) + _FLOOR
+    out[:, 1, 3] = _UNIT * e * (56 + 24 * g) + _FLOOR
+    out[:, 2, 3] = _UNIT * e * g * 144 + _FLOOR
+    return out.reshape(-1, 12)
+
+
+def _stack_need(tree: WideTree) -> int:
+    """Most nodes that wait on any way down: all children but one of each node above."""
+    used = (tree.low[:, 0] <= tree.high[:, 0]).sum(axis=1)
+    waiting = np.zeros(len(tree.child), np.int64)  # when each node's turn comes
+    level = np.array([0])
+    most = 0
+    while len(level):
+        waiting[level] += np.maximum(used[level] - 1, 0)
+        most = max(most, int(waiting[level].max()))
+        child = tree.child[level]
+        inner = child > 0
+        below = child[inner]
+        waiting[below] = np.broadcast_to(waiting[level][:, None], child.shape)[inner]
+        level = below
+    return most
