@@ -243,7 +243,7 @@ class Scenario(Section):
         rows: dict[str, list[float]] = {}  # {what it stands for: x, y, radius}
         for number, entry in enumerate(self.planning.obstacles):
             if entry.object is None:
-                assert entry.centre is not None, "either of the two is given"
+                assert entry.centre and entry.radius_m, "either of the two kinds is given"
                 place = np.subtract(entry.centre, scene.origin[:2])
                 rows[f"planning.obstacles[{number}]"] = [*place, entry.radius_m]
                 continue

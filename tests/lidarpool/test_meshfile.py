@@ -1,0 +1,404 @@
+"""Every format gives the same objects, and every broken file gives one clear error."""
+
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from lidarpool import meshfile
+from lidarpool.errors import LidarpoolError
+from lidarpool.meshfile import SUFFIXES, load_meshes
+from lidarpool.scene import Scene
+from lidarpool.transform import Transform
+
+OBJ = """# two objects
+o Box
+v {x} 0 0
+v {x1} 0 0
+v {x} 1 0
+usemtl red
+f 1 2 3
+usemtl blue
+f 1 3 2
+o Ball
+v 0 0 5
+v 1 0 5
+v 0 1 5
+f 4 5 6
+"""
+
+PLY = """ply
+format ascii 1.0
+element vertex 4
+property double x
+property double y
+property double z
+element face 2
+property list uchar int vertex_indices
+end_header
+500000.123456 4000000.5 1
+500001.123456 4000000.5 1
+500001.123456 4000001.5 1
+500000.123456 4000001.5 1
+3 0 1 2
+3 0 2 3
+"""
+
+DAE = """<?xml version="1.0"?>
+<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+ <asset>{unit}{up}</asset>
+ <library_geometries><geometry id="g" name="shape"><mesh>
+  <source id="p"><float_array id="a" count="12">{numbers}</float_array>
+   <technique_common><accessor source="#a" count="4" stride="3">
+    <param name="X" type="float"/><param name="Y" type="float"/><param name="Z" type="float"/>
+   </accessor></technique_common></source>
+  <vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
+  <triangles count="1"><input semantic="VERTEX" source="#v" offset="0"/><p>0 1 2</p></triangles>
+  <polylist count="1"><input semantic="VERTEX" source="#v" offset="0"/>
+   <vcount>4</vcount><p>0 1 2 3</p></polylist>
+ </mesh></geometry></library_geometries>
+ <library_visual_scenes><visual_scene id="s">
+  <node id="outer" name="Outer"><translate>10 0 0</translate>
+   <node id="n1" name="Chair"><rotate>0 0 1 90</rotate><instance_geometry url="#g"/></node>
+   <node id="n2" name="Chair"><scale>2 2 -2</scale><instance_geometry url="{url}"/></node>
+  </node>
+ </visual_scene></library_visual_scenes>
+ <scene><instance_visual_scene url="#s"/></scene>
+</COLLADA>
+"""
+DAE_PARTS = {"unit": "", "up": "", "numbers": "0 0 1  1 0 1  1 1 1  0 1 1", "url": "#g"}
+
+
+def dae(**parts):
+    return DAE.format(**(DAE_PARTS | parts))
+
+
+def write(path, content):
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+def export(scene, suffix):
+    content = scene.export(file_type=suffix[1:])
+    return content if isinstance(content, bytes) else content.encode()
+
+
+def triangles(meshes):
+    """All triangles as rows, in an order that does not depend on how they were stored."""
+    rows = np.concatenate([mesh.vertices[mesh.faces].mean(axis=1) for mesh in meshes])
+    return rows[np.lexsort(rows.round(4).T)]
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".obj", ".stl", ".ply", ".off", ".3mf"])
+def test_formats_agree(tmp_path, two_objects, suffix):
+    mesh = two_objects.to_mesh()
+    names = {"two"}
+    source = mesh
+    if suffix in (".glb", ".3mf"):
+        source, names = two_objects, {"Box A", "Ball"}
+    if suffix == ".obj":
+        source, names = two_objects, {"box", "ball"}
+    path = write(tmp_path / f"two{suffix}", export(source, suffix))
+    meshes = load_meshes(path, unit="m", up_axis="z")
+    assert {mesh.name for mesh in meshes} == names
+    assert sum(len(mesh.faces) for mesh in meshes) == len(mesh.faces)
+    expected = mesh.triangles.mean(axis=1)
+    np.testing.assert_allclose(
+        triangles(meshes), expected[np.lexsort(expected.round(4).T)], atol=1e-5
+    )
+
+
+def test_a_suffix_in_capitals(tmp_path, two_objects):
+    path = write(tmp_path / "TWO.GLB", export(two_objects, ".glb"))
+    assert [mesh.name for mesh in load_meshes(path)] == ["Box A", "Ball"]
+
+
+def test_gltf_is_turned_upright_unless_told(tmp_path, two_objects):
+    path = write(tmp_path / "two.glb", export(two_objects, ".glb"))
+    box = load_meshes(path)[0]
+    # File (x, y, z) is world (x, -z, y): the box is 2 m high, its 3 m lie along y.
+    np.testing.assert_allclose(np.ptp(box.vertices, axis=0), [1, 3, 2], atol=1e-6)
+    as_it_is = load_meshes(path, up_axis="z")[0]
+    np.testing.assert_allclose(np.ptp(as_it_is.vertices, axis=0), [1, 2, 3], atol=1e-6)
+
+
+def test_gltf_beside_its_buffers(tmp_path, two_objects):
+    for name, content in two_objects.export(file_type="gltf").items():
+        write(tmp_path / name, content)
+    assert [mesh.name for mesh in load_meshes(tmp_path / "model.gltf")] == ["Box A", "Ball"]
+    next(tmp_path.glob("*.bin")).unlink()
+    with pytest.raises(LidarpoolError, match=r"model\.gltf is broken"):
+        load_meshes(tmp_path / "model.gltf")
+
+
+def test_instances_are_objects(tmp_path):
+    scene = trimesh.Scene()
+    box = trimesh.creation.box((1, 1, 1))
+    for i in range(5):
+        place = trimesh.transformations.translation_matrix((2 * i, 0, 0))
+        scene.add_geometry(box, node_name=f"Crate {i}", geom_name="crate", transform=place)
+    scene = Scene.load(write(tmp_path / "crates.glb", export(scene, ".glb")))
+    assert scene.names == tuple(f"Crate {i}" for i in range(5))
+    np.testing.assert_allclose(scene.object_bounds[:, :, 0].mean(axis=1), [0, 2, 4, 6, 8])
+
+
+def glb(header, body=b""):
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<II", len(text), 0x4E4F534A) + text
+    if body:
+        chunks += struct.pack("<II", len(body), 0x004E4942) + body
+    return b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks
+
+
+def gltf_triangle(**change):
+    """A glTF of one node 'Sign' with a mesh of two primitives, one triangle each."""
+    body = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes()
+    primitive = {"attributes": {"POSITION": 0}}
+    header = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0, 1]}],
+        "nodes": [{"name": "Sign", "mesh": 0}, {"mesh": 0, "translation": [5, 0, 0]}],
+        "meshes": [{"name": "panel", "primitives": [primitive, dict(primitive)]}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"} | change
+        ],
+        "bufferViews": [{"buffer": 0, "byteLength": len(body)}],
+        "buffers": [{"byteLength": len(body)}],
+    }
+    return header, body
+
+
+def test_materials_do_not_split_gltf_objects(tmp_path):
+    path = write(tmp_path / "sign.glb", glb(*gltf_triangle()))
+    meshes = load_meshes(path)
+    assert [(mesh.name, len(mesh.faces)) for mesh in meshes] == [("Sign", 2), ("panel", 2)]
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (lambda h: h.update(extensionsRequired=["KHR_draco_mesh_compression"]), "needs KHR_draco"),
+        (lambda h: h.update(scenes=[]), "no scene"),
+        (lambda h: h["accessors"][0].update(sparse={}), "sparsely"),
+        (lambda h: h["accessors"][0].pop("bufferView"), "sparsely"),
+        (lambda h: h["accessors"][0].update(normalized=True), "normalised"),
+        (lambda h: h["meshes"][0]["primitives"][0].update(mode=6), "fans"),
+        (lambda h: h["accessors"][0].update(count=9), "broken"),
+        (lambda h: h["nodes"][0].update(mesh=7), "broken|no triangles"),
+    ],
+)
+def test_gltf_that_would_be_read_wrong(tmp_path, edit, message):
+    header, body = gltf_triangle()
+    header["nodes"] = header["nodes"][:1]
+    header["scenes"] = [{"nodes": [0]}]
+    edit(header)
+    with pytest.raises(LidarpoolError, match=message):
+        load_meshes(write(tmp_path / "m.glb", glb(header, body)))
+
+
+def test_required_extensions_of_looks_do_no_harm(tmp_path):
+    header, body = gltf_triangle()
+    header["extensionsRequired"] = ["KHR_materials_unlit", "EXT_texture_webp"]
+    assert len(load_meshes(write(tmp_path / "m.glb", glb(header, body)))) == 2
+
+
+def test_obj_objects_keep_names_order_and_digits(tmp_path):
+    text = OBJ.format(x="500000.123456", x1="500001.123456")
+    meshes = load_meshes(write(tmp_path / "two.obj", text))
+    assert [(mesh.name, len(mesh.faces)) for mesh in meshes] == [("Box", 2), ("Ball", 1)]
+    assert meshes[0].vertices[:, 0].min() == 500000.123456
+
+
+def test_georeferenced_double_precision_ply(tmp_path):
+    scene = Scene.load(write(tmp_path / "geo.ply", PLY))
+    np.testing.assert_array_equal(scene.origin % 1, 0)
+    world = scene.vertices + scene.origin
+    np.testing.assert_array_equal(world.min(axis=0), [500000.123456, 4000000.5, 1])
+    assert np.abs(scene.vertices[:, :2]).max() < 2
+
+
+def test_placement_far_away_loses_nothing(tmp_path):
+    path = write(tmp_path / "m.obj", OBJ.format(x="0.125", x1="1.125"))
+    placed = Transform.place((512_000.5, 5_400_000.25, 300))
+    scene = Scene.load(path, transform=placed)
+    assert (scene.vertices + scene.origin)[:, 0].min() == 512_000.5
+    np.testing.assert_array_equal(np.ptp(scene.vertices, axis=0), [1.125, 1, 5])
+
+
+@pytest.mark.parametrize(("unit", "metres"), [("mm", 0.001), ("in", 0.0254), ("km", 1000.0)])
+def test_units(tmp_path, unit, metres):
+    path = write(tmp_path / "m.obj", OBJ.format(x=0, x1=1))
+    ball = load_meshes(path, unit=unit)[1]
+    np.testing.assert_allclose(ball.vertices.max(axis=0), np.array([1, 1, 5]) * metres)
+
+
+def test_3mf_is_in_millimetres(tmp_path, two_objects):
+    path = write(tmp_path / "two.3mf", export(two_objects, ".3mf"))
+    box = load_meshes(path)[0]
+    np.testing.assert_allclose(np.ptp(box.vertices, axis=0), [0.001, 0.002, 0.003])
+
+
+def test_mirrored_objects_keep_their_outside(tmp_path, tetrahedron):
+    mesh = trimesh.Trimesh(*tetrahedron, process=False)
+    path = write(tmp_path / "t.ply", mesh.export(file_type="ply"))
+    mirrored = load_meshes(path, transform=Transform.place(scale=(-1, 1, 1)))[0]
+    assert trimesh.Trimesh(mirrored.vertices, mirrored.faces, process=False).volume == (
+        pytest.approx(mesh.volume)
+    )
+
+
+def test_dae_names_unit_axis_and_digits(tmp_path):
+    text = dae(
+        unit='<unit name="centimeter" meter="0.01"/>',
+        up="<up_axis>Y_UP</up_axis>",
+        numbers="0 0 1  50000012.25 0 1  1 1 1  0 1 1",
+    )
+    meshes = load_meshes(write(tmp_path / "m.dae", text))
+    assert [(mesh.name, len(mesh.faces)) for mesh in meshes] == [("Chair", 3), ("Chair", 3)]
+    # 50000012.25 along x, turned by 90 degrees about z to y, moved by 10; then Y-up: y is z.
+    far = meshes[0].vertices
+    np.testing.assert_allclose(far[:, 2].max(), 500000.1225, rtol=1e-15)
+    np.testing.assert_allclose(far[:, 0].max(), 0.1, rtol=1e-7)
+    doubled = meshes[1].vertices
+    assert doubled[:, 0].max() == pytest.approx(1000000.345, rel=1e-15)
+    assert doubled[:, 1].max() == pytest.approx(0.02, rel=1e-12)
+    assert Scene.from_meshes(meshes).names == ("Chair", "Chair.2")
+
+
+def test_dae_that_states_nothing_is_in_metres_and_stands_by_its_standard(tmp_path):
+    # COLLADA 1.4.1: up_axis is Y_UP where it is left out.
+    meshes = load_meshes(write(tmp_path / "m.dae", dae()))
+    assert np.ptp(meshes[1].vertices, axis=0).tolist() == [2, 0, 2]
+
+
+def test_dae_with_a_lost_geometry(tmp_path):
+    with pytest.raises(LidarpoolError, match=r"broken or cut short .*lost"):
+        load_meshes(write(tmp_path / "m.dae", dae(url="#lost")))
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".stl", ".ply", ".off", ".3mf", ".dae", "ascii"])
+def test_a_cut_file_never_loses_triangles_in_silence(tmp_path, two_objects, suffix):
+    # .obj is not here: its lines announce nothing, so that some cuts cannot be seen.
+    mesh = two_objects.to_mesh()
+    if suffix == "ascii":
+        path, content = tmp_path / "m.stl", mesh.export(file_type="stl_ascii").encode()
+    elif suffix == ".dae":
+        path, content = tmp_path / "m.dae", dae().encode()
+    else:
+        source = two_objects if suffix in (".glb", ".3mf") else mesh
+        path, content = tmp_path / f"m{suffix}", export(source, suffix)
+    write(path, content)
+    whole = sum(len(mesh.faces) for mesh in load_meshes(path))
+    size = len(content)
+    refused = 0
+    for cut in {*np.linspace(0, size - 1, 40).astype(int).tolist(), *range(size - 15, size)}:
+        path.write_bytes(content[:cut])
+        try:
+            found = sum(len(mesh.faces) for mesh in load_meshes(path))
+        except LidarpoolError as error:
+            assert str(path) in str(error)
+            assert str(error).count("\n") <= 1
+            refused += 1
+        else:
+            assert found == whole, f"cut at {cut} of {size}"
+    assert refused > 30
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("content", ["noise", "text", "zeros"])
+def test_junk(tmp_path, suffix, content):
+    junk = {
+        "noise": np.random.default_rng(5).bytes(3000),
+        "text": b"This is not a mesh.\n" * 20,
+        "zeros": bytes(2000),
+    }
+    path = write(tmp_path / f"junk{suffix}", junk[content])
+    with pytest.raises(LidarpoolError) as caught:
+        load_meshes(path)
+    assert str(path) in str(caught.value)
+    assert str(caught.value).count("\n") <= 1
+    assert len(str(caught.value)) < 400 + len(str(path))
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("m.obj", "", r"is empty \(0 bytes\)"),
+        ("m.obj", "# nothing\n", "no triangles"),
+        ("m.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n", "no triangles"),
+        ("m.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "broken"),
+        ("m.obj", "v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n", "1 of the 3 vertices .* NaN"),
+        ("m.obj", "v 0 0 0\nv 1 0 0\nv 0 inf 0\nf 1 2 3\n", "NaN or infinite"),
+        ("m.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf -1 -2 -3\nv 5 5 5\n", "backwards"),
+        ("m.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "broken"),
+        ("m.off", "OFF\n3 2 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "cut short: 5 vertices and"),
+        ("m.off", "OFF\n0 0 0\n", "no triangles|broken|cut"),
+        ("m.stl", "solid a\nendsolid a\n", "no triangles"),
+        ("m.stl", "solid a\nfacet\n", "does not end"),
+        ("m.ply", PLY.replace("element face 2", "element face 0"), "point cloud"),
+        ("m.ply", PLY.replace("3 0 2 3\n", ""), "6 rows announced, 5 there"),
+        ("m.ply", PLY.replace("3 0 2 3\n", "3 0 2\n"), "its last face is '3 0 2'"),
+        ("m.ply", PLY.replace("3 0 2 3", "3 0 2 9"), "vertices 0 to 9|broken"),
+        ("m.ply", PLY.partition("end_header")[0], "no PLY header"),
+        ("m.ply", PLY.replace("500001.123456 4000001.5", "nan 4000001.5"), "NaN|broken"),
+        ("m.las", "LASF", "has the ending .las"),
+        ("m", "x", r"has the ending \(none\)"),
+        ("m.gltf", "{", "no valid JSON"),
+        ("m.gltf", "[]", "no glTF object"),
+        ("m.gltf", "[" * 100_000, "no valid JSON"),
+        ("m.3mf", b"PK\5\6" + bytes(18), "broken"),
+    ],
+)
+def test_bad_files(tmp_path, name, content, message):
+    path = write(tmp_path / name, content)
+    with pytest.raises(LidarpoolError, match=message) as caught:
+        load_meshes(path)
+    assert str(path) in str(caught.value)
+
+
+def test_missing_and_folders(tmp_path):
+    (tmp_path / "d.glb").mkdir()
+    with pytest.raises(LidarpoolError, match="does not exist"):
+        load_meshes(tmp_path / "no.glb")
+    with pytest.raises(LidarpoolError, match="is not a file"):
+        load_meshes(tmp_path / "d.glb")
+
+
+def test_unreadable(tmp_path, monkeypatch):
+    path = write(tmp_path / "m.obj", "x")
+
+    def denied(_):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "read_bytes", denied)
+    with pytest.raises(LidarpoolError, match="cannot be read: Permission denied"):
+        load_meshes(path)
+
+
+@pytest.mark.parametrize("stop", [KeyboardInterrupt, MemoryError])
+def test_interrupts_and_lack_of_memory_pass(tmp_path, monkeypatch, stop):
+    def stopped(*_, **__):
+        raise stop
+
+    monkeypatch.setattr(meshfile.trimesh, "load_scene", stopped)
+    with pytest.raises(stop):
+        load_meshes(write(tmp_path / "m.obj", OBJ.format(x=0, x1=1)))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"unit": "parsec"}, "must be one of um, mm"), ({"up_axis": "w"}, "must be x, y or z")],
+)
+def test_bad_options(tmp_path, options, message):
+    with pytest.raises(LidarpoolError, match=message):
+        load_meshes(write(tmp_path / "m.obj", OBJ.format(x=0, x1=1)), **options)
+
+
+def test_degenerate_triangles_are_kept(tmp_path):
+    text = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 1 1 2\n"
+    assert len(load_meshes(write(tmp_path / "m.obj", text))[0].faces) == 2

@@ -1,0 +1,351 @@
+"""Scenario files: defaults, what they build, and a message for each way to get one wrong."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidarpool.complaints import did_you_mean
+from lidarpool.errors import LidarpoolError
+from lidarpool.scenario import Scenario
+from lidarpool.sections import Section
+from lidarpool.sensor import Sensor
+from lidarpool.survey import Survey
+from lidarpool.transform import UNITS_M
+from lidarpool.yamlfile import SIZE_LIMIT, read_yaml
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+DEFAULT = Survey(Sensor(), poses=[(0, 0, 1), (0, 0, 2), (0, 0, 3)])
+
+
+@pytest.fixture
+def scenario(tmp_path):
+    """Return a function that loads a scenario from its text."""
+
+    def load(text):
+        path = tmp_path / "s.yaml"
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return Scenario.load(path)
+
+    return load
+
+
+@pytest.fixture
+def crate(tmp_path):
+    """Write crate.stl, a box of 2 x 4 x 6 m about the origin."""
+    mesh = trimesh.creation.box((2, 4, 6))
+    (tmp_path / "crate.stl").write_bytes(mesh.export(file_type="stl"))
+    return tmp_path / "crate.stl"
+
+
+def everything(loaded):
+    """Build all that a scenario describes."""
+    scene = loaded.build_scene()
+    return scene, loaded.survey(scene), loaded.plan(scene)
+
+
+@pytest.mark.parametrize("source", ["python", "file", "empty sections"])
+def test_the_default_survey(source, scenario):
+    if source == "python":
+        loaded = Scenario()
+    elif source == "file":
+        loaded = Scenario.load(EXAMPLES / "seed.yaml")
+    else:
+        loaded = scenario("scene:\nsensor:\nposes:\ncloud:\nplanning:\npool:\n")
+    scene, survey, planning = everything(loaded)
+    assert survey == DEFAULT
+    assert survey.scan_count == 108
+    assert survey.ray_count == 120_000
+    assert len(scene.faces) == 76_800
+    assert planning.start == (25, 25)
+    assert planning.target == (-30, -20)
+    np.testing.assert_allclose(planning.radii, 2.0, atol=1e-12)
+    centres = [(-20, -20), (20, -20), (-20, 20), (20, 20), (-10, -5), (5, 5)]
+    np.testing.assert_allclose(planning.centres, centres, atol=1e-12)
+    numbers = (planning.trials, planning.particles, planning.iterations, planning.seed)
+    assert numbers == (100, 1000, 300, 0)
+    assert loaded.pool.queue_capacity == 10
+    assert loaded.pool.collectors == 2
+    assert loaded.pool.backend == "auto"
+
+
+def test_the_seed_example_writes_out_the_defaults():
+    stated = read_yaml(EXAMPLES / "seed.yaml")
+    plain = Scenario().model_dump()
+    for section in ("sensor", "cloud"):
+        assert stated[section] == plain[section]
+    for section in ("planning", "pool"):
+        for name in set(stated[section]) - {"enabled", "start", "target", "obstacles"}:
+            assert stated[section][name] == plain[section][name]
+
+
+def test_the_warehouse_example_with_a_mesh_beside_it(tmp_path):
+    scene = trimesh.Scene()
+    for i, name in enumerate(["Cluttering", "ShelfD", "ShelfE", "Bucket"]):
+        place = trimesh.transformations.translation_matrix((6, 1, 3 * i))
+        scene.add_geometry(trimesh.creation.box((1, 2, 1)), node_name=name, transform=place)
+    (tmp_path / "warehouse.glb").write_bytes(scene.export(file_type="glb"))
+    shutil.copy(EXAMPLES / "warehouse.yaml", tmp_path)
+    scene, survey, planning = everything(Scenario.load(tmp_path / "warehouse.yaml"))
+    assert scene.names == ("Cluttering", "ShelfD", "ShelfE", "Bucket")
+    np.testing.assert_allclose(scene.bounds[:, 2], [0, 2], atol=1e-6)
+    assert survey.sensor.layers == 64
+    assert [pose.pitch_deg for pose in survey.poses] == [0, 0, 10]
+    assert len(planning.radii) == 5
+    np.testing.assert_allclose(planning.radii[0], np.hypot(0.5, 0.5) + 0.2)
+
+
+def test_the_warehouse_example_asks_for_the_mesh():
+    with pytest.raises(LidarpoolError, match=r"warehouse\.glb does not exist"):
+        Scenario.load(EXAMPLES / "warehouse.yaml").build_scene()
+
+
+def test_mesh_files_are_placed(scenario, crate):
+    loaded = scenario(
+        """
+        scene:
+          files:
+            - crate.stl
+            - {file: crate.stl, unit: cm, translation: [10, 0, 0], rotation_deg: [90, 0, 0]}
+            - file: crate.stl
+              up_axis: y
+              scale: [1, 1, 2]
+            - file: crate.stl
+              matrix: [[1, 0, 0, 7], [0, 1, 0, 8], [0, 0, 1, 9], [0, 0, 0, 1]]
+          ground: {height_m: -4, margin_m: 1}
+        """
+    )
+    scene = loaded.build_scene()
+    assert scene.names == ("crate", "crate.2", "crate.3", "crate.4", "Ground")
+    sizes = np.ptp(scene.object_bounds, axis=1)
+    np.testing.assert_allclose(sizes[:4], [[2, 4, 6], [0.02, 0.06, 0.04], [2, 6, 8], [2, 4, 6]])
+    np.testing.assert_allclose(scene.object_bounds[3].mean(axis=0), [7, 8, 9])
+    np.testing.assert_allclose(scene.object_bounds[4], [[-2, -4, -4], [11.01, 11, -4]])
+    assert loaded.plan(scene) is None
+
+
+def test_files_relative_to_the_scenario_and_seed_beside_them(scenario, crate):
+    (crate.parent / "meshes").mkdir()
+    crate.rename(crate.parent / "meshes" / "crate.stl")
+    scene = scenario("scene: {preset: seed, files: meshes/crate.stl}").build_scene()
+    assert scene.names[-2:] == ("Goblet", "crate")
+
+
+def test_a_mesh_file_is_a_scenario(crate):
+    scene, survey, planning = everything(Scenario.load(crate))
+    assert scene.names == ("crate",)
+    assert [pose.position for pose in survey.poses] == [(0, 0, -2), (0, 0, -1), (0, 0, 0)]
+    assert planning is None
+
+
+def test_georeferenced_poses_and_plans_are_local(scenario, crate):
+    loaded = scenario(
+        """
+        scene: {files: [{file: crate.stl, translation: [500000.5, 4000000.25, 100]}]}
+        poses: [[500010.5, 4000000.25, 101], {position: [500000, 4000010, 102], yaw_deg: 45}]
+        planning: {start: [500010, 4000000], target: [499990, 4000000], clearance_m: 0.5}
+        """
+    )
+    scene, survey, planning = everything(loaded)
+    world = [np.add(pose.position, scene.origin).tolist() for pose in survey.poses]
+    assert world == [[500010.5, 4000000.25, 101], [500000, 4000010, 102]]
+    assert np.abs([pose.position for pose in survey.poses]).max() < 20
+    assert survey.poses[1].yaw_deg == 45
+    np.testing.assert_allclose(planning.centres + scene.origin[:2], [[500000.5, 4000000.25]])
+    np.testing.assert_allclose(planning.radii, np.hypot(1, 2) + 0.5)
+    assert np.add(planning.start, scene.origin[:2]).tolist() == [500010, 4000000]
+
+
+def test_obstacles(scenario):
+    def plan(text):
+        return everything(scenario(f"planning: {text}"))[2]
+
+    assert len(plan("{obstacles: auto}").radii) == 6
+    assert len(plan("{obstacles: []}").radii) == 0
+    assert len(plan('{obstacles: ["*e*", {object: Vase}]}').radii) == 5
+    disc = plan("{obstacles: [{centre: [1, 2], radius_m: 3}], clearance_m: 0.5}")
+    assert (disc.centres.tolist(), disc.radii.tolist()) == ([[1, 2]], [3.5])
+    assert plan("{enabled: false}") is None
+
+
+def test_flat_objects_are_no_obstacles(scenario):
+    text = "scene: {preset: seed, ground: {margin_m: 20}}"
+    assert len(everything(scenario(text))[2].radii) == 6
+
+
+def test_numbers_as_everybody_writes_them(scenario):
+    loaded = scenario("cloud: {precision_m: 1e-3}\nsensor: {max_range_m: .inf, step_deg: 20}")
+    assert loaded.cloud.precision_m == 0.001
+    assert loaded.sensor.sensor() == Sensor(step_deg=20)
+
+
+def test_the_units_of_the_schema_are_those_that_can_be_read():
+    for unit in UNITS_M:
+        Scenario.from_data({"scene": {"files": [{"file": "m.stl", "unit": unit}]}})
+
+
+def test_scenarios_are_frozen():
+    with pytest.raises(ValueError, match="frozen"):
+        Scenario().steps = 5
+    assert issubclass(Scenario, Section)
+
+
+IDENTITY = "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"
+BAD = [
+    # (text, what the message says after the file's name)
+    ("sensor: {layers: 0}", r"sensor\.layers is 0; it must be 1 to 65535"),
+    ("sensor: {layers: 70000}", r"sensor\.layers is 70000; it must be 1 to 65535"),
+    ("sensor: {layers: '40'}", r"sensor\.layers is '40'; it must be a whole number, 1 to"),
+    ("sensor: {layers: 4.5}", r"is 4\.5; it must be a whole number"),
+    ("sensor: {layers: true}", r"is true; it must be a whole number"),
+    ("sensor: {layers: }", r"is empty; it must be a whole number"),
+    ("sensor: {layer: 4}", r"sensor\.layer is not a field\. Did you mean 'layers'\?"),
+    ("sensr: {}", r"sensr is not a field\. Did you mean 'sensor'\?"),
+    ("zzz: {}", r"zzz is not a field\. There are: scene, sensor, poses"),
+    ("sensor: {vertical_fov_deg: .nan}", r"is nan; it must be a finite number, above 0"),
+    ("sensor: {vertical_fov_deg: 181}", r"is 181; it must be above 0(\.0)?, at most 180"),
+    ("sensor: {max_range_m: .nan}", r"max_range_m is nan; it must be above 0"),
+    ("sensor: {step_deg: 0.1}", "less than one azimuth"),
+    ("sensor: {min_range_m: 5, max_range_m: 2}", "must be above min_range_m"),
+    ("sensor: {layers: 65535, rays_per_revolution: 36000}", "at most 100,000,000 rays"),
+    ("sensor: 5", r"sensor is 5; it must be a section of fields"),
+    ("sensor: [1]", r"sensor is \[1\]; it must be a section of fields"),
+    ("poses: []", r"poses is \[\]; it must be a list of at least 1"),
+    ("poses: 5", "poses is 5; it must be a list"),
+    ("poses: [[0, 0]]", r"poses\[0\]\.position is \[0, 0\]; it must be a list of 3"),
+    ("poses: [[0, 0, 0, 0]]", r"poses\[0\]\.position .* must be a list of 3"),
+    ("poses: [[0, 0, x]]", r"poses\[0\]\.position\[2\] is 'x'; it must be a number"),
+    ("poses: [[0, 0, 1e99]]", r"poses\[0\]\.position\[2\] is 1e\+99; it must be at most"),
+    ("poses: [[0, 0, .inf]]", r"is inf; it must be a finite number"),
+    ("poses: [{yaw_deg: 0}]", r"poses\[0\]\.position is missing"),
+    ("poses: [{position: [0, 0, 0], yaw: 5}]", r"poses\[0\]\.yaw is not.*'yaw_deg'"),
+    ("steps: 0", "steps is 0; it must be 1 to 1000000"),
+    ("steps: 1000000\nposes: [" + "[0,0,1]," * 11 + "]", "11,000,000 scans; at most 10,000,000"),
+    ("scene: none", "nothing to scan"),
+    ("scene: missing.glb", r"missing\.glb does not exist"),
+    ("scene: {files: [{unit: m}]}", r"scene\.files\[0\]\.file is missing"),
+    ("scene: {files: [{file: ''}]}", r"must be text that is not empty"),
+    ("scene: {files: [{file: a.stl, unit: parsec}]}", r"unit is 'parsec'; it must be one of 'um'"),
+    ("scene: {files: [{file: a.stl, scale: 0}]}", "scale is 0 along an axis"),
+    ("scene: {files: [{file: a.stl, scale: 2, matrix: " + IDENTITY + "}]}", "either matrix or"),
+    ("scene: {files: [{file: a.stl, matrix: [[1,0,0]]}]}", "must be a"),
+    ("scene: {files: [{file: a.stl, matrix: " + IDENTITY.replace("1", "0") + "}]}", "0 0 0 1"),
+    ("scene: {preset: sead}", "preset is 'sead'; it must be one of 'seed', 'none'"),
+    ("scene: {ground: {margin_m: -1}}", "margin_m is -1; it must be"),
+    ("cloud: {precision_m: 0}", "precision_m is 0; it must be"),
+    ("cloud: {precision_m: 1e-3x}", "is '1e-3x'; it must be a number"),
+    ("cloud: {precision_m: 1e400}", "is inf; it must be a finite number"),
+    ("cloud: {precision_m: " + "9" * 400 + "}", "it must be a number"),
+    ("cloud: {keep_every: 0}", "keep_every is 0; it must be 1 to"),
+    ("planning: {start: [5, 5]}", r"planning\.start lies .* middle of Goblet"),
+    ("planning: {start: [5]}", r"planning\.start is \[5\]; it must be a list of 2"),
+    ("planning: {start: [1, 1], target: [1, 1]}", "nothing to plan"),
+    ("planning: {obstacles: [Bel]}", "Did you mean 'Bell'"),
+    ("planning: {obstacles: [xyzzy]}", "The scene has Sphere"),
+    ("planning: {obstacles: all}", "obstacles is 'all'; it must be a list"),
+    ("planning: {obstacles: [{centre: [0, 0]}]}", "both centre and radius_m"),
+    ("planning: {obstacles: [{object: Vase, radius_m: 1}]}", "both centre and radius_m"),
+    ("planning: {trials: -3}", "trials is -3; it must be 1 to"),
+    ("planning: {seed: 99999999999999999999}", "seed is 9+; it must be 0 to"),
+    ("planning: {enabled: 1}", "enabled is 1; it must be true or false"),
+    ("scene: a.stl\nplanning: {enabled: true}", r"give planning\.start and planning\.target"),
+    ("pool: {backend: opengl}", "must be one of 'auto', 'cuda', 'embree', 'numpy'"),
+    ("pool: {queue_capacity: 0}", "queue_capacity is 0; it must be 1 to"),
+    ("pool: {gpus: 1}", r"pool\.gpus is not a field\. Did you mean 'gpu'"),
+    ("", "is empty: see examples"),
+    ("# nothing\n", "is empty"),
+    ("- 1", "holds a list; a scenario has sections"),
+    ("hello", "holds only 'hello'"),
+    ("a: b: c", "line 1: mapping values are not allowed"),
+    ("steps: 4\nsensor: {}\nsteps: 5", "line 3: 'steps' is given twice"),
+    ("sensor: {layers: 4, layers: 4}", "line 1: 'layers' is given twice"),
+    ("1: 2", "1.* is not a field"),
+    ("[1]: 2", "unhashable key"),
+    ("scene: &a [*a]", r"must be a section of fields"),
+    ("[" * 50_000, "nested too deeply"),
+    ("steps: 2026-99-99", "not valid YAML: month must be"),
+    ("steps: " + "1" * 5000, "not valid YAML: Exceeds the limit"),
+    ("steps: !!python/object/apply:os.getcwd []", "tags such as !name have no meaning"),
+    ("steps: !go 5", "tags such as !name have no meaning"),
+    (b"\xff\xfe\x00", "not UTF-8"),
+    ("steps: '\0'", "not valid YAML: unacceptable character"),
+]
+
+
+@pytest.mark.parametrize(("text", "message"), BAD, ids=[str(i) for i in range(len(BAD))])
+def test_bad_scenarios(scenario, tmp_path, text, message):
+    with pytest.raises(LidarpoolError, match=message) as caught:
+        everything(scenario(text))
+    told = str(caught.value)
+    assert str(tmp_path) in told
+    assert told.count("\n") <= 1
+    assert all(len(line) < 300 + len(str(tmp_path)) for line in told.splitlines())
+
+
+def test_several_faults_take_two_lines(scenario):
+    with pytest.raises(LidarpoolError) as caught:
+        scenario("steps: 0\nsensor: {layers: 0, layer: 1}\ncloud: {keep_every: 0}")
+    lines = str(caught.value).splitlines()
+    assert len(lines) == 2
+    assert lines[1].endswith("(2 more to follow.)")
+
+
+def test_bad_files(tmp_path):
+    with pytest.raises(LidarpoolError, match="does not exist"):
+        Scenario.load(tmp_path / "no.yaml")
+    with pytest.raises(LidarpoolError, match="is a folder"):
+        Scenario.load(tmp_path)
+    large = tmp_path / "large.yaml"
+    large.write_bytes(b"#" * (SIZE_LIMIT + 1))
+    with pytest.raises(LidarpoolError, match="larger than 4 MiB"):
+        Scenario.load(large)
+    with pytest.raises(LidarpoolError, match="cannot be read"):
+        Scenario.load(tmp_path / "nul\0.yaml")
+
+
+def test_a_broken_mesh_is_named(scenario, tmp_path):
+    (tmp_path / "m.stl").write_bytes(b"junk")
+    with pytest.raises(LidarpoolError, match=r"m\.stl holds no triangles"):
+        scenario("scene: m.stl").build_scene()
+
+
+YAML_VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
+    lambda inner: (
+        st.lists(inner, max_size=4)
+        | st.dictionaries(
+            st.sampled_from(["file", "files", "position", "layers", "seed", "object", "x"]),
+            inner,
+            max_size=4,
+        )
+    ),
+    max_leaves=12,
+)
+
+
+@settings(deadline=None, max_examples=200)
+@given(
+    st.dictionaries(
+        st.sampled_from(["scene", "sensor", "poses", "steps", "cloud", "planning", "pool", "x"]),
+        YAML_VALUES,
+        max_size=4,
+    )
+)
+def test_any_data_is_a_scenario_or_one_error_for_users(data):
+    try:
+        loaded = Scenario.from_data(data, source="s.yaml")
+    except LidarpoolError as error:
+        assert str(error).startswith("s.yaml: ")
+        assert str(error).count("\n") <= 1
+    else:
+        assert set(data) <= set(Scenario.model_fields)
+        assert loaded.steps >= 1
+
+
+def test_did_you_mean():
+    assert did_you_mean("LAYER", ["layers", "step_deg"]) == " Did you mean 'layers'?"
+    assert did_you_mean("xyzzy", ["layers"]) == ""

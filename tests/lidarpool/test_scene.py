@@ -1,0 +1,149 @@
+"""A scene keeps every triangle, name and digit of the meshes it is made of."""
+
+import pickle
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidarpool.errors import LidarpoolError
+from lidarpool.mesh import Mesh
+from lidarpool.scene import Scene, local_origin, unique_names
+
+FACES = np.array([[0, 1, 2]])
+
+
+def triangle(name="T", at=(0.0, 0.0, 0.0)):
+    return Mesh(name, np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]]) + np.array(at), FACES)
+
+
+def world(scene):
+    return scene.vertices[scene.faces] + scene.origin
+
+
+def test_seed():
+    scene = Scene.seed()
+    assert scene.names == ("Sphere", "Vase", "Bell", "Pawn", "Spindle", "Goblet")
+    assert scene.vertices.dtype == np.float64
+    assert scene.faces.dtype == scene.face_object.dtype == np.int32
+    assert scene.faces.shape == (76_800, 3)
+    np.testing.assert_array_equal(np.bincount(scene.face_object), [12_800] * 6)
+    np.testing.assert_array_equal(scene.origin, [0, 0, 0])
+    centres = [(-20, -20), (20, -20), (-20, 20), (20, 20), (-10, -5), (5, 5)]
+    np.testing.assert_allclose(scene.footprints[:, :2], centres, atol=1e-12)
+    np.testing.assert_allclose(scene.footprints[:, 2], 2.0, atol=1e-12)
+    np.testing.assert_allclose(scene.bounds, [[-22, -22, 0], [22, 22, 5.1]], atol=1e-12)
+
+
+def test_seed_is_the_same_each_time_and_through_pickle():
+    first, second = Scene.seed(), pickle.loads(pickle.dumps(Scene.seed()))
+    for name in ("vertices", "faces", "face_object", "origin"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+    assert first.names == second.names
+
+
+def test_arrays_cannot_be_changed():
+    scene = Scene.seed()
+    for array in (scene.vertices, scene.faces, scene.face_object, scene.origin):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 0
+
+
+@settings(deadline=None)
+@given(
+    st.tuples(*[st.floats(-6e6, 6e6)] * 3),
+    st.lists(st.tuples(*[st.floats(-500, 500)] * 3), min_size=1, max_size=5),
+)
+def test_world_coordinates_come_back(centre, offsets):
+    given = [triangle(at=np.add(centre, offset)) for offset in offsets]
+    scene = Scene.from_meshes(given)
+    expected = np.concatenate([mesh.vertices[mesh.faces] for mesh in given])
+    np.testing.assert_allclose(world(scene), expected, rtol=0, atol=2e-9)
+    np.testing.assert_array_equal(scene.origin, np.round(scene.origin))
+    if np.abs(centre).max() > 11_000:
+        assert np.abs(scene.vertices).max() < 1001
+    elif np.abs(centre).max() < 9_000:
+        assert not scene.origin.any()
+
+
+def test_georeferenced_coordinates_lose_no_digit():
+    given = triangle(at=(512_345.678_9, 5_403_210.123_4, 431.5))
+    scene = Scene.from_meshes([given])
+    np.testing.assert_array_equal(world(scene), given.vertices[given.faces])
+    np.testing.assert_array_equal(scene.origin, [512_346, 5_403_211, 432])
+
+
+def test_merge_keeps_world_coordinates_and_names():
+    near = Scene.from_meshes([triangle("Shelf"), triangle("Box")])
+    far = Scene.from_meshes([triangle("Shelf", at=(500_000, 4e6, 10))])
+    both = Scene.merge([near, far])
+    assert both.names == ("Shelf", "Box", "Shelf.2")
+    np.testing.assert_array_equal(both.face_object, [0, 1, 2])
+    np.testing.assert_allclose(
+        world(both), np.concatenate([world(near), world(far)]), rtol=0, atol=1e-9
+    )
+
+
+def test_meshes_are_the_inverse_of_from_meshes():
+    scene = Scene.seed()
+    again = Scene.from_meshes(scene.meshes())
+    assert again.names == scene.names
+    np.testing.assert_array_equal(world(again), world(scene))
+    np.testing.assert_array_equal(again.face_object, scene.face_object)
+
+
+def test_local_origin():
+    near = np.array([[0.0, 0, 0], [19_000, 0, 0]])
+    np.testing.assert_array_equal(local_origin(near), [0, 0, 0])
+    far = np.array([[500_000.25, 10.0, 0], [500_003.75, 20.0, 5]])
+    np.testing.assert_array_equal(local_origin(far), [500_002, 15, 2])
+
+
+def test_unused_vertices_do_not_count_in_bounds():
+    mesh = Mesh("T", np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [99, 99, 99]]), FACES)
+    np.testing.assert_array_equal(Scene.from_meshes([mesh]).bounds, [[0, 0, 0], [1, 1, 0]])
+
+
+@given(st.lists(st.sampled_from(["a", "b", "a.2", "a.3", "b.2.2"]), max_size=12))
+def test_unique_names(names):
+    unique = unique_names(names)
+    assert len(set(unique)) == len(names)
+    for position, (name, plain) in enumerate(zip(unique, names, strict=True)):
+        if plain not in names[:position]:
+            assert name == plain
+        else:
+            assert name.startswith(f"{plain}.")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"faces": np.empty((0, 3), int)}, "needs triangles"),
+        ({"faces": [[0, 1, 3]]}, "name the 3 vertices"),
+        ({"faces": [[0, 1, -1]]}, "name the 3 vertices"),
+        ({"vertices": [[0, 0, 0], [1, 0, 0], [0, np.nan, 0]]}, "1 of the 3 vertices"),
+        ({"vertices": np.zeros((3, 2))}, r"expected \(v, 3\)"),
+        ({"face_object": [1]}, "face_object"),
+        ({"face_object": [0, 0]}, "face_object"),
+        ({"origin": [0, 0, np.inf]}, "origin"),
+        ({"origin": [0, 0]}, "origin"),
+    ],
+)
+def test_scenes_that_do_not_fit_together(change, message):
+    good = {
+        "vertices": np.eye(3),
+        "faces": [[0, 1, 2]],
+        "face_object": [0],
+        "names": ("T",),
+        "origin": np.zeros(3),
+    }
+    Scene(**good)
+    with pytest.raises(LidarpoolError, match=message):
+        Scene(**(good | change))
+
+
+def test_a_scene_of_nothing():
+    for make in (Scene.from_meshes, Scene.merge):
+        with pytest.raises(LidarpoolError, match="at least one object"):
+            make([])

@@ -1,0 +1,115 @@
+"""Surfaces of revolution are closed, round and as large as they should be."""
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidarpool.errors import LidarpoolError
+from lidarpool.shapes import (
+    SEED_OUTLINES,
+    SEED_POSITIONS,
+    resample,
+    revolve,
+    seed_objects,
+    smooth,
+)
+
+
+def closed(mesh):
+    """Whether every edge belongs to two faces that run along it in opposite directions."""
+    edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
+    forth = {tuple(edge) for edge in edges.tolist()}
+    return len(forth) == len(edges) and forth == {(b, a) for a, b in forth}
+
+
+def areas(mesh):
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+
+
+def volume(mesh):
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
+    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+
+
+@pytest.mark.parametrize("index", range(6))
+def test_each_seed_object(index):
+    mesh = seed_objects()[index]
+    assert len(mesh.faces) == 12_800
+    assert len(mesh.vertices) == 80 * 80 + 2
+    assert closed(mesh)
+    assert areas(mesh).min() > 1e-5
+    assert len(np.unique(mesh.vertices.round(9), axis=0)) == len(mesh.vertices)
+    local = mesh.vertices - [*SEED_POSITIONS[index], 0]
+    assert np.hypot(local[:, 0], local[:, 1]).max() == pytest.approx(2.0, abs=1e-12)
+    assert local[:, 2].min() == 0.0
+    assert 4.0 <= local[:, 2].max() <= 5.2
+    assert volume(mesh) > 10  # outward faces
+
+
+def test_seed_objects_do_not_cross_themselves():
+    # Their profiles are simple curves: no two legs that are not neighbours meet.
+    for name, outline in SEED_OUTLINES.items():
+        line = resample(smooth(outline), 82)
+        a, b = line[:-1], line[1:]
+
+        def side(p, q, r):
+            return np.sign((q - p)[..., 0] * (r - p)[..., 1] - (q - p)[..., 1] * (r - p)[..., 0])
+
+        first, second = a[:, None], b[:, None]
+        across = side(first, second, a) * side(first, second, b) < 0
+        assert not np.any(across & across.T), name
+
+
+def test_seed_objects_differ_and_have_names():
+    meshes = seed_objects()
+    assert [mesh.name for mesh in meshes] == ["Sphere", *SEED_OUTLINES]
+    assert len({round(volume(mesh), 3) for mesh in meshes}) == 6
+
+
+def test_sphere_has_the_volume_of_a_sphere():
+    assert volume(seed_objects()[0]) == pytest.approx(4 / 3 * np.pi * 8, rel=3e-3)
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    st.lists(st.tuples(st.floats(0.01, 10), st.floats(0.01, 5)), min_size=1, max_size=12),
+    st.integers(3, 40),
+)
+def test_revolved_profiles_are_watertight(steps, segments):
+    heights = np.cumsum([0.0] + [step for _, step in steps] + [1.0])
+    radii = [0.0, *(radius for radius, _ in steps), 0.0]
+    mesh = revolve(np.column_stack([radii, heights]), segments)
+    assert len(mesh.faces) == 2 * len(steps) * segments
+    assert closed(mesh)
+    assert volume(mesh) > 0
+    assert trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).is_watertight
+
+
+def test_resample_spaces_points_evenly():
+    line = resample([(0, 0), (3, 0), (3, 0), (3, 4)], 8)
+    np.testing.assert_allclose(np.linalg.norm(np.diff(line, axis=0), axis=1), 1.0)
+    np.testing.assert_array_equal(line[[0, -1]], [(0, 0), (3, 4)])
+
+
+def test_smooth_keeps_the_ends_and_stays_in_the_hull():
+    line = smooth([(0, 0), (1, 0), (1, 1), (0, 1)])
+    np.testing.assert_array_equal(line[[0, -1]], [(0, 0), (0, 1)])
+    assert line.min() >= 0
+    assert line.max() <= 1
+
+
+@pytest.mark.parametrize(
+    ("profile", "segments", "message"),
+    [
+        ([(0, 0), (0, 1)], 8, "cannot be revolved"),
+        ([(0, 0), (0, 1), (0, 2)], 8, "positive radii"),
+        ([(0, 0), (1, 1), (0, 2)], 2, "at least 3"),
+        ([(0, 0, 0), (1, 1, 1), (0, 2, 2)], 8, "cannot be revolved"),
+    ],
+)
+def test_bad_profiles(profile, segments, message):
+    with pytest.raises(LidarpoolError, match=message):
+        revolve(profile, segments)
