@@ -24,7 +24,7 @@ def world(scene):
 
 def test_seed():
     scene = Scene.seed()
-    assert scene.names == ("Sphere", "Vase", "Bell", "Pawn", "Spindle", "Goblet")
+    assert scene.names == ("Sphere", "Vase", "Bell", "Pawn", "Spindle", "Bowl")
     assert scene.vertices.dtype == np.float64
     assert scene.faces.dtype == scene.face_object.dtype == np.int32
     assert scene.faces.shape == (76_800, 3)

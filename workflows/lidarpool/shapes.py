@@ -41,16 +41,16 @@ SEED_OUTLINES: dict[str, tuple[tuple[float, float], ...]] = {
         (0.0, 0.0), (0.25, 0.0), (0.5, 0.6), (2.2, 1.7), (2.2, 2.1), (0.9, 2.6), (0.4, 3.6),
         (0.6, 3.9), (0.3, 4.3), (0.0, 4.3),
     ),
-    "Goblet": (
-        (0.0, 0.0), (1.6, 0.0), (1.6, 0.0), (1.5, 0.2), (0.4, 0.4), (0.3, 1.2), (0.7, 1.5),
-        (0.4, 1.8), (1.9, 2.1), (2.3, 3.4), (1.9, 4.2), (1.75, 4.2), (1.9, 3.4), (1.6, 2.5),
-        (0.0, 2.4),
+    # Low, since the pawn stands behind it as seen from the default poses.
+    "Bowl": (
+        (0.0, 0.0), (1.1, 0.0), (1.1, 0.0), (1.0, 0.25), (0.5, 0.4), (0.5, 0.55), (1.9, 0.7),
+        (2.2, 1.6), (2.0, 2.2), (1.85, 2.2), (2.0, 1.6), (1.7, 0.95), (0.0, 0.8),
     ),
 }  # fmt: skip
 
 
 def seed_objects(rings: int = SEED_RINGS, segments: int = SEED_SEGMENTS) -> tuple[Mesh, ...]:
-    """Make the six objects of the default survey: sphere, vase, bell, pawn, spindle, goblet.
+    """Make the six objects of the default survey: sphere, vase, bell, pawn, spindle, bowl.
 
     Each stands on z = 0 at its place in `SEED_POSITIONS`, is `SEED_RADIUS_M` in radius and has
     `2 * rings * segments` triangles: 76,800 in all as they come.
