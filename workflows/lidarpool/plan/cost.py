@@ -8,6 +8,7 @@ only, so that the order of additions is ours: the same numbers on every machine.
 
 from __future__ import annotations
 
+import itertools
 from typing import TypeAlias
 
 import numpy as np
@@ -23,7 +24,7 @@ _MARGIN = 4e-6
 _SLOPE = 8.0  # price of a depth of 1; a waypoint pushed 1 into a disc shortens the path by < 2
 _TOUCH = np.float32(1e-5)  # price below which an entry is a rounding error, well under _MARGIN
 _NOTHING = np.float32(1e-15)  # added to steps, so that one of length 0 has a direction too
-_BLOCK_ELEMENTS = 40_000  # of each buffer: three of them stay in a second-level cache
+_BLOCK_ELEMENTS = 160_000  # of each buffer: three of them stay in a second-level cache
 
 
 class PathCost:
@@ -57,16 +58,22 @@ class PathCost:
         # The boundaries of all discs together are at least as long as any way around them.
         self.entry_price = 2.0 + 2 * np.pi * float(radii.sum())
         self._cost = np.empty(particles, np.float32)
-        discs, segments = len(radii), waypoints + 1
-        count = -(-particles * discs * segments // _BLOCK_ELEMENTS)  # rounded up
-        width = -(-particles // max(1, count))
-        self._blocks = [slice(at, at + width) for at in range(0, particles, width)]
-        self._work = _Workspace(_grown(centres, radii), centres, segments, width)
+        pairs = len(radii) * (waypoints + 1) * particles
+        blocks = min(particles, max(1, -(-pairs // _BLOCK_ELEMENTS)))  # rounded up
+        ends = [particles * block // blocks for block in range(blocks + 1)]
+        self._blocks = [slice(*span) for span in itertools.pairwise(ends)]
+        # One for each width, of which there are two at most: their loops run over whole,
+        # contiguous buffers, which is twice as fast as over parts of wider ones.
+        self._workspaces = {
+            width: _Workspace(centres, _grown(centres, radii), waypoints + 1, width)
+            for width in {block.stop - block.start for block in self._blocks}
+        }
 
     def evaluate(self) -> Singles:
         """Costs of the paths in `waypoints`: (particles,), the same buffer at every call."""
         for block in self._blocks:
-            self._work.evaluate(self._points[..., block], self._cost[block], self.entry_price)
+            workspace = self._workspaces[block.stop - block.start]
+            workspace.evaluate(self._points[..., block], self._cost[block], self.entry_price)
         return self._cost
 
 
@@ -91,83 +98,79 @@ class _Workspace:
     product with a disc's coordinate is one long loop.
     """
 
-    def __init__(self, radii: Floats, centres: Floats, segments: int, width: int) -> None:
+    def __init__(self, centres: Floats, radii: Floats, segments: int, width: int) -> None:
         def singles(*shape: int) -> Singles:
             return np.empty(shape, np.float32)
 
+        discs = len(radii)
         doubled = (2 * centres).astype(np.float32)
         self._x, self._y = doubled[:, 0, None, None], doubled[:, 1, None, None]
         squared = (4 * radii**2).astype(np.float32)
         self._squared_radii = np.repeat(squared[:, None], width, axis=1)  # (disc, particle)
         self._weights = (_SLOPE / (4 * radii)).astype(np.float32)[:, None]
-        discs = len(radii)
-        self._pairs = [singles(2, segments, width) for _ in range(3)]  # first axis: x, y
+        # (x and y, segment, particle)
+        self._direction, self._middle, self._products = (
+            singles(2, segments, width) for _ in range(3)
+        )
         self._length = singles(segments, width)
-        self._wide = [singles(discs, segments, width) for _ in range(3)]
+        # (disc, segment, particle)
+        self._along, self._across, self._spare = (singles(discs, segments, width) for _ in range(3))
         self._nearest = singles(discs, width)
         self._price, self._entered = singles(width), np.empty(width, np.bool_)
 
     def evaluate(self, points: Singles, cost: Singles, entry_price: float) -> None:
-        """Write to `cost`, (w,), what the paths through `points`, (k + 2, 2, w), cost."""
-        width = points.shape[-1]
-        direction, middle, scratch = (pair[..., :width] for pair in self._pairs)
-        length = self._length[:, :width]
+        """Write to `cost`, (width,), what the paths through `points`, (k + 2, 2, width), cost."""
+        direction, products, length = self._direction, self._products, self._length
         first, last = points[:-1].transpose(1, 0, 2), points[1:].transpose(1, 0, 2)
         np.subtract(last, first, out=direction)
         np.add(direction[0], _NOTHING, out=direction[0])
-        np.square(direction, out=scratch)
-        np.add(scratch[0], scratch[1], out=length)
+        np.square(direction, out=products)
+        np.add(products[0], products[1], out=length)
         np.sqrt(length, out=length)
         np.add.reduce(length, axis=0, out=cost)
-        if not len(self._nearest):
-            return
-        np.divide(direction, length, out=direction)
-        np.add(last, first, out=middle)
-        self._measure(direction, middle, scratch, length)
-        self._charge(cost, entry_price)
+        if len(self._nearest):
+            np.divide(direction, length, out=direction)
+            np.add(last, first, out=self._middle)
+            self._measure()
+            self._charge(cost, entry_price)
 
-    def _measure(
-        self, direction: Singles, middle: Singles, scratch: Singles, length: Singles
-    ) -> None:
+    def _measure(self) -> None:
         """Write to `_nearest` the squared distance, times 4, of each path to each disc."""
-        width = length.shape[-1]
-        along, across, spare = (wide[..., :width] for wide in self._wide)
-        (east, north), offset = direction, scratch[0]
+        direction, middle, products = self._direction, self._middle, self._products
+        along, across, spare = self._along, self._across, self._spare
+        (east, north), offset = direction, products[0]
 
         np.multiply(self._x, east, out=along)
         np.multiply(self._y, north, out=spare)
         np.add(along, spare, out=along)
-        np.multiply(middle, direction, out=scratch)
-        np.add(scratch[0], scratch[1], out=offset)
+        np.multiply(middle, direction, out=products)
+        np.add(products[0], products[1], out=offset)
         np.subtract(along, offset, out=along)
 
         np.multiply(self._x, north, out=across)
         np.multiply(self._y, east, out=spare)
         np.subtract(across, spare, out=across)
-        np.multiply(middle, direction[::-1], out=scratch)
-        np.subtract(scratch[0], scratch[1], out=offset)
+        np.multiply(middle, direction[::-1], out=products)
+        np.subtract(products[0], products[1], out=offset)
         np.subtract(across, offset, out=across)
 
         np.abs(along, out=along)
-        np.minimum(along, length, out=spare)
+        np.minimum(along, self._length, out=spare)
         np.subtract(along, spare, out=along)
         np.square(along, out=along)
         np.square(across, out=across)
         np.add(along, across, out=along)
-        np.minimum.reduce(along, axis=1, out=self._nearest[:, :width])
+        np.minimum.reduce(along, axis=1, out=self._nearest)
 
     def _charge(self, cost: Singles, entry_price: float) -> None:
         """Add to `cost` the price of entering discs, from `_nearest`."""
-        width = len(cost)
-        nearest, price, entered = self._nearest, self._price, self._entered
-        nearest, price, entered = nearest[:, :width], price[:width], entered[:width]
-        squared_radii = self._squared_radii[:, :width]
+        nearest, price = self._nearest, self._price
         # (r² - d²) / r lies between the depth and twice the depth
-        np.minimum(nearest, squared_radii, out=nearest)
-        np.subtract(squared_radii, nearest, out=nearest)
+        np.minimum(nearest, self._squared_radii, out=nearest)
+        np.subtract(self._squared_radii, nearest, out=nearest)
         np.multiply(nearest, self._weights, out=nearest)
         np.add.reduce(nearest, axis=0, out=price)
-        np.greater(price, _TOUCH, out=entered)
+        np.greater(price, _TOUCH, out=self._entered)
         np.add(cost, price, out=cost)
-        np.multiply(entered, np.float32(entry_price), out=price)
+        np.multiply(self._entered, np.float32(entry_price), out=price)
         np.add(cost, price, out=cost)

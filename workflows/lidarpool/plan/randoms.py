@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
-_TABLE_WINDOWS = 4  # length of a table, in windows
-
 
 class Randoms:
-    """Uniform single-precision numbers from a seed.
+    """Single-precision random numbers from a seed.
 
     NumPy keeps the raw output of its bit generators for ever the same, but not what its
     `Generator` makes of it (NEP 19), so the last step is done here.
@@ -24,34 +24,53 @@ class Randoms:
         self._bits = np.random.SFC64(seed)
 
     def uniform(self, count: int) -> NDArray[np.float32]:
-        """Numbers in [0, 1), multiples of 2**-24: (count,)."""
+        """Numbers uniform in [0, 1), multiples of 2**-24: (count,)."""
         high = self._bits.random_raw(count) >> np.uint64(40)
         return high.astype(np.float32) * np.float32(2**-24)
+
+    def normal(self, count: int) -> NDArray[np.float32]:
+        """Numbers of mean 0 and variance 1, nearly normal: (count,).
+
+        Each is the sum of four uniform ones (Irwin-Hall), the four quarters of a raw number,
+        so none is beyond 3.5. The exact distribution would need logarithms, which are not the
+        same on every machine.
+        """
+        raw = self._bits.random_raw(count)
+        total = np.zeros(count, np.uint64)
+        for quarter in range(4):
+            total += (raw >> np.uint64(16 * quarter)) & np.uint64(0xFFFF)
+        # Four whole numbers below 2**16 have mean 2 (2**16 - 1) and variance near 2**32 / 3.
+        centred = total.astype(np.float32) - np.float32(2 * (2**16 - 1))
+        return centred * np.float32(math.sqrt(3) / 2**16)
 
     def below(self, end: int) -> int:
         """Draw a whole number from 0 to end - 1, for an `end` far below 2**64."""
         return int(self._bits.random_raw()) % end
 
-    def windows(self, count: int, scale: float) -> Windows:
-        """Return a source of `count` numbers at a time, uniform in [0, scale)."""
-        return Windows(self, count, scale)
-
 
 class Windows:
-    """A table of random numbers, read through windows at random places.
+    """A table of numbers, read through windows at random places.
 
-    Fresh numbers for each move of a swarm would cost as much as all its other arithmetic. Here
-    they are drawn once; a draw is a view of the table that starts anywhere. Draws overlap, but
-    a number serves another particle, coordinate and time in each.
+    Fresh random numbers for each move of a swarm would cost as much as all its other
+    arithmetic. Here they are drawn once, and a draw is a view of the table that starts
+    anywhere. Draws overlap, but a number serves another particle and coordinate in each.
+
+    Parameters
+    ----------
+    table
+        The numbers.
+    count
+        Numbers in a window, fewer than in the table.
+    randoms
+        What the places are drawn from.
     """
 
-    def __init__(self, randoms: Randoms, count: int, scale: float) -> None:
+    def __init__(self, table: NDArray[np.float32], count: int, randoms: Randoms) -> None:
+        self._table = table
         self._count = count
         self._randoms = randoms
-        self._table = randoms.uniform(_TABLE_WINDOWS * count) * np.float32(scale)
-        self._starts = (_TABLE_WINDOWS - 1) * count + 1
 
     def draw(self) -> NDArray[np.float32]:
         """Numbers, (count,): a view, not to be written to."""
-        start = self._randoms.below(self._starts)
+        start = self._randoms.below(len(self._table) - self._count + 1)
         return self._table[start : start + self._count]

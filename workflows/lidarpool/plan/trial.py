@@ -15,7 +15,7 @@ from .frame import Frame
 from .geometry import Floats, clearance, path_length, segment_distances
 from .planning import Planning
 from .randoms import Randoms
-from .swarm import Swarm, group_count
+from .swarm import Swarm
 
 _ITERATIONS_PER_LOOK = 8  # at whether the trial is cancelled: about every millisecond
 
@@ -88,7 +88,7 @@ def run_trial(planning: Planning, trial: int, cancelled: Callable[[], bool] | No
     seed = trial_seed(planning, trial)
     frame = Frame(planning.start, planning.target)
     swarm = prepare_swarm(planning, frame, seed)
-    lowest = np.empty((planning.iterations, group_count(planning.particles)), np.float32)
+    lowest = np.empty((planning.iterations, swarm.groups), np.float32)
     for iteration in range(planning.iterations):
         if cancelled is not None and iteration % _ITERATIONS_PER_LOOK == 0 and cancelled():
             raise TrialCancelledError(f"Trial {trial} was cancelled at iteration {iteration}.")
