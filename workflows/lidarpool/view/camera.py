@@ -55,6 +55,20 @@ class Camera:
         pixels = np.stack([side / ahead, -up / ahead], axis=1) * self.focal + self.centre
         return pixels, np.sqrt((offset * offset).sum(axis=1))
 
+    def cells(
+        self, pixels: ArrayLike
+    ) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64]]:
+        """Whether pixel coordinates (n, 2) are in the image, and their column and row.
+
+        Those outside, or NaN, have column and row 0.
+        """
+        place = np.asarray(pixels, dtype=np.float64)
+        inside: NDArray[np.bool_] = np.logical_and.reduce(
+            (place >= 0) & (place < self.size), axis=1
+        )
+        whole = np.where(inside[:, None], place, 0).astype(np.int64)
+        return inside, whole[:, 0], whole[:, 1]
+
     def footprint(self, distance: ArrayLike) -> Floats:
         """Width in metres that one pixel covers at a distance, seen face on."""
         return np.asarray(distance, dtype=np.float64) / self.focal

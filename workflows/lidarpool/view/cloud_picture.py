@@ -14,7 +14,7 @@ from ..scene import Scene
 from .captions import facts, without_common_prefix
 from .overlay import splat
 from .page import Page
-from .scene_picture import scene_colours
+from .scene_picture import scene_colours, surrounding
 from .shot import SIZE, Shot, finite_points, take_shot
 from .theme import Theme, mapped, object_colours, theme_for
 
@@ -64,9 +64,9 @@ def draw_cloud(
     scene = scene or shot.scene
     page = Page(size, theme)
     if owners is None:
-        norm = _height_norm(points, shot)
-        share = np.asarray(norm(points[:, 2]), dtype=np.float64)
-        colours = HEIGHT_COLOURS[np.clip(share * 255, 0, 255).astype(np.int64)]
+        low, high = _heights(points, shot)
+        share = np.clip((points[:, 2] - low) / (high - low), 0, 1)
+        colours = HEIGHT_COLOURS[(share * 255).astype(np.int64)]
     else:
         colours, entries = _object_colours(owners, scene, theme)
     axes = page.show(shot, _paint(shot, points, colours, theme))
@@ -75,7 +75,7 @@ def draw_cloud(
         page.legend(entries, len(sensors) > 0)
     elif len(points):
         height = float(shot.stage.origin[2])
-        world = Normalize(norm.vmin + height, norm.vmax + height)
+        world = Normalize(low + height, high + height)
         page.colour_bar(HEIGHT_COLOURS, world, "height z (m)")
     if not len(points):
         page.note(axes, "no points")
@@ -103,16 +103,14 @@ def on_shown_surfaces(shot: Shot, points: Floats) -> NDArray[np.bool_]:
     """
     pixels, distance = shot.camera.project(points)
     width, height = shot.camera.size
-    with np.errstate(invalid="ignore"):
-        inside = ((pixels >= 0) & (pixels < (width, height))).all(axis=1)
-    column, row = np.where(inside[:, None], pixels, 0).astype(np.int64).T
+    inside, column, row = shot.camera.cells(pixels)
     slack = 0.01 * shot.stage.size + 2 * shot.camera.footprint(distance)
     # A point at a silhouette may fall into the pixel beside the one that shows its surface.
     near = np.zeros(len(points), dtype=np.bool_)
     for dy, dx in ((0, 0), (0, 1), (0, -1), (1, 0), (-1, 0)):
         beside = shot.depth[np.clip(row + dy, 0, height - 1), np.clip(column + dx, 0, width - 1)]
         near |= np.abs(distance - beside) <= slack
-    return inside & near
+    return np.asarray(inside & near)
 
 
 def _thinned(positions: ArrayLike, objects: ArrayLike | None) -> tuple[Floats, Ints | None, int]:
@@ -133,13 +131,13 @@ def _thinned(positions: ArrayLike, objects: ArrayLike | None) -> tuple[Floats, I
     return points[keep], None if owners is None else owners[keep].astype(np.int64), len(points)
 
 
-def _height_norm(points: Floats, shot: Shot) -> Normalize:
-    """Scale from the lowest to the highest point, strays left out."""
+def _heights(points: Floats, shot: Shot) -> tuple[float, float]:
+    """Lowest and highest of the points (n, 3), strays left out, and some way apart."""
     if not len(points):
-        return Normalize(0.0, 1.0)
-    low, high = np.percentile(points[:, 2], [0.5, 99.5])
+        return 0.0, 1.0
+    low, high = (float(z) for z in np.percentile(points[:, 2], [0.5, 99.5]))
     least = 1e-3 * shot.stage.size
-    return Normalize(low, high) if high - low > least else Normalize(low - least, high + least)
+    return (low, high) if high - low > least else (low - least, high + least)
 
 
 def _object_colours(
@@ -154,4 +152,6 @@ def _object_colours(
         )
     names = without_common_prefix(scene.names) if scene else [f"Object {k}" for k in range(count)]
     palette = scene_colours(scene, theme) if scene else object_colours(count)
+    if scene:
+        palette[surrounding(scene)] = theme.rgb["muted"]  # their own grey is that of the clay
     return palette[owners], [(names[k], palette[k]) for k in shown]

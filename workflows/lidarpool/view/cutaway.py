@@ -49,15 +49,19 @@ class Cutaway:
     def removes(self, points: Floats, triangle: Ints) -> NDArray[np.bool_]:
         """Whether the hits at points (n, 3) on triangles (n,) are taken away."""
         owner = self.surface.scene.face_object[triangle]
+        out = self.surrounds[owner]
+        which = np.flatnonzero(out)
+        points, owner = points[which], owner[which]
         low, high = self.core[owner, 0], self.core[owner, 1]
         beside = (points[:, :2] < low[:, :2]) | (points[:, :2] > high[:, :2])
         shell = beside.any(axis=1) | (points[:, 2] > high[:, 2])
-        normal = self.surface.face_normals[triangle]
+        normal = self.surface.face_normals[triangle[which]]
         height = (normal * points).sum(axis=1)
         eye_above = normal @ self.eye > height
         sensor_above = normal @ self.sensors.T > height[:, None]
         opposite = (sensor_above != eye_above[:, None]).mean(axis=1) >= 0.5
-        return self.surrounds[owner] & shell & opposite
+        out[which] = shell & opposite
+        return out
 
 
 def plan_cutaway(surface: Surface, poses: Floats, eye: Floats) -> Cutaway | None:

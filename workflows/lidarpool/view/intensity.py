@@ -16,17 +16,8 @@ ENOUGH_HITS = 12  # a density is read off about so many hits
 MOST_ROUNDS = 12
 
 
-def hit_density(scene: Scene, hit_counts: ArrayLike) -> Floats:
-    """Hits per square metre at each triangle, (f,).
-
-    Where triangles are so small that most were hit once or never, hits are shared with the
-    triangles around: each gives a third to each of its corners, each corner gives them back by
-    area, as often as it takes to read a density off a dozen hits. The total stays the same.
-
-    Parameters
-    ----------
-    hit_counts
-        (f,) hits of each triangle; what is not finite or negative counts as none.
+def checked_counts(scene: Scene, hit_counts: ArrayLike) -> Floats:
+    """Hits of each triangle as numbers, (f,); what is not finite or negative counts as none.
 
     Raises
     ------
@@ -39,7 +30,21 @@ def hit_density(scene: Scene, hit_counts: ArrayLike) -> Floats:
             f"Hit counts have shape {hits.shape}; the scene has {len(scene.faces)} triangles, "
             "and needs one count for each."
         )
-    hits = np.where(np.isfinite(hits) & (hits > 0), hits, 0.0)
+    return np.where(np.isfinite(hits) & (hits > 0), hits, 0.0)
+
+
+def hit_density(scene: Scene, hits: Floats) -> Floats:
+    """Hits per square metre at each triangle, (f,).
+
+    Where triangles are so small that most were hit once or never, hits are shared with the
+    triangles around: each gives a third to each of its corners, each corner gives them back by
+    area, as often as it takes to read a density off a dozen hits. The total stays the same.
+
+    Parameters
+    ----------
+    hits
+        (f,) from `checked_counts`.
+    """
     a, b, c = (scene.vertices[scene.faces[:, k]] for k in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
     for _ in range(_rounds(hits)):

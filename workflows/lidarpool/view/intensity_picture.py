@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import LidarpoolError
 from ..scene import Scene
 from .captions import facts
-from .intensity import hit_density
+from .intensity import checked_counts, hit_density
 from .page import Page
 from .shot import SIZE, Shot, finite_points, take_shot
 from .theme import Theme, mapped, theme_for
@@ -54,38 +54,48 @@ def draw_intensity(
     """
     sensors = finite_points(poses)
     rays = _rays(sample_rays)
-    density = hit_density(scene, hit_counts)
+    hits = checked_counts(scene, hit_counts)
+    density = hit_density(scene, hits)
     shot = shot or take_shot(scene, sensors, size=size, backend=backend)
     theme = theme_for(dark)
-    norm = density_norm(density)
+    low, high = density_range(density)
     table = mapped("turbo", np.linspace(0.08, 0.97, 256))
     page = Page(size, theme)
-    axes = page.show(shot, shot.paint(_colours(density, norm, table, theme), theme, 0.5))
+    axes = page.show(
+        shot, shot.paint(_colours(density, hits > 0, (low, high), table, theme), theme, 0.5)
+    )
     page.lines(axes, shot, rays - scene.origin, theme.ray, width=0.45, alpha=0.5)
     page.sensors(axes, shot, sensors - scene.origin)
     if density.any():
-        page.colour_bar(table, norm, "hits per square metre")
+        page.colour_bar(table, LogNorm(low, high), "hits per square metre")
     else:
         page.note(axes, "no ray hit the scene")
-    hits = np.nan_to_num(np.asarray(hit_counts, dtype=np.float64), posinf=0.0).clip(0).sum()
-    counted = facts((round(float(hits)), "hit"), (len(sensors), "sensor position"))
+    counted = facts((round(float(hits.sum())), "hit"), (len(sensors), "sensor position"))
     page.title("Ray intensity", f"{counted} · grey: hit by no ray")
     return page.save(path)
 
 
-def density_norm(density: Floats) -> LogNorm:
-    """Logarithmic scale over densities (f,), two and a half decades at most, strays left out."""
+def density_range(density: Floats) -> tuple[float, float]:
+    """Choose the ends of a logarithmic scale over densities (f,), leaving strays out."""
     hit = density[density > 0]
     low, high = np.percentile(hit, [10, 99.5]) if len(hit) else (1.0, 10.0)
     low = max(low, high / WIDEST_RANGE)
-    return LogNorm(low, max(high, 2 * low), clip=True)
+    return float(low), float(max(high, 2 * low))
 
 
-def _colours(density: Floats, norm: LogNorm, table: Floats, theme: Theme) -> Floats:
-    """Colours of triangles (f, 3); grey fades in below the lowest density of the scale."""
-    share = np.asarray(norm(np.maximum(density, norm.vmin)), dtype=np.float64)
+def _colours(
+    density: Floats,
+    hit: NDArray[np.bool_],
+    scale: tuple[float, float],
+    table: Floats,
+    theme: Theme,
+) -> Floats:
+    """Colours of triangles (f, 3) by density and whether they were hit, both (f,)."""
+    low, high = scale
+    share = np.log(np.maximum(density, low) / low) / np.log(high / low)
     colours = table[np.clip(share * 255, 0, 255).astype(np.int64)]
-    seen = np.clip(density / norm.vmin / 0.6 - 0.3, 0, 1)[:, None]
+    # Shared hits fade out to grey; triangles that were hit themselves are never grey.
+    seen = np.where(hit, 1.0, np.clip(density / low / 0.6 - 0.3, 0, 1))[:, None]
     return np.asarray(theme.rgb["unseen"] * (1 - seen) + colours * seen)
 
 

@@ -14,7 +14,10 @@ from .stage import Axis, Stage
 Floats = NDArray[np.float64]
 
 # In pixels of a picture 1600 wide.
-TICK, NUMBER, TITLE = 7.0, 24.0, 64.0
+TICK = 7.0  # length of a tick mark
+BESIDE, BELOW = 14.0, 24.0  # from an edge to the numbers right or left of it, and under it
+LETTER = 12.0  # width of a digit
+TITLE = 32.0  # from the numbers to the title
 APART = 34.0  # numbers stand at least this far apart
 SHORTEST_AXIS = 36.0  # a shorter height axis has no room for numbers
 
@@ -57,7 +60,9 @@ def axis_labels(stage: Stage, camera: Camera) -> tuple[list[Label], list[Floats]
         labels += _numbers(axis, start, end, camera, outward, labels)
         angle = math.degrees(math.atan2(ends[0, 1] - ends[1, 1], ends[1, 0] - ends[0, 0]))
         angle = (angle + 90) % 180 - 90 if axis.name != "z" else 90.0
-        labels.append(Label(axis.title, ends.mean(axis=0) + TITLE * scale * outward, angle))
+        widest = max((len(text) for text in axis.labels), default=0)
+        away = (_clear(outward) + TITLE + LETTER * widest * abs(outward[0])) * scale
+        labels.append(Label(axis.title, ends.mean(axis=0) + away * outward, angle))
     return labels, lines
 
 
@@ -93,10 +98,15 @@ def _numbers(
     pixels, _ = camera.project(places)
     out: list[Label] = []
     for pixel, text in zip(pixels, axis.labels, strict=True):
-        wide = 6.0 * len(text) * scale * abs(outward[0])
-        place = pixel + (NUMBER * scale + wide) * outward
+        wide = LETTER / 2 * len(text) * abs(outward[0])
+        place = pixel + (_clear(outward) + wide) * scale * outward
         others = [label.place for label in (*taken, *out)]
         apart = (APART + 4 * max(0, len(text) - 3)) * (0.7 if k == 2 else 1.0) * scale
         if all(float(np.linalg.norm(place - other)) >= apart for other in others):
             out.append(Label(text, place, mark=np.stack([pixel, pixel + TICK * scale * outward])))
     return out
+
+
+def _clear(outward: Floats) -> float:
+    """Distance from an edge to its numbers."""
+    return float(BESIDE * abs(outward[0]) + BELOW * abs(outward[1]))

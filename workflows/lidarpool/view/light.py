@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,8 @@ from .surface import Surface, unit
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-Blocked = Callable[[Floats, Floats], NDArray[np.bool_]]  # (origins, directions) -> (n,)
+Bools = NDArray[np.bool_]
+Blocked = Callable[[Floats, Floats], Bools]  # (origins, directions) -> (n,)
 
 PATTERN = 4  # rays are spread over blocks of 4 x 4 pixels, and averaged over as many
 BOUNCED = 0.22  # light from a direction where other surfaces are
@@ -62,8 +64,43 @@ class LightMap:
     position: Floats
     normal: Floats
 
+    def smoothed(self, tolerance: Floats) -> LightMap:
+        """Return the map with each point averaged over a block around it, on its own surface.
+
+        A block holds each of the pattern's directions once, so this takes the grain out.
+
+        Parameters
+        ----------
+        tolerance
+            (rows, columns) metres; points farther than this from the plane of the middle one
+            are another surface.
+        """
+        reach = PATTERN // 2
+        rows, columns = self.sky.shape
+        light = np.stack([self.sky, self.sun], axis=-1)
+        total = np.full((rows, columns), 1e-9)
+        summed = 1e-9 * light
+        for down, right in product(range(-reach, reach + 1), repeat=2):
+            # Half of each outermost row and column: the block is PATTERN points wide.
+            share = (0.5 if abs(down) == reach else 1.0) * (0.5 if abs(right) == reach else 1.0)
+            here = _overlap(rows, down), _overlap(columns, right)
+            there = _overlap(rows, -down), _overlap(columns, -right)
+            weight = share * _alike(
+                self.position[here],
+                self.normal[here],
+                self.position[there],
+                self.normal[there],
+                tolerance[here],
+            )
+            total[here] += weight
+            summed[here] += weight[..., None] * light[there]
+        sky, sun = np.moveaxis(summed / total[..., None], -1, 0)
+        return replace(self, sky=sky, sun=sun)
+
     def at(self, pixels: Floats, position: Floats, normal: Floats, tolerance: Floats) -> Floats:
-        """Sky and sun at points, averaged over the grid points near them on the same surface.
+        """Sky and sun at points, (2, n), between the four grid points around each.
+
+        Grid points on another surface than the point count for little.
 
         Parameters
         ----------
@@ -72,40 +109,38 @@ class LightMap:
         position, normal
             (n, 3).
         tolerance
-            (n,) metres; grid points farther than this from the plane are another surface.
-
-        Returns
-        -------
-        (2, n)
+            (n,) metres, see `smoothed`.
         """
         rows, columns = self.sky.shape
-        cell = np.floor(pixels / self.stride - PATTERN / 2 + 0.5).astype(np.int64)
-        out = np.full((2, len(pixels)), 1.0)
-        busy = self._shaded()[
-            np.clip(cell[:, 1], 0, rows - 1), np.clip(cell[:, 0], 0, columns - 1)
-        ].nonzero()[0]
-        total = np.full(len(busy), 1e-9)
-        summed = np.full((2, len(busy)), 1e-9)
-        for shift in range(PATTERN * PATTERN):
-            row = np.clip(cell[busy, 1] + shift // PATTERN, 0, rows - 1)
-            column = np.clip(cell[busy, 0] + shift % PATTERN, 0, columns - 1)
-            off_plane = ((self.position[row, column] - position[busy]) * normal[busy]).sum(axis=1)
-            alike = (self.normal[row, column] * normal[busy]).sum(axis=1)
-            with np.errstate(invalid="ignore"):
-                weight = (np.abs(off_plane) < tolerance[busy]) * np.clip(alike - 0.6, 0, None)
-            weight = np.nan_to_num(weight)
+        start = (pixels - self.stride // 2 - 0.5) / self.stride
+        cell = np.floor(start).astype(np.int64)
+        part = start - cell
+        total = np.full(len(pixels), 1e-9)
+        summed = np.full((2, len(pixels)), 1e-9)
+        for down, right in product(range(2), repeat=2):
+            row = np.clip(cell[:, 1] + down, 0, rows - 1)
+            column = np.clip(cell[:, 0] + right, 0, columns - 1)
+            spot = self.position[row, column]
+            weight = _alike(position, normal, spot, self.normal[row, column], tolerance)
+            weight = np.where(np.isfinite(spot[:, 0]), weight + 1e-3, 0.0)
+            weight *= np.abs(1 - down - part[:, 1]) * np.abs(1 - right - part[:, 0])
             total += weight
-            summed[0] += weight * self.sky[row, column]
-            summed[1] += weight * self.sun[row, column]
-        out[:, busy] = summed / total
-        return out
+            summed += weight * np.stack([self.sky[row, column], self.sun[row, column]])
+        return np.asarray(summed / total)
 
-    def _shaded(self) -> NDArray[np.bool_]:
-        """Whether the block that starts at a grid point holds any point not fully lit."""
-        dim = (self.sky < 0.999) | (self.sun < 0.999)
-        padded = np.pad(dim, ((0, PATTERN - 1), (0, PATTERN - 1)), mode="edge")
-        windows = np.lib.stride_tricks.sliding_window_view(padded, (PATTERN, PATTERN))
-        return windows.any(axis=(2, 3))
+
+def _alike(
+    position: Floats, normal: Floats, spot: Floats, facing: Floats, tolerance: Floats
+) -> Floats:
+    """How much points (..., 3) are on one surface with spots (..., 3): 0 for not, to 0.4."""
+    with np.errstate(invalid="ignore"):
+        near = np.abs(((spot - position) * normal).sum(axis=-1)) < tolerance
+        return np.where(near, np.clip((facing * normal).sum(axis=-1) - 0.6, 0, None), 0.0)
+
+
+def _overlap(length: int, shift: int) -> slice:
+    """Return the indices `n` of a row for which `n + shift` is in the row too."""
+    return slice(max(0, -shift), min(length, length - shift))
 
 
 def sun_direction(camera: Camera) -> Floats:
@@ -146,12 +181,19 @@ def measure_light(
         away = 0.5 * camera.footprint(np.linalg.norm(at - camera.eye, axis=1))
         at = at + away[:, None] * facing
 
-        def dark(where: Floats, rays: Floats) -> NDArray[np.bool_]:
+        def dark(where: Floats, rays: Floats) -> Bools:
             return blocked(surface, cutaway, where, rays, rig.reach)
 
         sky[there] = _sky(dark, rig.sky_rays, at, facing, turn)
         sun[there] = _sun(dark, rig.sun_rays, at, facing, turn, sun_direction(camera))
-    return LightMap(rig.stride, sky, sun, position, normal)
+    distance = np.linalg.norm(position - camera.eye, axis=-1)
+    light = LightMap(rig.stride, sky, sun, position, normal)
+    return light.smoothed(plane_tolerance(rig.stride, camera, distance))
+
+
+def plane_tolerance(stride: int, camera: Camera, distance: Floats) -> Floats:
+    """How far apart in metres points of one surface may be from each other's planes."""
+    return 3 * stride * camera.footprint(distance)
 
 
 def _sky(dark: Blocked, rays: int, at: Floats, facing: Floats, turn: Floats) -> Floats:

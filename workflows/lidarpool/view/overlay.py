@@ -30,17 +30,14 @@ def visible(shot: Shot, points: Floats, slack: float = 2.0) -> tuple[Floats, Boo
     seen : bool (n,), False outside the picture
     """
     pixels, distance = shot.camera.project(points)
-    width, height = shot.camera.size
-    with np.errstate(invalid="ignore"):
-        inside = ((pixels >= 0) & (pixels < (width, height))).all(axis=1)
-    column, row = np.where(inside[:, None], pixels, 0).astype(np.int64).T
+    inside, column, row = shot.camera.cells(pixels)
     return pixels, inside & (
         distance <= shot.depth[row, column] + slack * shot.camera.footprint(distance)
     )
 
 
-def visible_runs(shot: Shot, segments: Floats) -> list[Floats]:
-    """Split line segments (n, 2, 3) into the pieces that can be seen.
+def visible_runs(shot: Shot, segments: Floats, slack: float = 2.0) -> list[Floats]:
+    """Split line segments (n, 2, 3) into the pieces that can be seen; see `visible`.
 
     Returns
     -------
@@ -57,7 +54,7 @@ def visible_runs(shot: Shot, segments: Floats) -> list[Floats]:
     s = np.linspace(0, 1, STEPS)[None]
     share = s * near[:, None] / (far[:, None] * (1 - s) + s * near[:, None])
     path = segments[:, :1] + share[..., None] * (segments[:, 1:] - segments[:, :1])
-    pixels, seen = visible(shot, path.reshape(-1, 3))
+    pixels, seen = visible(shot, path.reshape(-1, 3), slack)
     pixels, seen = pixels.reshape(-1, STEPS, 2), seen.reshape(-1, STEPS)
     runs = []
     for line, shown in zip(pixels, seen, strict=True):

@@ -27,11 +27,11 @@ from .theme import Theme
 Floats = NDArray[np.float64]
 
 DPI = 200
-FONT = {"fontfamily": "DejaVu Sans"}
+FONT = "DejaVu Sans"  # comes with matplotlib
 MANY_POSES = 40  # more than this are drawn as small dots
 MOST_POSES = 3000
 LEGEND_ROWS = 30
-LEGEND_LETTERS = 21
+LEGEND_LETTERS = 18
 
 
 class Page:
@@ -64,15 +64,17 @@ class Page:
         axes.set(xlim=(0, width), ylim=(height, 0))
         labels, lines = axis_labels(shot.stage, shot.camera)
         marks = [label.mark for label in labels if label.mark is not None]
-        axes.add_collection(
-            LineCollection([*marks, *lines], colors=self.theme.muted, linewidths=0.6 * self.unit)
-        )
+        corners = shot.stage.corners
+        border = visible_runs(shot, np.stack([corners, np.roll(corners, -1, axis=0)], axis=1), 5.0)
+        for drawn, colour in ((border, self.theme.line), ([*marks, *lines], self.theme.muted)):
+            axes.add_collection(LineCollection(drawn, colors=colour, linewidths=0.6 * self.unit))
         for label in labels:
             title = label.mark is None
             axes.text(
-                *label.place, label.text, rotation=label.angle_deg, ha="center", va="center",
+                float(label.place[0]), float(label.place[1]), label.text,
+                rotation=label.angle_deg, ha="center", va="center",
                 fontsize=(7.2 if title else 6.6) * self.unit,
-                color=self.theme.ink if title else self.theme.muted, **FONT,
+                color=self.theme.ink if title else self.theme.muted, family=FONT,
             )  # fmt: skip
         return axes
 
@@ -81,11 +83,11 @@ class Page:
         top = 1 - 0.05 * self.size[0] / self.size[1] / 1.6
         self.figure.text(
             0.03, top, text, fontsize=11 * self.unit, fontweight="bold",
-            color=self.theme.ink, va="center", **FONT,
+            color=self.theme.ink, va="center", family=FONT,
         )  # fmt: skip
         self.figure.text(
             0.03, top - 0.042, detail, fontsize=7.2 * self.unit, color=self.theme.muted,
-            va="center", **FONT,
+            va="center", family=FONT,
         )  # fmt: skip
 
     def sensors(self, axes: Axes, shot: Shot, poses: Floats) -> None:
@@ -97,13 +99,16 @@ class Page:
             feet = poses.copy()
             feet[:, 2] = shot.stage.level
             self.lines(axes, shot, np.stack([poses, feet], axis=1), self.theme.sensor, 0.8, 0.7)
-        drawn = np.isfinite(pixels).all(axis=1)
-        colours = [self.theme.sensor if s else "none" for s in seen[drawn]]
-        axes.scatter(
-            *pixels[drawn].T, s=(5 if many else 20) * self.unit**2, c=colours or None, zorder=5,
-            edgecolors=[self.theme.page if s else self.theme.sensor for s in seen[drawn]],
-            linewidths=(0.2 if many else 0.7) * self.unit,
-        )  # fmt: skip
+        looks = (
+            (seen, self.theme.sensor, self.theme.page),
+            (~seen & np.isfinite(pixels).all(axis=1), "none", self.theme.sensor),
+        )
+        for which, face, edge in looks:
+            axes.scatter(
+                pixels[which, 0], pixels[which, 1], s=(5 if many else 20) * self.unit**2,
+                facecolors=face, edgecolors=edge, linewidths=(0.2 if many else 0.7) * self.unit,
+                zorder=5,
+            )  # fmt: skip
 
     def lines(
         self, axes: Axes, shot: Shot, segments: Floats, colour: str, width: float, alpha: float
@@ -145,9 +150,9 @@ class Page:
         """Put a legend of handles into the page's right margin; `size` of the font in points."""
         if handles:
             self.figure.legend(
-                handles=handles, loc="center left", bbox_to_anchor=(0.822, 0.5), frameon=False,
+                handles=handles, loc="center left", bbox_to_anchor=(0.842, 0.5), frameon=False,
                 labelcolor=self.theme.ink, labelspacing=0.55, handletextpad=0.5, borderpad=0,
-                handlelength=1.4, prop={"family": "DejaVu Sans", "size": size * self.unit},
+                handlelength=1.4, prop={"family": FONT, "size": size * self.unit},
             )  # fmt: skip
 
     def colour_bar(self, colours: Floats, norm: Normalize, title: str) -> None:
@@ -155,10 +160,10 @@ class Page:
         axes = self.figure.add_axes((0.862, 0.27, 0.014, 0.46))
         bar = self.figure.colorbar(ScalarMappable(norm, ListedColormap(colours)), cax=axes)
         bar.outline.set_visible(False)
-        bar.set_label(title, fontsize=7.6 * self.unit, color=self.theme.ink, **FONT)
+        bar.set_label(title, fontsize=7.6 * self.unit, color=self.theme.ink, family=FONT)
         axes.tick_params(
             which="both", labelsize=6.6 * self.unit, color=self.theme.muted, width=0.6 * self.unit,
-            labelcolor=self.theme.muted, labelfontfamily="DejaVu Sans", length=2.5 * self.unit,
+            labelcolor=self.theme.muted, labelfontfamily=FONT, length=2.5 * self.unit,
         )  # fmt: skip
         axes.tick_params(which="minor", length=1.5 * self.unit)
         if isinstance(norm, LogNorm):
@@ -170,7 +175,7 @@ class Page:
         halo = [withStroke(linewidth=3 * self.unit, foreground=self.theme.page)]
         axes.text(
             0.43, 0.5, text, transform=axes.transAxes, ha="center", va="center",
-            fontsize=9 * self.unit, color=self.theme.muted, path_effects=halo, **FONT,
+            fontsize=9 * self.unit, color=self.theme.muted, path_effects=halo, family=FONT,
         )  # fmt: skip
 
     def save(self, path: str | os.PathLike[str]) -> Path:

@@ -130,8 +130,9 @@ def _frame(axes: Axes, page: Page, limits: Floats) -> None:
     """Set limits, grid and round ticks, the same on both axes."""
     theme = page.theme
     step = nice_step(float(np.ptp(limits[:, 0])) / 8)
-    across, up = (axis("xy"[k], *limits[:, k], step, 0.0) for k in range(2))
-    axes.set(xlim=limits[:, 0], ylim=limits[:, 1], facecolor=theme.ground)
+    (x0, y0), (x1, y1) = limits.tolist()
+    across, up = axis("x", x0, x1, step, 0.0), axis("y", y0, y1, step, 0.0)
+    axes.set(xlim=(x0, x1), ylim=(y0, y1), facecolor=theme.ground)
     axes.set_aspect("equal")
     axes.grid(color=theme.line, lw=0.5 * page.unit)
     axes.set_axisbelow(True)
@@ -140,10 +141,10 @@ def _frame(axes: Axes, page: Page, limits: Floats) -> None:
     for side, one in ((axes.xaxis, across), (axes.yaxis, up)):
         side.set_ticks(one.ticks)
         side.set_major_formatter(_labels_of(one))
-        side.set_label_text(one.title, fontsize=7.6 * page.unit, color=theme.ink, **FONT)
+        side.set_label_text(one.title, fontsize=7.6 * page.unit, color=theme.ink, family=FONT)
     axes.tick_params(
         labelsize=6.8 * page.unit, labelcolor=theme.muted, color=theme.line, length=2.5 * page.unit,
-        width=0.6 * page.unit, labelfontfamily="DejaVu Sans",
+        width=0.6 * page.unit, labelfontfamily=FONT,
     )  # fmt: skip
 
 
@@ -165,7 +166,8 @@ def _ends(axes: Axes, page: Page, planning: Planning) -> None:
         axes.annotate(
             name, place, xytext=(-8 * page.unit if left else 8 * page.unit, 0),
             textcoords="offset points", ha="right" if left else "left", va="center",
-            fontsize=7.6 * page.unit, color=page.theme.ink, path_effects=halo, zorder=7, **FONT,
+            fontsize=7.6 * page.unit, color=page.theme.ink, family=FONT,
+            path_effects=halo, zorder=7,
         )  # fmt: skip
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .camera import Camera
-from .light import LightMap
+from .light import LightMap, plane_tolerance
 from .stage import Axis, Stage
 from .surface import Surface
 
@@ -75,10 +75,10 @@ class Samples:
         brightness = np.ones(len(self.pixel))
         there = np.flatnonzero(self.triangle != SKY)
         normal = self.normal[there]
-        tolerance = 3 * light.stride * camera.footprint(self.distance[there])
+        tolerance = plane_tolerance(light.stride, camera, self.distance[there])
         sky, direct = light.at(self.at[there], self.position[there], normal, tolerance)
         facing = np.clip(normal @ sun, 0, None)
-        on_surface = 0.7 * sky * (0.88 + 0.12 * normal[:, 2]) + 0.42 * facing * direct
+        on_surface = 0.78 * sky * (0.88 + 0.12 * normal[:, 2]) + 0.36 * facing * direct
         on_ground = 0.62 + 0.3 * sky + 0.08 * direct
         on_ground *= 1 - 0.1 * (1 - direct)
         brightness[there] = np.where(self.triangle[there] == GROUND, on_ground, on_surface)
@@ -162,16 +162,14 @@ def grid_lines(
     half = LINE_PX * camera.size[0] / 1600 / 2
     for k, axis in enumerate(stage.axes[:2]):
         pixel = np.hypot(along * level[:, k], across * level[:, 1 - k])
-        gap = _gap(axis, stage.ground[:, k], position[on, k])
+        gap = _gap(axis, position[on, k])
         out[on] = np.maximum(out[on], np.clip(0.5 + half - gap / pixel, 0, min(1.0, 2 * half)))
     return out
 
 
-def _gap(axis: Axis, ends: Floats, place: Floats) -> Floats:
-    """Distance of coordinates (n,) from the nearest tick or end of an axis."""
-    gap = np.abs(place[:, None] - ends).min(axis=1)
-    if len(axis.ticks):
-        nearest = np.round((place - axis.ticks[0]) / axis.step)
-        nearest = np.clip(nearest, 0, len(axis.ticks) - 1)
-        gap = np.minimum(gap, np.abs(place - axis.ticks[0] - nearest * axis.step))
-    return gap
+def _gap(axis: Axis, place: Floats) -> Floats:
+    """Distance of coordinates (n,) from the nearest tick of an axis."""
+    if not len(axis.ticks):
+        return np.full(len(place), np.inf)
+    nearest = np.clip(np.round((place - axis.ticks[0]) / axis.step), 0, len(axis.ticks) - 1)
+    return np.asarray(np.abs(place - axis.ticks[0] - nearest * axis.step))

@@ -73,12 +73,17 @@ def scene_colours(scene: Scene, theme: Theme) -> Floats:
 
     Floors and halls are grey, so that what stands in them is what one sees.
     """
-    width = scene.object_bounds[:, 1] - scene.object_bounds[:, 0]
-    whole = np.maximum(scene.bounds[1] - scene.bounds[0], 1e-9)
-    share = np.where(np.isfinite(width), width, 0.0)[:, :2].prod(axis=1) / whole[:2].prod()
-    grey = (share >= SURROUNDING) & (len(scene.names) > 1)
+    grey = surrounding(scene)
     colours = np.empty((len(scene.names), 3))
     colours[~grey] = object_colours(int((~grey).sum()))
     steps = np.linspace(0, 0.22, max(int(grey.sum()), 1))[: int(grey.sum()), None]
     colours[grey] = theme.rgb["clay"] * (1 - steps) + theme.rgb["muted"] * steps
     return colours
+
+
+def surrounding(scene: Scene) -> NDArray[np.bool_]:
+    """Whether each object is a floor or a hall that the others stand in: (objects,)."""
+    width = scene.object_bounds[:, 1] - scene.object_bounds[:, 0]
+    whole = np.maximum(scene.bounds[1] - scene.bounds[0], 1e-9)
+    share = np.where(np.isfinite(width), width, 0.0)[:, :2].prod(axis=1) / whole[:2].prod()
+    return np.asarray((share >= SURROUNDING) & (len(scene.names) > 1))

@@ -20,7 +20,7 @@ from .theme import Theme
 Floats = NDArray[np.float64]
 
 SIZE = (1600, 1000)  # pixels of a finished picture
-FRAME = (0.075, 0.09, 0.805, 0.91)  # where the scene is; legend and colour bar are right of it
+FRAME = (0.08, 0.09, 0.79, 0.91)  # where the scene is; legend and colour bar are right of it
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +115,7 @@ def take_shot(
     surface = None if scene is None else Surface.of(scene, backend)
     rig, scale = Rig(), 1.0
     if surface is not None and surface.caster.backend == "numpy":
-        rig, scale = Rig(stride=3, sky_rays=4, sun_rays=1), 0.5
+        rig, scale = Rig(stride=3, sky_rays=6, sun_rays=2), 1.0
     camera = _camera(stage, (round(size[0] * scale), round(size[1] * scale)), 33.0)
     cutaway = None
     if surface is not None:
@@ -186,12 +186,12 @@ def _expose(
 
     width, height = camera.size
     column, row = np.meshgrid(np.arange(width), np.arange(height))
-    whole = see(np.stack([column.ravel(), row.ravel()], axis=1) + 0.5)
+    centres = np.stack([column.ravel(), row.ravel()], axis=1).astype(np.float64) + 0.5
+    whole = see(centres)
     light = _light_map(surface, cutaway, camera, whole, rig)
     edges = _edges(whole.triangle.reshape(height, width))
     corners = np.array([[-0.125, -0.375], [0.375, -0.125], [-0.375, 0.125], [0.125, 0.375]])
-    pixels = np.stack([column.ravel()[edges], row.ravel()[edges]], axis=1) + 0.5
-    finer = see((pixels[:, None] + corners).reshape(-1, 2))
+    finer = see((centres[edges][:, None] + corners).reshape(-1, 2))
     samples = whole.select(~edges).join(finer)
     lit = samples.lit(light, camera, sun_direction(camera))
     depth = whole.distance.reshape(height, width)

@@ -109,10 +109,18 @@ class Stage:
         level = float(low[2]) - 1e-3 * widest
         step = nice_step(float((ground[1] - ground[0]).max()) / 6)
         x, y = (
-            axis("xy"[k], *ground[:, k], min(step, nice_step(np.ptp(ground[:, k]) / 2)), origin[k])
+            axis(
+                "xy"[k],
+                float(ground[0, k]),
+                float(ground[1, k]),
+                min(step, nice_step(float(np.ptp(ground[:, k])) / 2)),
+                float(origin[k]),
+            )
             for k in range(2)
         )
-        z = axis("z", level, float(high[2]), nice_step((high[2] - low[2]) / 3), origin[2])
+        z = axis(
+            "z", level, float(high[2]), nice_step(float(high[2] - low[2]) / 3), float(origin[2])
+        )
         return cls(np.stack([low, high]), ground, level, (x, y, z), origin)
 
 
@@ -121,10 +129,10 @@ def axis(name: str, low: float, high: float, step: float, origin: float) -> Axis
     slack = 1e-6 * step
     first = math.ceil((low + origin - slack) / step - 2e-3)
     last = math.floor((high + origin + slack) / step)
-    world = np.arange(first, last + 1) * step
+    world: Floats = np.arange(first, last + 1, dtype=np.float64) * step
     offset = 0.0
     if len(world) and np.abs(world).max() >= LONGEST_LABEL and high - low < LONGEST_LABEL:
-        unit = 10.0 ** math.ceil(math.log10(max(high - low, 1.0)))
+        unit = 10.0 ** math.floor(math.log10(max(high - low, 1.0)))
         offset = math.floor(world[0] / unit) * unit
     decimals = max(0, -math.floor(math.log10(step) + 1e-9))
     labels = tuple(f"{value + 0.0:.{decimals}f}".replace("-", "−") for value in world - offset)
