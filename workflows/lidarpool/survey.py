@@ -62,6 +62,18 @@ class ScanSpec:
     pose: Pose
     azimuths: tuple[int, int]
 
+    def wire(self) -> list[float]:
+        """Plain numbers, to travel through a pipe."""
+        pose = self.pose
+        angles = (pose.yaw_deg, pose.pitch_deg, pose.roll_deg)
+        return [self.scan, *self.azimuths, *pose.position, *angles]
+
+    @classmethod
+    def from_wire(cls, numbers: Sequence[float]) -> ScanSpec:
+        """Inverse of `wire`."""
+        scan, first, stop, x, y, z, yaw, pitch, roll = numbers
+        return cls(int(scan), Pose((x, y, z), yaw, pitch, roll), (int(first), int(stop)))
+
     def ray_count(self, sensor: Sensor) -> int:
         """Rays in this scan."""
         return (self.azimuths[1] - self.azimuths[0]) * sensor.layers

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -53,7 +55,8 @@ class Swarm:
         self.groups = _group_count(particles)
         self._at = paths.waypoints.reshape(rows, particles)  # positions, a view
         spreads = _spreads(self.groups, widest)
-        self._at[:] = _scattered(corners, particles, spreads, randoms)
+        start = _scattered(corners, particles, spreads, randoms)
+        self._at[:] = start.reshape(rows, particles)
         self._best = self._at.copy()  # of each particle
         self._best_cost = np.full(particles, np.inf, np.float32)
         self._jump = np.zeros_like(self._best)  # from a particle's best to where it is
@@ -119,10 +122,24 @@ def _spreads(groups: int, widest: float) -> NDArray[np.float64]:
 
 
 def _scattered(corners: int, particles: int, spreads: Floats, randoms: Randoms) -> Singles:
-    """First positions: corners evenly along the straight line, and off it by up to the spread."""
-    shape = (corners, 2, len(spreads), particles // len(spreads))
-    off = 2 * randoms.uniform(2 * corners * particles).reshape(shape) - 1
-    off *= spreads.astype(np.float32)[:, None]
+    """First positions: polylines about the straight line, (corners, 2, groups, size).
+
+    A group's paths turn at 1, 2, 3, … places, drawn up to its spread off the straight line, and
+    their corners lie evenly along them. Few turns make paths that lead between discs a simple
+    path rarely happens on when every corner is drawn by itself.
+    """
+    groups = len(spreads)
+    shape = (corners, 2, groups, particles // groups)
+    turns = 2 * randoms.uniform(2 * corners * particles).reshape(shape) - 1
+    turns *= spreads.astype(np.float32)[:, None]
+    at = np.zeros(shape, np.float32)
+    for group in range(groups):
+        count = group % corners + 1
+        for turn, corner in itertools.product(range(count), range(corners)):
+            # 1 where the corner is at the turn, 0 from the turns on either side of it
+            share = 1 - abs((corner + 1) * (count + 1) / (corners + 1) - (turn + 1))
+            if share > 0:
+                at[corner, :, group] += np.float32(share) * turns[turn, :, group]
     along = np.arange(1, corners + 1) / (corners + 1) - 0.5
-    off[:, 0] += along.astype(np.float32)[:, None, None]
-    return off.reshape(2 * corners, particles)
+    at[:, 0] += along.astype(np.float32)[:, None, None]
+    return at

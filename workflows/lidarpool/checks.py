@@ -1,0 +1,118 @@
+"""Questions asked before a run starts, so that it need not fail in the middle."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from distributed import Client
+from poolpart import Pool, PoolError, WorkerInfo
+from raybeam import BackendUnavailable, available_backends
+
+from ._version import __version__
+from .errors import LidarpoolError
+from .scan import COLLECT, GENERATE, GPU, LIDAR, OTHER, SORT
+from .scene import Scene
+from .survey import Survey
+
+
+def check_versions(client: Client) -> None:
+    """Check that every worker has this version of lidarpool; LidarpoolError if not."""
+
+    # Nested, so that it travels by value: a worker that lacks the package can still run it.
+    def version() -> str:
+        from lidarpool._version import __version__
+
+        return __version__
+
+    for address, answer in client.run(version, on_error="return").items():
+        if isinstance(answer, ModuleNotFoundError):
+            raise LidarpoolError(
+                f"The worker at {address} does not have lidarpool: install lidarpool "
+                f"{__version__} in the environment that dask worker is started from."
+            )
+        if answer != __version__:
+            raise LidarpoolError(
+                f"The worker at {address} has lidarpool {answer}, here it is {__version__}: "
+                "install the same version on both sides."
+            )
+
+
+def survey_pool(client: Client, collectors: int, planning: bool) -> Pool:
+    """All workers of the cluster, once it is sure that they are enough for a survey.
+
+    Raises
+    ------
+    LidarpoolError
+        If there are no workers, other versions, or too few slots in a partition.
+    """
+    try:
+        if not client.scheduler_info(n_workers=-1)["workers"]:
+            raise PoolError(
+                f"The cluster at {client.scheduler.address} has no workers: start some, for "
+                f'example dask worker {client.scheduler.address} --resources "GPU=1"'
+            )
+        check_versions(client)
+        pool = Pool.from_client(client)
+        needs = {GPU: 1, LIDAR: 2 + collectors}
+        purpose = {
+            GPU: "stage 2 casts the rays",
+            LIDAR: f"{GENERATE}, {SORT} and {collectors} x {COLLECT}",
+            OTHER: "path planning; or leave it out with --no-plan",
+        }
+        pool.require(needs | ({OTHER: 1} if planning else {}), purpose)
+    except PoolError as error:
+        raise LidarpoolError(str(error)) from error
+    return pool
+
+
+def common_backend(client: Client, wanted: str, workers: Sequence[WorkerInfo]) -> str:
+    """Name of the ray-casting backend to use on all these workers.
+
+    "auto" is settled here, once: if each worker chose for itself, a cloud would depend on
+    which of them casts which scan.
+
+    Raises
+    ------
+    LidarpoolError
+        If the backend wanted is not there on all of them.
+    """
+    answers: Mapping[str, dict[str, str]] = client.run(
+        available_backends, workers=[worker.address for worker in workers]
+    )
+    if not answers:
+        raise LidarpoolError("The workers of partition 'GPU' left before the run started.")
+    names = list(next(iter(answers.values())))
+    if wanted == "auto":
+        return next(n for n in names if not any(reasons[n] for reasons in answers.values()))
+    if wanted not in names:
+        raise LidarpoolError(f"There is no backend {wanted!r}: use auto, {', '.join(names)}.")
+    for address, reasons in answers.items():
+        if reasons[wanted]:
+            raise LidarpoolError(
+                f"Backend {wanted!r} cannot be used on the GPU worker at {address}: "
+                f"{reasons[wanted]}. Backend 'auto' takes what works."
+            )
+    return wanted
+
+
+def check_backend_here(wanted: str) -> None:
+    """Refuse a backend that this machine lacks, before a local cluster is started for it."""
+    reasons = available_backends()
+    if wanted != "auto" and wanted not in reasons:
+        raise LidarpoolError(f"There is no backend {wanted!r}: use auto, {', '.join(reasons)}.")
+    if reasons.get(wanted):
+        raise LidarpoolError(str(BackendUnavailable(
+            f"Backend {wanted!r} cannot be used here: {reasons[wanted]}. "
+            "Backend 'auto' takes what works."
+        )))
+
+
+def check_precision(scene: Scene, survey: Survey) -> None:
+    """Check that the scene spans few enough cells of the cloud's precision to be numbered."""
+    reach = float(np.abs(scene.vertices).max(initial=0.0))
+    if reach / survey.precision_m >= 2**31 - 1:
+        raise LidarpoolError(
+            f"precision_m {survey.precision_m} is too fine for a scene that reaches {reach:.0f} m "
+            f"from its origin: use at least {reach / 2**31:.2g}."
+        )

@@ -1,0 +1,24 @@
+"""How far a run has come."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Counts at one moment of a run.
+
+    `generated`, `cast`, `framed` and `collected` are scans that have passed stage 1 to 4, out
+    of `scans`; `trials_done` are planning trials out of `trials`. `seconds` is since the start.
+    """
+
+    scans: int
+    generated: int
+    cast: int
+    framed: int
+    collected: int
+    points: int
+    trials: int
+    trials_done: int
+    seconds: float

@@ -1,0 +1,105 @@
+"""Stage 2: what becomes of one item on a GPU worker."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import groupby
+
+import numpy as np
+from numpy.typing import NDArray
+from poolpart import Recorder, TaskRecord
+from raybeam import Returns
+
+from ..survey import Pose, ScanSpec
+from .messages import HIT, Batch, Frame
+from .setup import SurveySetup, ray_directions
+from .stage_names import GPU, INTERSECT
+
+SAMPLES_PER_SCAN = 4  # rays of each scan that are shown in pictures
+
+
+def intersect(setup: SurveySetup, wire: Sequence[Sequence[float]]) -> Batch:
+    """Cast the rays of some scans; runs on a GPU worker.
+
+    Parameters
+    ----------
+    setup
+        Scene and sensor.
+    wire
+        The scans, as `ScanSpec.wire` describes them.
+
+    Raises
+    ------
+    RuntimeError
+        If casting fails, naming the scans.
+    """
+    recorder = Recorder(INTERSECT, GPU)
+    specs = tuple(ScanSpec.from_wire(numbers) for numbers in wire)
+    frames: list[Frame] = []
+    tables: list[NDArray[np.void]] = []
+    for pose, group in _same_pose(specs):
+        try:
+            hits = setup.cast(pose, (group[0].azimuths[0], group[-1].azimuths[1]))
+        except Exception as error:
+            span = f"scan {group[0].scan}" + (f" to {group[-1].scan}" if len(group) > 1 else "")
+            raise RuntimeError(f"{span}: {type(error).__name__}: {error}") from error
+        for spec, part in _by_scan(setup, group, hits):
+            frames.append(_frame(setup, spec, part))
+            table = np.empty(len(part), HIT)
+            table["ray"], table["distance"] = part.ray, part.distance
+            table["object"] = setup.scene.face_object[part.triangle]
+            tables.append(table)
+    return Batch(
+        scans=specs,
+        hits=np.concatenate(tables),
+        hit_counts=tuple(len(table) for table in tables),
+        frames=tuple(frames),
+        record=recorder.done(len(specs)),
+    )
+
+
+def frames_of(batch: Batch) -> tuple[tuple[Frame, ...], TaskRecord]:
+    """The frames of a batch with its record: a key of its own, so that stage 3 fetches no hits."""
+    return batch.frames, batch.record
+
+
+def _same_pose(specs: Sequence[ScanSpec]) -> Iterator[tuple[Pose, list[ScanSpec]]]:
+    """Runs of scans from one pose whose azimuths follow on: they are cast in one go."""
+
+    def start_of_run(numbered: tuple[int, ScanSpec]) -> tuple[Pose, int]:
+        index, spec = numbered
+        nonlocal run
+        if index and specs[index - 1].azimuths[1] != spec.azimuths[0]:
+            run += 1
+        return spec.pose, run
+
+    run = 0
+    for (pose, _), group in groupby(enumerate(specs), start_of_run):
+        yield pose, [spec for _, spec in group]
+
+
+def _by_scan(
+    setup: SurveySetup, group: Sequence[ScanSpec], hits: Returns
+) -> Iterator[tuple[ScanSpec, Returns]]:
+    """Divide the hits of neighbouring scans; ray numbers then start at 0 in each scan."""
+    layers = setup.sensor.layers
+    starts = np.array([s.azimuths[0] - group[0].azimuths[0] for s in group]) * layers
+    cuts = [*np.searchsorted(hits.ray, starts), len(hits.ray)]
+    for spec, start, i, j in zip(group, starts, cuts, cuts[1:], strict=False):
+        yield spec, Returns(hits.ray[i:j] - start, hits.distance[i:j], hits.triangle[i:j])
+
+
+def _frame(setup: SurveySetup, spec: ScanSpec, hits: Returns) -> Frame:
+    triangles, counts = np.unique(hits.triangle, return_counts=True)
+    few = np.unique(np.linspace(0, len(hits.ray) - 1, SAMPLES_PER_SCAN).astype(int))
+    few = few[: len(hits.ray)]
+    ends = hits.distance[few, None] * ray_directions(setup.sensor, spec, hits.ray[few])
+    return Frame(
+        scan=spec.scan,
+        pose=spec.pose,
+        rays=spec.ray_count(setup.sensor),
+        hits=len(hits.ray),
+        triangles=triangles.astype(np.int32),
+        counts=counts.astype(np.int32),
+        samples=(ends + spec.pose.position).astype(np.float32),
+    )

@@ -1,0 +1,326 @@
+"""The driver's side of the survey: it feeds the stages, keeps the ledger, sends again.
+
+Everything happens in `step`, called over and over from one thread; nothing in it waits for
+long. Scans are under way from when they leave stage 1's pipe until both their frame and
+their points have arrived here. Only so many batches are under way at a time: that bounds
+every queue, the sorter's buffer and the workers' memory, and it is why no `put` of the
+driver ever meets a full pipe.
+"""
+
+from __future__ import annotations
+
+import time
+import uuid
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from distributed import Client, Future
+from poolpart import Ledger, Partition, Pipe, TaskRecord, forget_pipes
+
+from ..errors import LidarpoolError
+from ..survey import Survey
+from .casting import frames_of, intersect
+from .builder import CloudBuilder
+from .messages import Delivery, Frame, FrameRun, Hello, Part
+from .setup import SurveySetup
+from .stage_names import COLLECT, GENERATE, GPU, INTERSECT, LIDAR, PARTITION_OF, SORT
+from .stages import collect, generate, sort_frames
+
+BATCH_SECONDS = 0.05  # casting time that makes a batch worth its overhead
+BATCH_RAYS = 1_000_000  # bounds a batch's memory, at 16 bytes a hit and 24 a direction
+STALL_SECONDS = 60.0  # without any delivery; then everything under way is sent again
+DELIVERY_CAPACITY = 16  # messages of at most `stages.DELIVERY_BYTES` on their way to the driver
+
+
+@dataclass(eq=False)
+class _UnderWay:
+    """One batch between stage 1 and its arrival."""
+
+    scans: range | list[int]
+    batch: Future
+    frames: Future
+    handed_on: set[str] = field(default_factory=set)  # stages whose pipe it was put into
+    waiting_for: set[str] = field(default_factory=lambda: {SORT, COLLECT})
+
+
+class SurveyPump:
+    """Runs one survey on the partitions of a cluster.
+
+    Parameters
+    ----------
+    client
+        Client of the cluster.
+    partitions
+        The GPU and LIDAR partitions, by name.
+    setup
+        Scene, sensor and backend.
+    survey
+        What to scan.
+    on_frame
+        Called with each frame, in scan order, in the driver's thread.
+    queue_capacity
+        Items that stage 1 may be ahead.
+    collectors
+        Number of tasks of stage 4.
+    """
+
+    def __init__(
+        self,
+        client: Client,
+        partitions: dict[str, Partition],
+        setup: SurveySetup,
+        survey: Survey,
+        on_frame: Callable[[Frame], None],
+        queue_capacity: int = 10,
+        collectors: int = 2,
+    ) -> None:
+        self.client, self.partitions, self.survey = client, partitions, survey
+        self.on_frame = on_frame
+        self.run_id = uuid.uuid4().hex[:8]
+        self.cloud = CloudBuilder(survey.scan_count)
+        self.frames = Ledger(survey.scan_count)
+        self.generated = Ledger(survey.scan_count)
+        self.cast = 0  # scans that stage 2 has finished
+        self.replayed = 0  # batches that were put into a pipe once more
+        self.records: list[TaskRecord] = []
+
+        slots = max(1, partitions[GPU].slots)
+        self._running_most = 2 * slots + 2
+        self._under_way_most = self._running_most + 2 * queue_capacity
+        rays_per_scan = max(1, survey.ray_count // survey.scan_count)
+        self._batch_most = max(
+            1, min(BATCH_RAYS // rays_per_scan, survey.scan_count // (16 * slots))
+        )
+        self._under_way: list[_UnderWay] = []
+        self._greeted: Counter[str] = Counter()
+        self._consumers = {SORT: 1, COLLECT: collectors}
+        self._last_delivery = time.monotonic()
+        self._was_resent = False
+        self._kept: list[_UnderWay] = []  # sent twice: their keys may still be asked for
+        self._closed = False
+
+        def pipe(name: str, capacity: int) -> Pipe:
+            return Pipe(f"lidarpool-{self.run_id}-{name}", capacity, client).create()
+
+        self._scans = pipe("scans", queue_capacity)
+        self._inlets = {
+            stage: pipe(stage, self._under_way_most + queue_capacity) for stage in (SORT, COLLECT)
+        }
+        self._deliveries = pipe("deliveries", DELIVERY_CAPACITY)
+        self._setup = partitions[GPU].submit(_make_setup, *setup.__reduce__()[1], key=self._key("scene"))
+        self._stages = self._start_stages()
+
+    def _key(self, name: str, number: int | None = None) -> str:
+        return f"{name}-{self.run_id}" + ("" if number is None else f"-{number}")
+
+    def _start_stages(self) -> dict[str, Future]:
+        lidar, survey, sensor = self.partitions[LIDAR], self.survey, self.survey.sensor
+        out = self._deliveries
+        stages = {GENERATE: lidar.submit(generate, survey, self._scans, key=self._key(GENERATE))}
+        stages[SORT] = lidar.submit(sort_frames, self._inlets[SORT], out, key=self._key(SORT))
+        for number in range(self._consumers[COLLECT]):
+            stages[f"{COLLECT}-{number}"] = lidar.submit(
+                collect,
+                sensor,
+                survey.keep_every,
+                survey.precision_m,
+                self._inlets[COLLECT],
+                out,
+                key=self._key(COLLECT, number),
+            )
+        return stages
+
+    # -- one turn ----------------------------------------------------------------------
+
+    @property
+    def complete(self) -> bool:
+        """Whether every frame and every point has arrived."""
+        return self.frames.complete and self.cloud.ledger.complete
+
+    @property
+    def finished(self) -> bool:
+        """Whether, after that, the stages have ended."""
+        return self._closed and all(future.done() for future in self._stages.values())
+
+    def step(self) -> bool:
+        """Do what can be done now; returns whether anything was.
+
+        Raises
+        ------
+        LidarpoolError
+            If a task of the survey has failed, naming stage and scans.
+        """
+        self._check_tasks()
+        if self._closed:
+            return False
+        moved = self._take_deliveries()
+        moved |= self._hand_on()
+        moved |= self._take_scans()
+        if self.complete:
+            for inlet in self._inlets.values():
+                inlet.close()
+            self._closed = True
+        elif self._under_way and time.monotonic() - self._last_delivery > STALL_SECONDS:
+            for stage in self._inlets:
+                self._send_again(stage)
+        return moved
+
+    def _check_tasks(self) -> None:
+        for name, future in self._stages.items():
+            _raise_if_failed(future, f"stage {name}")
+        _raise_if_failed(self._setup, "preparing the scene on the GPU workers")
+        for item in self._under_way:
+            for future in (item.batch, item.frames):
+                _raise_if_failed(future, f"stage {INTERSECT}, scans {item.scans[0]} to {item.scans[-1]}")
+
+    def _take_scans(self) -> bool:
+        """Submit a stage-2 task for each item of stage 1, as far as the credit goes."""
+        running = sum(not item.handed_on for item in self._under_way)
+        if running >= self._running_most or len(self._under_way) >= self._under_way_most:
+            return False
+        items = self._scans.poll()
+        for item in items:
+            # A generator that was run again describes scans again.
+            wire = [numbers for numbers in item if self.generated.accept(int(numbers[0]))]
+            if wire:
+                self._submit(wire)
+        return bool(items)
+
+    def _submit(self, wire: Sequence[Sequence[float]]) -> None:
+        gpu, first = self.partitions[GPU], int(wire[0][0])
+        batch = gpu.submit(intersect, self._setup, wire, key=self._key(INTERSECT, first))
+        frames = gpu.submit(frames_of, batch, key=self._key("frames", first), priority=1)
+        scans = [int(numbers[0]) for numbers in wire]
+        self._under_way.append(_UnderWay(scans, batch, frames))
+
+    def _hand_on(self) -> bool:
+        """Put what stage 2 has finished into the pipes of stages 3 and 4."""
+        moved = False
+        for stage, inlet in self._inlets.items():
+            ready = [
+                item
+                for item in self._under_way
+                if stage not in item.handed_on and _result_of(item, stage).status == "finished"
+            ]
+            if ready:
+                self._put(stage, inlet, ready)
+                moved = True
+                if stage == COLLECT:
+                    self.cast += sum(len(item.scans) for item in ready)
+        return moved
+
+    def _put(self, stage: str, inlet: Pipe, items: Sequence[_UnderWay]) -> None:
+        keys = [_result_of(item, stage).key for item in items]
+        inlet.put({"base": self.frames.first_missing, "keys": keys}, timeout_s=STALL_SECONDS)
+        for item in items:
+            item.handed_on.add(stage)
+
+    # -- what arrives ------------------------------------------------------------------
+
+    def _take_deliveries(self) -> bool:
+        deliveries = self._deliveries.poll()
+        for data in deliveries:
+            delivery = Delivery.from_wire(data)
+            content = delivery.content
+            if isinstance(content, Hello):
+                self._greet(delivery.stage)
+            elif isinstance(content, FrameRun):
+                self._take_frames(content)
+            else:
+                self.cloud.add(content)
+        if deliveries:
+            self._last_delivery = time.monotonic()
+            self._release_arrived()
+        return bool(deliveries)
+
+    def _take_frames(self, run: FrameRun) -> None:
+        self.records.extend(run.records)
+        for frame in run.frames:
+            if self.frames.accept(frame.scan):
+                self.on_frame(frame)
+        if run.records:
+            last = run.records[-1]
+            per_scan = max(last.seconds, 1e-6) / last.items
+            wished = min(int(BATCH_SECONDS / per_scan), 2 * last.items, self._batch_most)
+            self._scans.advise(max(1, wished))
+
+    def _release_arrived(self) -> None:
+        still = []
+        for item in self._under_way:
+            if SORT in item.waiting_for and all(scan in self.frames for scan in item.scans):
+                item.waiting_for.discard(SORT)
+            if COLLECT in item.waiting_for and all(s in self.cloud.ledger for s in item.scans):
+                item.waiting_for.discard(COLLECT)
+            if item.waiting_for:
+                still.append(item)
+            elif self._was_resent:
+                # A collector may ask for the key of a batch that another has delivered. The
+                # scheduler would make it wait for ever for a key that nobody holds.
+                self._kept.append(item)
+        self._under_way = still
+        if not still:
+            self._kept.clear()
+            self._was_resent = False
+
+    # -- sending again -----------------------------------------------------------------
+
+    def _greet(self, stage: str) -> None:
+        """A consumer has started. Once each is expected; more means that one had died."""
+        self._greeted[stage] += 1
+        if self._greeted[stage] > self._consumers[stage]:
+            self._send_again(stage)
+
+    def _send_again(self, stage: str) -> None:
+        lost = [i for i in self._under_way if stage in i.handed_on and stage in i.waiting_for]
+        lost = [item for item in lost if _result_of(item, stage).status == "finished"]
+        if lost:
+            self._was_resent = True
+            self.replayed += len(lost)
+            self._put(stage, self._inlets[stage], lost)
+        self._last_delivery = time.monotonic()
+
+    # -- the end -----------------------------------------------------------------------
+
+    @property
+    def duplicates_dropped(self) -> int:
+        """Scans that came more than once: descriptions, frames or points."""
+        ledgers = (self.generated, self.frames, self.cloud.ledger)
+        return sum(ledger.duplicates for ledger in ledgers)
+
+    def stop(self, reason: str) -> None:
+        """End every stage at once; `finish` does the rest."""
+        for pipe in (self._scans, self._deliveries, *self._inlets.values()):
+            pipe.fail(reason)
+        self.client.cancel([f for item in self._under_way for f in (item.frames, item.batch)])
+
+    def finish(self, timeout_s: float = 10.0) -> None:
+        """Wait for the stages to end, take their records, and leave nothing on the scheduler."""
+        deadline = time.monotonic() + timeout_s
+        while not all(f.done() for f in self._stages.values()) and time.monotonic() < deadline:
+            time.sleep(0.01)
+        for future in self._stages.values():
+            if future.status == "finished":
+                self.records.append(future.result(timeout=timeout_s))
+        pipes = (self._scans, self._deliveries, *self._inlets.values())
+        forget_pipes(self.client, [pipe.name for pipe in pipes])
+        self.client.cancel([*self._stages.values(), self._setup])
+        self._under_way.clear()
+        self._kept.clear()
+
+
+def _make_setup(*arguments: Any) -> SurveySetup:
+    return SurveySetup(*arguments)
+
+
+def _result_of(item: _UnderWay, stage: str) -> Future:
+    return item.frames if stage == SORT else item.batch
+
+
+def _raise_if_failed(future: Future, what: str) -> None:
+    if future.status == "error":
+        error = future.exception(timeout=10)
+        raise LidarpoolError(f"{what} failed: {error}")
+    if future.status == "cancelled":  # "lost" passes: a worker died and the task runs again
+        raise LidarpoolError(f"{what} was cancelled from outside this run.")

@@ -1,0 +1,10 @@
+"""Names of the stages and of the partitions that they run on; a leaf module."""
+
+GPU, LIDAR, OTHER = "GPU", "LIDAR", "OTHER"
+
+GENERATE = "generate"  # 1, on LIDAR: one long task
+INTERSECT = "intersect"  # 2, on GPU: a short task an item
+SORT = "sort"  # 3, on LIDAR: one long task
+COLLECT = "collect"  # 4, on LIDAR: two long tasks
+
+PARTITION_OF = {GENERATE: LIDAR, INTERSECT: GPU, SORT: LIDAR, COLLECT: LIDAR}

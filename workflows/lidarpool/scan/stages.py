@@ -1,0 +1,171 @@
+"""Stages 1, 3 and 4: the long-running tasks on LIDAR workers.
+
+Each secedes at once: it frees its thread, so that a worker with one thread and four LIDAR
+slots runs all four, and keeps its slot. A pipe that fails ends a stage quietly: whoever
+failed it knows why.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from distributed import Client, Future, get_client, secede
+from poolpart import Pipe, PipeClosed, PipeFailed, Recorder, TaskRecord
+
+from ..sensor import Sensor
+from ..survey import ScanSpec, Survey
+from .messages import POINT, Batch, Delivery, Frame, FrameRun, Hello, Part
+from .setup import ray_directions
+from .stage_names import COLLECT, GENERATE, LIDAR, SORT
+
+DELIVERY_BYTES = 4 << 20  # of points or frames in one message through the scheduler
+FETCH_TIMEOUT_S = 30.0  # then the driver is left to send the batch again
+
+
+def generate(survey: Survey, outlet: Pipe) -> TaskRecord:
+    """Stage 1: describe every scan and send it on, as many in one item as is advised."""
+    secede()
+    recorder = Recorder(GENERATE, LIDAR)
+    sent = 0
+    try:
+        while sent < survey.scan_count:
+            stop = min(sent + outlet.advice, survey.scan_count)
+            outlet.put([survey.scan(index).wire() for index in range(sent, stop)])
+            sent = stop
+        outlet.close()
+    except PipeFailed:
+        pass
+    except PipeClosed:  # an earlier run of this task got as far as closing it
+        sent = survey.scan_count
+    return recorder.done(sent)
+
+
+def sort_frames(inlet: Pipe, outlet: Pipe) -> TaskRecord:
+    """Stage 3: put frames back into scan order.
+
+    The driver has only so many scans under way, which bounds the frames waiting here.
+    """
+    secede()
+    recorder = Recorder(SORT, LIDAR)
+    waiting: dict[int, Frame] = {}  # {scan: frame that came before its turn}
+    following = 0  # the scan whose turn it is
+    try:
+        outlet.put(Delivery(SORT, Hello()).wire())
+        while True:
+            items = inlet.get_all()
+            # Everything before `base` has reached the driver: a sorter that was started again
+            # with an empty memory must not wait for it.
+            following = max(following, *(item["base"] for item in items))
+            records = []
+            for frames, record in _fetch(items):
+                records.append(record)
+                waiting.update({frame.scan: frame for frame in frames if frame.scan >= following})
+            ready = []
+            for stale in [scan for scan in waiting if scan < following]:
+                del waiting[stale]
+            while following in waiting:
+                ready.append(waiting.pop(following))
+                following += 1
+            for run in _frame_runs(ready, records):
+                outlet.put(Delivery(SORT, run).wire())
+    except (PipeClosed, PipeFailed):
+        return recorder.done(following)
+
+
+def collect(
+    sensor: Sensor, keep_every: int, precision_m: float, inlet: Pipe, outlet: Pipe
+) -> TaskRecord:
+    """Stage 4: thin out the hits of each scan, turn them into points, gather and deliver."""
+    secede()
+    recorder = Recorder(COLLECT, LIDAR)
+    scans = 0
+    try:
+        outlet.put(Delivery(COLLECT, Hello()).wire())
+        while True:
+            batches: list[Batch] = list(_fetch(inlet.get_all()))
+            tables = [
+                (spec.scan, points_of(sensor, spec, hits[::keep_every], precision_m))
+                for batch in batches
+                for spec, hits in _hits_by_scan(batch)
+            ]
+            scans += len(tables)
+            for part in _parts(tables):
+                outlet.put(Delivery(COLLECT, part).wire())
+    except (PipeClosed, PipeFailed):
+        return recorder.done(scans)
+
+
+def points_of(sensor: Sensor, spec: ScanSpec, hits: np.ndarray, precision_m: float) -> np.ndarray:
+    """Points (POINT) of some hits (HIT) of one scan, rounded to the precision."""
+    directions = ray_directions(sensor, spec, hits["ray"])
+    position = np.asarray(spec.pose.position) + directions * hits["distance"][:, None]
+    points = np.zeros(len(hits), POINT)
+    points["cell"] = np.rint(position / precision_m)
+    points["scan"], points["ray"] = spec.scan, hits["ray"]
+    points["object"], points["ring"] = hits["object"], hits["ray"] % sensor.layers
+    return points
+
+
+def _fetch(items: Sequence[dict[str, Any]]) -> Iterator[Any]:
+    """Results of the batches that some pipe items name, straight from the workers that have them.
+
+    The items carry keys, not futures: the driver holds the futures until the scans have
+    arrived, and a queue that is given a future it does not know yet polls for it.
+    """
+    client: Client = get_client()
+    futures = [
+        Future(key, client=client, state="memory") for item in items for key in item["keys"]
+    ]
+    try:
+        # "skip": a batch that was sent again may have been delivered by another and released.
+        results = client.sync(
+            client._gather, futures, errors="skip", callback_timeout=FETCH_TIMEOUT_S
+        )
+    except TimeoutError:
+        return
+    yield from results
+
+
+def _hits_by_scan(batch: Batch) -> Iterator[tuple[ScanSpec, np.ndarray]]:
+    stops = np.cumsum(batch.hit_counts)
+    for spec, stop, count in zip(batch.scans, stops, batch.hit_counts, strict=True):
+        yield spec, batch.hits[stop - count : stop]
+
+
+def _frame_runs(frames: Sequence[Frame], records: Sequence[TaskRecord]) -> Iterator[FrameRun]:
+    """Divide frames into messages of bounded size; the records go with the first."""
+    run: list[Frame] = []
+    size = 0
+    carried = tuple(records)
+    for frame in frames:
+        run.append(frame)
+        size += frame.triangles.nbytes + frame.counts.nbytes + frame.samples.nbytes
+        if size >= DELIVERY_BYTES:
+            yield FrameRun(tuple(run), carried)
+            run, size, carried = [], 0, ()
+    if run or carried:
+        yield FrameRun(tuple(run), carried)
+
+
+def _parts(tables: Sequence[tuple[int, np.ndarray]]) -> Iterator[Part]:
+    """Divide the points of some scans into messages of bounded size."""
+    held: list[tuple[int, np.ndarray]] = []
+    size = 0
+    for scan, points in tables:
+        held.append((scan, points))
+        size += points.nbytes
+        if size >= DELIVERY_BYTES:
+            yield _part(held)
+            held, size = [], 0
+    if held:
+        yield _part(held)
+
+
+def _part(tables: Sequence[tuple[int, np.ndarray]]) -> Part:
+    return Part(
+        scans=tuple(scan for scan, _ in tables),
+        counts=tuple(len(points) for _, points in tables),
+        points=np.concatenate([points for _, points in tables]),
+    )

@@ -1,0 +1,346 @@
+"""A whole run: the survey and, beside it, the planning, on one cluster."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+from distributed import Client
+from distributed.comm.core import CommClosedError
+from numpy.typing import NDArray
+from poolpart import (
+    Backoff,
+    Partition,
+    PipeClosed,
+    PipeFailed,
+    TaskRecord,
+    assign_devices,
+    local_cluster,
+)
+
+from .checks import check_backend_here, check_precision, common_backend, survey_pool
+from .cloud import Cloud
+from .errors import LidarpoolError
+from .plan import Plan, Planning, Trial
+from .progress import Progress
+from .scan import GPU, LIDAR, OTHER, Frame, SurveyPump, SurveySetup
+from .scene import Scene
+from .survey import Survey
+from .trials import TrialPump
+
+PROGRESS_EVERY_S = 0.1
+WATCH_EVERY_S = 1.0
+PATIENCE_S = 60.0  # how long a partition may be without workers; a nanny needs a few seconds
+SAMPLE_RAYS = 400  # kept for the pictures
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """What a run gives.
+
+    Parameters
+    ----------
+    cloud
+        The merged points.
+    hit_counts
+        int64 (f,): rays that hit each triangle of the scene.
+    sample_rays
+        float32 (k, 2, 3): first and last point of some rays, metres, local coordinates.
+    plan, trials
+        The best path and all trials; None and empty where nothing was planned.
+    backend
+        Name of the ray-casting backend that was used.
+    rays, hits
+        Rays fired, and those that hit something.
+    records
+        Each task of the run: where it ran and when.
+    seconds, survey_seconds, planning_seconds
+        Wall time of all, of the survey and of the planning.
+    replayed, duplicates_dropped
+        Batches that had to be sent again, and scans that came twice because of it.
+    notes
+        What a user should know, such as that the GPU partition had no GPU.
+    """
+
+    cloud: Cloud
+    hit_counts: NDArray[np.int64]
+    sample_rays: NDArray[np.float32]
+    plan: Plan | None
+    trials: tuple[Trial, ...]
+    backend: str
+    rays: int
+    hits: int
+    records: tuple[TaskRecord, ...]
+    seconds: float
+    survey_seconds: float
+    planning_seconds: float
+    replayed: int
+    duplicates_dropped: int
+    notes: tuple[str, ...]
+
+
+def simulate(
+    scene: Scene,
+    survey: Survey,
+    planning: Planning | None = None,
+    *,
+    client: Client | None = None,
+    backend: str = "auto",
+    on_frame: Callable[[Frame], None] | None = None,
+    on_progress: Callable[[Progress], None] | None = None,
+    queue_capacity: int = 10,
+    collectors: int = 2,
+    gpu_workers: int | None = None,
+    other_workers: int | None = None,
+) -> Result:
+    """Scan a scene on a partitioned cluster and plan a path meanwhile.
+
+    Parameters
+    ----------
+    scene, survey
+        What to scan, and how; poses in the scene's local coordinates.
+    planning
+        A path to plan on the OTHER partition while the survey runs; None for none.
+    client
+        Client of a cluster whose workers declare the resources GPU, LIDAR and OTHER. Without
+        one, a local cluster is started on the loopback interface and stopped in the end.
+    backend
+        Ray-casting backend of stage 2: auto, cuda, embree or numpy.
+    on_frame
+        Called with each frame, in scan order, while the survey runs. It is called in this
+        thread: while it takes its time the pipeline waits, and nothing is lost.
+    on_progress
+        Called some ten times a second with how far things are.
+    queue_capacity
+        Items that stage 1 may be ahead of stage 2.
+    collectors
+        Tasks of stage 4.
+    gpu_workers, other_workers
+        Workers of a local cluster; by default what suits the machine.
+
+    Returns
+    -------
+    Result
+        The same survey gives the same cloud on any cluster.
+
+    Raises
+    ------
+    LidarpoolError
+        If the cluster lacks something or a task fails; one or two lines say which and what to
+        do. KeyboardInterrupt passes through once everything has been stopped.
+
+    Examples
+    --------
+    >>> from lidarpool import Scene, Survey, simulate
+    >>> if __name__ == "__main__":                                     # doctest: +SKIP
+    ...     result = simulate(Scene.seed(), Survey(poses=[(0, 0, 1)]))
+    ...     print(len(result.cloud), "points")
+    """
+    check_precision(scene, survey)
+    if client is None:
+        check_backend_here(backend)
+    with _cluster(client, collectors, gpu_workers, other_workers) as client:
+        run = _Run(client, scene, survey, planning, backend, queue_capacity, collectors)
+        return run.drive(on_frame, on_progress)
+
+
+@contextmanager
+def _cluster(
+    client: Client | None, collectors: int, gpu_workers: int | None, other_workers: int | None
+) -> Iterator[Client]:
+    if client is not None:
+        yield client
+        return
+    with (
+        local_cluster(
+            gpu_workers=gpu_workers, lidar_slots=2 + collectors, other_workers=other_workers
+        ) as cluster,
+        Client(cluster) as own,
+    ):
+        yield own
+
+
+class _Run:
+    """One run on one cluster, checked and ready to be driven."""
+
+    def __init__(
+        self,
+        client: Client,
+        scene: Scene,
+        survey: Survey,
+        planning: Planning | None,
+        backend: str,
+        queue_capacity: int,
+        collectors: int,
+    ) -> None:
+        pool = survey_pool(client, collectors, planning is not None)
+        self.client, self.scene, self.survey, self.planning = client, scene, survey, planning
+        self.queue_capacity, self.collectors = queue_capacity, collectors
+        self.partitions: dict[str, Partition] = pool.partitions()
+        casting = [worker for worker in pool if worker.resources.get(GPU)]
+        self.backend = common_backend(client, backend, casting)
+        self.notes: list[str] = []
+        if not any(worker.gpus for worker in casting):
+            self.notes.append(
+                f"no GPU in partition GPU: {len(casting)} CPU worker{'s' * (len(casting) > 1)} "
+                f"cast{'s' * (len(casting) == 1)} the rays with {self.backend}"
+            )
+        self.setup = SurveySetup(scene, survey.sensor, self.backend, assign_devices(casting))
+        self.hit_counts = np.zeros(len(scene.faces), np.int64)
+        self.samples: list[NDArray[np.float32]] = []
+        self.hits = 0
+
+    def drive(
+        self,
+        on_frame: Callable[[Frame], None] | None,
+        on_progress: Callable[[Progress], None] | None,
+    ) -> Result:
+        started = time.monotonic()
+
+        def take(frame: Frame) -> None:
+            self._take(frame)
+            if on_frame:
+                on_frame(frame)
+
+        pumps: list[SurveyPump | TrialPump] = []
+        trials = None
+        try:
+            if self.planning is not None:  # first, so that no slot of OTHER waits for the survey
+                trials = TrialPump(self.client, self.partitions[OTHER], self.planning)
+                trials.step()
+                pumps.append(trials)
+            survey = SurveyPump(
+                self.client,
+                self.partitions,
+                self.setup,
+                self.survey,
+                take,
+                self.queue_capacity,
+                self.collectors,
+            )
+            pumps.append(survey)
+            times = self._loop(pumps, survey, trials, on_progress, started)
+        except BaseException as error:
+            reason = str(error) or type(error).__name__
+            _stop(pumps, f"the run was stopped: {reason}")
+            if isinstance(error, (OSError, CommClosedError, PipeClosed, PipeFailed)):
+                raise LidarpoolError(
+                    f"The cluster at {self.client.scheduler.address} cannot be reached any more "
+                    f"({type(error).__name__}: {error}); the run has ended without a result."
+                ) from error
+            raise
+        for pump in pumps:
+            pump.finish()
+        return self._result(survey, trials, started, times)
+
+    def _loop(
+        self,
+        pumps: list[SurveyPump | TrialPump],
+        survey: SurveyPump,
+        trials: TrialPump | None,
+        on_progress: Callable[[Progress], None] | None,
+        started: float,
+    ) -> dict[type, float]:
+        """Step the pumps until all have finished; returns when each did, in seconds."""
+        pause = Backoff(least_s=0.001, most_s=0.016)
+        watch = _Watch(self.client, {GPU, LIDAR} | ({OTHER} if trials else set()))
+        times: dict[type, float] = {}
+        told = float("-inf")
+        while len(times) < len(pumps):
+            moved = False
+            for pump in pumps:
+                if not pump.finished:
+                    moved |= pump.step()
+                elif type(pump) not in times:
+                    times[type(pump)] = time.monotonic() - started
+            now = time.monotonic()
+            watch.look(now)
+            if on_progress and (now - told >= PROGRESS_EVERY_S or len(times) == len(pumps)):
+                told = now
+                on_progress(self._progress(survey, trials, now - started))
+            if moved:
+                pause.reset()
+            else:
+                pause.sleep()
+        return times
+
+    def _take(self, frame: Frame) -> None:
+        np.add.at(self.hit_counts, frame.triangles, frame.counts)
+        self.hits += frame.hits
+        every = max(1, 4 * self.survey.scan_count // SAMPLE_RAYS)
+        if frame.scan % every == 0 and len(frame.samples):
+            starts = np.broadcast_to(np.float32(frame.pose.position), frame.samples.shape)
+            self.samples.append(np.stack([starts, frame.samples], axis=1))
+
+    def _progress(self, survey: SurveyPump, trials: TrialPump | None, seconds: float) -> Progress:
+        return Progress(
+            scans=self.survey.scan_count,
+            generated=survey.generated.delivered,
+            cast=survey.cast,
+            framed=survey.frames.delivered,
+            collected=survey.cloud.ledger.delivered,
+            points=survey.cloud.point_count,
+            trials=self.planning.trials if self.planning else 0,
+            trials_done=len(trials.trials) if trials else 0,
+            seconds=seconds,
+        )
+
+    def _result(
+        self, survey: SurveyPump, trials: TrialPump | None, started: float, times: dict[type, float]
+    ) -> Result:
+        samples = np.concatenate(self.samples) if self.samples else np.empty((0, 2, 3), np.float32)
+        return Result(
+            cloud=survey.cloud.merge(self.survey.precision_m, self.scene.origin),
+            hit_counts=self.hit_counts,
+            sample_rays=samples,
+            plan=trials.plan() if trials else None,
+            trials=tuple(trials.trials) if trials else (),
+            backend=self.backend,
+            rays=self.survey.ray_count,
+            hits=self.hits,
+            records=tuple(survey.records + (trials.records if trials else [])),
+            seconds=time.monotonic() - started,
+            survey_seconds=times[SurveyPump],
+            planning_seconds=times.get(TrialPump, 0.0),
+            replayed=survey.replayed,
+            duplicates_dropped=survey.duplicates_dropped,
+            notes=tuple(self.notes),
+        )
+
+
+def _stop(pumps: list[SurveyPump | TrialPump], reason: str) -> None:
+    """Stop what can be stopped; the cluster may be gone, and then nothing can."""
+    for pump in pumps:
+        try:
+            pump.stop(reason)
+            pump.finish()
+        except (OSError, CommClosedError, RuntimeError):
+            # The first error is the one to tell of.
+            continue
+
+
+class _Watch:
+    """Notices a partition that stays without workers: Dask would wait for ever."""
+
+    def __init__(self, client: Client, names: set[str]) -> None:
+        self.client, self.names = client, names
+        self._looked = time.monotonic()
+        self._seen = dict.fromkeys(names, self._looked)
+
+    def look(self, now: float) -> None:
+        """Check, once in a while; LidarpoolError if a partition has been empty for too long."""
+        if now - self._looked < WATCH_EVERY_S:
+            return
+        self._looked = now
+        for worker in self.client.scheduler_info(n_workers=-1)["workers"].values():
+            for name in self.names & set(worker["resources"]):
+                self._seen[name] = now
+        for name, seen in self._seen.items():
+            if now - seen > PATIENCE_S:
+                raise LidarpoolError(
+                    f"Partition {name!r} has had no workers for {PATIENCE_S:.0f} s, so the run "
+                    f'was ended: start some with --resources "{name}=1" and run it again.'
+                )
