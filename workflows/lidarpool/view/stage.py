@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-# Coordinates of more digits than this make tick labels that nobody reads.
-LONGEST_LABEL = 100_000.0
+# Numbers of more digits than this are not read: far coordinates are labelled from an offset.
+MOST_DIGITS = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +98,9 @@ class Stage:
             (3,) what local coordinates are added to.
         """
         low, high = bounds
-        widest = max(float((high - low).max()), 1e-6 * float(np.abs(bounds).max()), 1e-3)
+        widest = float((high - low).max())
+        if widest <= 1e-6 * max(float(np.abs(bounds).max()), 1.0):
+            widest = 1.0
         # A flat or pointlike box gets some width, so that there is something to look at.
         pad = np.maximum(np.array([0.15, 0.15, 0.02]) * widest - (high - low), 0) / 2
         pad[2] = 0.0
@@ -131,7 +133,8 @@ def axis(name: str, low: float, high: float, step: float, origin: float) -> Axis
     last = math.floor((high + origin + slack) / step)
     world: Floats = np.arange(first, last + 1, dtype=np.float64) * step
     offset = 0.0
-    if len(world) and np.abs(world).max() >= LONGEST_LABEL and high - low < LONGEST_LABEL:
+    far = 10.0**MOST_DIGITS
+    if high - low < far and np.abs(world).max(initial=0.0) >= min(far, far * step):
         unit = 10.0 ** math.floor(math.log10(max(high - low, 1.0)))
         offset = math.floor(world[0] / unit) * unit
     decimals = max(0, -math.floor(math.log10(step) + 1e-9))

@@ -1,0 +1,72 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidarpool import LidarpoolError
+from lidarpool.mesh import Mesh
+from lidarpool.scene import Scene
+from lidarpool.view.intensity import checked_counts, hit_density
+
+
+def sheet(n):
+    """A square of n x n cells, one metre wide."""
+    x, y = np.meshgrid(np.linspace(0, 1, n + 1), np.linspace(0, 1, n + 1))
+    vertices = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    number = np.arange(x.size).reshape(n + 1, n + 1)
+    a, b, c, d = (
+        q.ravel() for q in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1])
+    )
+    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    return Scene.from_meshes([Mesh("Sheet", vertices, faces)])
+
+
+SHEET = sheet(6)
+AREA = 1 / len(SHEET.faces)
+
+
+@settings(deadline=None)
+@given(st.lists(st.integers(0, 40), min_size=72, max_size=72))
+def test_sharing_hits_keeps_their_number(counts):
+    hits = checked_counts(SHEET, counts)
+    density = hit_density(SHEET, hits)
+    assert (density >= 0).all()
+    assert (density * AREA).sum() == pytest.approx(sum(counts))
+
+
+def test_even_hits_stay_even():
+    density = hit_density(SHEET, np.ones(72))
+    np.testing.assert_allclose(density, 72)
+
+
+def test_many_hits_a_triangle_are_not_smeared():
+    hits = np.zeros(72)
+    hits[10] = 500
+    density = hit_density(SHEET, hits)
+    assert density[10] == pytest.approx(500 / AREA)
+    assert not density[np.arange(72) != 10].any()
+
+
+def test_single_hits_spread_to_their_neighbours():
+    hits = np.zeros(72)
+    hits[30] = 1
+    assert (hit_density(SHEET, hits) > 0).sum() > 10
+
+
+def test_triangles_without_area_have_no_density():
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [2, 0, 0]], dtype=float)
+    scene = Scene.from_meshes([Mesh("Odd", vertices, np.array([[0, 1, 2], [0, 1, 3]]))])
+    density = hit_density(scene, np.array([4.0, 3.0]))
+    assert np.isfinite(density).all() and density[1] == 0
+
+
+def test_odd_counts_are_none():
+    counts = np.ones(72)
+    counts[:4] = np.nan, np.inf, -5, -np.inf
+    assert checked_counts(SHEET, counts).sum() == 68
+
+
+@pytest.mark.parametrize("counts", [[], [1, 2], np.ones((72, 1))])
+def test_counts_that_do_not_fit_are_refused(counts):
+    with pytest.raises(LidarpoolError, match="72 triangles"):
+        checked_counts(SHEET, counts)

@@ -1,0 +1,181 @@
+"""What hides what: the reason why these pictures are not left to matplotlib."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from lidarpool.mesh import Mesh
+from lidarpool.scene import Scene
+from lidarpool.view.cloud_picture import on_shown_surfaces
+from lidarpool.view.overlay import splat, visible, visible_runs
+from lidarpool.view.samples import GROUND, SKY
+from lidarpool.view.shot import take_shot
+from lidarpool.view.theme import LIGHT
+
+SIZE = (320, 200)
+
+
+def box(name, size, centre):
+    solid = trimesh.creation.box(size)
+    return Mesh(name, np.array(solid.vertices) + centre, np.array(solid.faces))
+
+
+@pytest.fixture(scope="module")
+def row():
+    """A near, a middle and a far box, one behind the other along the camera's view."""
+    towards = np.array([np.cos(np.radians(-62)), np.sin(np.radians(-62)), 0.0])
+    return Scene.from_meshes(
+        [
+            box(name, (2, 2, 2), k * 2.2 * towards)
+            for name, k in (("near", 1), ("middle", 0), ("far", -1))
+        ]
+    )
+
+
+@pytest.fixture(scope="module")
+def shot(row):
+    return take_shot(row, size=SIZE, backend="numpy")
+
+
+def closest_hit(scene, eye, ray):
+    """Distance and triangle by the textbook: every triangle's plane, then three half-planes."""
+    best = (np.inf, -1)
+    for number, (a, b, c) in enumerate(scene.vertices[scene.faces]):
+        normal = np.cross(b - a, c - a)
+        if abs(normal @ ray) < 1e-12:
+            continue
+        t = normal @ (a - eye) / (normal @ ray)
+        p = eye + t * ray
+        inside = all(np.cross(q - o, p - o) @ normal >= -1e-9 for o, q in ((a, b), (b, c), (c, a)))
+        if t > 0 and inside and t < best[0]:
+            best = (t, number)
+    return best
+
+
+def test_each_pixel_shows_the_nearest_thing(row, shot):
+    camera, stage = shot.camera, shot.stage
+    rng = np.random.default_rng(3)
+    columns, rows = rng.integers(0, SIZE[0], 400), rng.integers(0, SIZE[1], 400)
+    kinds = set()
+    for column, line in zip(columns, rows, strict=True):
+        ray = camera.rays([[column + 0.5, line + 0.5]])[0]
+        distance, triangle = closest_hit(row, camera.eye, ray)
+        flat = (stage.level - camera.eye[2]) / ray[2]
+        place = camera.eye[:2] + flat * ray[:2]
+        if flat < distance and ((place > stage.ground[0]) & (place < stage.ground[1])).all():
+            distance, triangle = flat, GROUND
+        kinds.add(row.face_object[triangle] if triangle >= 0 else int(triangle))
+        assert shot.depth[line, column] == pytest.approx(distance, rel=1e-5)
+    assert kinds == {0, 1, 2, GROUND, SKY}
+
+
+def test_the_picture_has_the_nearer_boxs_colour(row, shot):
+    colours = np.array([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]])[row.face_object]
+    image = shot.paint(colours, LIGHT)
+    # The far lower corner of the middle box lies behind the near one.
+    centre = row.object_bounds[:, :].mean(axis=1)
+    hidden = centre[1] + [0, 0, -0.9]
+    (pixel,), (seen,) = visible(shot, hidden[None])
+    column, line = pixel.astype(int)
+    red, green, blue = image[line, column]
+    assert not seen and red > 0.2 and green < 0.05 and blue < 0.05
+
+
+def test_points_behind_a_box_are_hidden_and_before_it_seen(row, shot):
+    near = row.object_bounds[0].mean(axis=0)
+    back = -shot.camera.axes[2]
+    _, seen = visible(shot, np.stack([near + 3 * back, near - 3 * back, near]))
+    assert seen.tolist() == [True, False, False]
+
+
+def test_a_line_that_passes_behind_a_box_is_broken(row, shot):
+    middle = row.object_bounds[1].mean(axis=0)
+    middle[2] = row.object_bounds[1, 1, 2] - 0.3
+    right = shot.camera.axes[0]
+    runs = visible_runs(shot, np.array([[middle - 3 * right, middle + 3 * right]]))
+    assert len(runs) == 2
+    ends, _ = shot.camera.project(np.array([middle - 3 * right, middle + 3 * right]))
+    np.testing.assert_allclose(runs[0][0], ends[0], atol=0.5)
+    np.testing.assert_allclose(runs[1][1], ends[1], atol=0.5)
+    above = middle + np.array([0, 0, 2])
+    whole = visible_runs(shot, np.array([[above - 3 * right, above + 3 * right]]))
+    assert len(whole) == 1
+
+
+def test_lines_behind_the_camera_or_none_at_all_draw_nothing(shot):
+    behind = shot.camera.eye - shot.camera.axes[2] * 5
+    assert visible_runs(shot, np.array([[behind, behind + 1e-3]])) == []
+    assert visible_runs(shot, np.empty((0, 2, 3))) == []
+
+
+def test_nearer_points_are_drawn_over_farther_ones(shot):
+    camera = shot.camera
+    at = np.array([[160.2, 100.2]])
+    ray = camera.rays(at)[0]
+    points = camera.eye + np.array([[5.0], [9.0]]) * ray
+    red, blue = np.array([1.0, 0, 0]), np.array([0, 0, 1.0])
+    blank = np.ones((*SIZE[::-1], 3))
+    for order in ([0, 1], [1, 0]):
+        image = splat(blank, camera, points[order], np.stack([red, blue])[order], 2.0, np.zeros(3))
+        np.testing.assert_allclose(image[100, 160], red, atol=0.05)
+        assert (image != 1).any(axis=2).sum() < 40
+    assert splat(blank, camera, np.empty((0, 3)), np.empty((0, 3)), 2.0, red) is blank
+
+
+def room():
+    """A closed hall with thick walls and a roof, a crate and a lamp in it."""
+    shell = [
+        box("Hall outside", (12, 20, 4), (0, 0, 2)),
+        box("Hall inside", (11.4, 19.4, 3.4), (0, 0, 2)),
+    ]
+    return [*shell, box("Crate", (1.5, 1.5, 1.5), (2, -4, 1.05))]
+
+
+def as_one(meshes):
+    """The same triangles as a single object."""
+    first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    return [
+        Mesh(
+            "Everything",
+            np.concatenate([mesh.vertices for mesh in meshes]),
+            np.concatenate([m.faces + n for m, n in zip(meshes, first, strict=False)]),
+        )
+    ]
+
+
+@pytest.mark.parametrize("group", [list, as_one])
+def test_the_inside_of_a_closed_hall_is_shown(group):
+    scene = Scene.from_meshes(group(room()))
+    poses = np.array([[0, 0.5, 1.5], [1, 6, 1.5]])
+    shot = take_shot(scene, poses, size=SIZE, backend="numpy")
+    _, seen = visible(shot, np.concatenate([poses, [[2, -4, 1.85], [-3, -5, 0.35]]]))
+    assert seen.all(), "sensors, the crate's top and the floor"
+    far_wall, near_wall = shot.camera.axes[2] * 5, -shot.camera.axes[2] * 5
+    wall = (
+        np.array([np.sign(far_wall[0]) * 5.69, 3.0, 1.5]),
+        np.array([np.sign(near_wall[0]) * 5.69, 3.0, 1.5]),
+    )
+    assert on_shown_surfaces(shot, np.array(wall)).tolist() == [True, False]
+
+
+def test_the_hall_stays_closed_where_the_sensor_is_outside():
+    scene = Scene.from_meshes(room())
+    shot = take_shot(scene, [[0, 30, 1.5]], size=SIZE, backend="numpy")
+    roof_seen = visible(shot, np.array([[0, 0, 4.0]]))[1]
+    floor_seen = visible(shot, np.array([[-3, -5, 0.3]]))[1]
+    assert roof_seen.all() and not floor_seen.any()
+
+
+def test_points_lie_on_the_surface_that_is_shown(row, shot):
+    rng = np.random.default_rng(5)
+    corners = row.vertices[row.faces]
+    share = rng.dirichlet((1, 1, 1), len(corners))
+    points = (share[..., None] * corners).sum(axis=1)
+    shown = on_shown_surfaces(shot, points)
+    direct = []
+    for point in points:
+        offset = point - shot.camera.eye
+        distance = np.linalg.norm(offset)
+        direct.append(closest_hit(row, shot.camera.eye, offset / distance)[0] > distance - 1e-6)
+    assert (shown == direct).mean() > 0.9
+    assert 0.2 < shown.mean() < 0.8
