@@ -1,0 +1,219 @@
+"""The command `lidarpool`."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import sys
+from pathlib import Path
+from typing import Any, NoReturn
+
+import click
+from distributed import Client
+from poolpart import Pool, PoolError
+from raybeam import available_backends
+
+from ._version import __version__
+from .complaints import did_you_mean
+from .errors import LidarpoolError
+from .output import prepare_folder, write_result
+from .plan import Planning
+from .report import versions
+from .scenario import Scenario
+from .scene import Scene
+from .simulate import Result, simulate
+from .survey import Survey
+from .terminal import shown_progress
+
+CONNECT_TIMEOUT_S = 10
+
+_out = click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    default=Path("lidarpool-out"),
+    show_default=True,
+    help="Folder for the results; made if it is not there.",
+)
+_quiet = click.option("--quiet", "-q", is_flag=True, help="No progress, only the result.")
+
+
+class _Commands(click.Group):
+    """Names the command that a misspelt one may have been meant to be."""
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        if args and self.get_command(ctx, args[0]) is None and not args[0].startswith("-"):
+            hint = did_you_mean(args[0], self.list_commands(ctx))
+            raise click.UsageError(
+                f"There is no command {args[0]!r}{hint or ''}; see lidarpool --help.", ctx
+            )
+        return super().resolve_command(ctx, args)
+
+
+@click.group(cls=_Commands)
+@click.version_option(__version__, prog_name="lidarpool")
+def cli() -> None:
+    """Simulate lidar surveys on a partitioned Dask cluster."""
+
+
+@cli.command()
+@_out
+@_quiet
+def demo(out: Path, quiet: bool) -> None:
+    """Run the default survey and path planning on a cluster on this machine.
+
+    \b
+    Examples:
+      lidarpool demo
+      lidarpool demo --out /tmp/demo
+    """
+    _run(Scenario(), out, quiet=quiet)
+
+
+@cli.command()
+@click.argument("scenario", type=click.Path(path_type=Path))
+@_out
+@click.option("--scheduler", metavar="ADDRESS", help="Use this Dask cluster, tcp://host:8786.")
+@click.option(
+    "--backend",
+    metavar="[auto|cuda|embree|numpy]",
+    help="Ray caster of stage 2; by default the scenario's, else the fastest there is.",
+)
+@click.option("--no-plan", is_flag=True, help="Leave the path planning out.")
+@_quiet
+def run(
+    scenario: Path, out: Path, scheduler: str | None, backend: str | None, no_plan: bool, quiet: bool
+) -> None:
+    """Run a survey from a scenario file, or of a mesh file from its middle.
+
+    \b
+    Examples:
+      lidarpool run examples/seed.yaml --out seed
+      lidarpool run hall.glb --no-plan --scheduler tcp://127.0.0.1:8786
+    """
+    _run(Scenario.load(scenario), out, scheduler, backend, no_plan, quiet)
+
+
+def _run(
+    scenario: Scenario,
+    out: Path,
+    scheduler: str | None = None,
+    backend: str | None = None,
+    no_plan: bool = False,
+    quiet: bool = False,
+) -> None:
+    scene = scenario.build_scene()
+    survey = scenario.survey(scene)
+    planning = None if no_plan else scenario.plan(scene)
+    prepare_folder(out)
+    client = _connect(scheduler) if scheduler else None
+    try:
+        with shown_progress(quiet) as show:
+            result = simulate(
+                scene,
+                survey,
+                planning,
+                client=client,
+                backend=backend or scenario.pool.backend,
+                on_progress=show,
+                queue_capacity=scenario.pool.queue_capacity,
+                collectors=scenario.pool.collectors,
+                gpu_workers=scenario.pool.gpu,
+                other_workers=scenario.pool.other,
+            )
+    finally:
+        if client is not None:
+            client.close()
+    write_result(out, result, scene, survey, planning)
+    _tell(out, result, scene, survey, planning)
+
+
+def _tell(
+    out: Path, result: Result, scene: Scene, survey: Survey, planning: Planning | None
+) -> None:
+    for note in result.notes:
+        click.echo(f"note: {note}")
+    click.echo(
+        f"{survey.scan_count:,} scans, {result.rays:,} rays, {result.hits:,} hits on "
+        f"{len(scene.names):,} objects, {len(result.cloud):,} points in the cloud "
+        f"({result.backend}, {result.survey_seconds:.1f} s)"
+    )
+    if result.plan is not None and planning is not None:
+        plan = result.plan
+        free = "free of collisions" if plan.collision_free else "NOT free of collisions"
+        click.echo(
+            f"path of {plan.length:.2f} m, {free}, shortest possible {plan.shortest_possible:.2f} m "
+            f"({plan.trials} trials, {result.planning_seconds:.1f} s)"
+        )
+    click.echo(f"results in {out}: open cloud.ply in any point-cloud viewer, the .png, report.json")
+
+
+@cli.command()
+@click.option("--scheduler", metavar="ADDRESS", help="Also show the workers of this cluster.")
+def info(scheduler: str | None) -> None:
+    """Show versions, ray-casting backends, GPUs and the workers by partition.
+
+    \b
+    Examples:
+      lidarpool info
+      lidarpool info --scheduler tcp://127.0.0.1:8786
+    """
+    for name, number in versions().items():
+        click.echo(f"{name:<14} {number}")
+    click.echo("backends")
+    for name, reason in available_backends().items():
+        click.echo(f"  {name:<12} {reason or 'ready'}")
+    if scheduler is None:
+        return
+    client = _connect(scheduler)
+    try:
+        pool = Pool.from_client(client)
+    except PoolError as error:
+        raise LidarpoolError(str(error)) from error
+    finally:
+        client.close()
+    click.echo(f"{pool!r}")
+    for worker in sorted(pool, key=lambda worker: (sorted(worker.resources), worker.name)):
+        held = ", ".join(f"{name}={slots:g}" for name, slots in sorted(worker.resources.items()))
+        click.echo(
+            f"  {held or 'no partition':<12} {worker.name}  {worker.address}  "
+            f"{worker.nthreads} threads  {worker.memory / 2**30:.1f} GiB  {len(worker.gpus)} GPUs"
+        )
+
+
+def _connect(scheduler: str) -> Client:
+    try:
+        return Client(scheduler, timeout=CONNECT_TIMEOUT_S, set_as_default=False)
+    except (OSError, ValueError, RuntimeError) as error:
+        raise LidarpoolError(
+            f"No Dask scheduler answers at {scheduler!r} ({type(error).__name__}): start one with "
+            "dask scheduler, and give its address as tcp://host:8786."
+        ) from error
+
+
+def _interrupt(*_: Any) -> NoReturn:
+    raise KeyboardInterrupt
+
+
+def main(arguments: list[str] | None = None) -> NoReturn:
+    """Run the command and exit: 0 done, 2 for what the user can put right, 130 interrupted."""
+    signal.signal(signal.SIGTERM, _interrupt)  # what a job manager sends; end as after Ctrl-C
+    for name in ("distributed", "poolpart"):  # their warnings are told in the result's notes
+        logging.getLogger(name).setLevel(logging.ERROR)
+    try:
+        cli.main(args=arguments, prog_name="lidarpool", standalone_mode=False)
+    except LidarpoolError as error:
+        _die(str(error), 2)
+    except click.UsageError as error:
+        _die(error.format_message(), 2)
+    except (KeyboardInterrupt, click.Abort):
+        _die("interrupted; everything was stopped, and the output folder is as it was.", 130)
+    except MemoryError:
+        _die("not enough memory: take a smaller scene, fewer scans or a larger keep_every.", 2)
+    sys.exit(0)
+
+
+def _die(message: str, code: int) -> NoReturn:
+    click.echo(f"lidarpool: {message}", err=True)
+    sys.exit(code)

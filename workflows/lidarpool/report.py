@@ -1,0 +1,172 @@
+"""The report of a run: everything a reader wants to check, as plain data for JSON."""
+
+from __future__ import annotations
+
+import math
+import platform
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import numpy as np
+from poolpart import TaskRecord, placement_violations
+
+from ._version import __version__
+from .plan import Planning
+from .scan import INTERSECT
+from .scene import Scene
+from .simulate import Result
+from .survey import Survey
+from .trials import TRIAL
+
+_PACKAGES = ("numpy", "dask", "distributed", "trimesh", "open3d-cpu", "open3d", "matplotlib")
+_PACKAGES += ("cupy-cuda12x", "cupy-cuda13x")
+
+
+def versions() -> dict[str, str]:
+    """Versions of this package, of Python and of what it stands on."""
+    found = {"lidarpool": __version__, "python": platform.python_version()}
+    for name in _PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def make_report(
+    result: Result,
+    scene: Scene,
+    survey: Survey,
+    planning: Planning | None,
+    files: Sequence[str],
+) -> dict[str, Any]:
+    """Report of a run, ready for JSON.
+
+    Lengths are in metres, times in seconds; what is infinite or unknown is None.
+    """
+    violations = placement_violations(result.records)
+    return {
+        "versions": versions(),
+        "machine": {"system": platform.platform(), "processor": platform.machine()},
+        "backend": result.backend,
+        "notes": list(result.notes),
+        "parameters": _parameters(scene, survey),
+        "scans": survey.scan_count,
+        "rays": result.rays,
+        "hits": result.hits,
+        "points": len(result.cloud),
+        "points_by_object": _points_by_object(result, scene),
+        "seconds": {
+            "total": round(result.seconds, 3),
+            "survey": round(result.survey_seconds, 3),
+            "planning": round(result.planning_seconds, 3),
+            "survey_and_planning_overlap": round(overlap_seconds(result.records), 3),
+        },
+        "stages": _stages(result.records),
+        "tasks": _tasks(result.records),
+        "placement_violations": len(violations),
+        "misplaced_tasks": [asdict(record) for record in violations[:20]],
+        "replayed": result.replayed,
+        "duplicates_dropped": result.duplicates_dropped,
+        "planning": _planning(result, planning),
+        "files": list(files),
+    }
+
+
+def _parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
+    sensor = asdict(survey.sensor)
+    sensor["max_range_m"] = _finite(survey.sensor.max_range_m)
+    return {
+        "objects": len(scene.names),
+        "triangles": len(scene.faces),
+        "origin": scene.origin.tolist(),
+        "sensor": sensor,
+        "poses": len(survey.poses),
+        "first_poses": [asdict(pose) for pose in survey.poses[:10]],
+        "steps": survey.steps,
+        "keep_every": survey.keep_every,
+        "precision_m": survey.precision_m,
+    }
+
+
+def _points_by_object(result: Result, scene: Scene) -> dict[str, int]:
+    counts = np.bincount(result.cloud.object, minlength=len(scene.names))
+    return {name: int(count) for name, count in zip(scene.names, counts, strict=True)}
+
+
+def _stages(records: Iterable[TaskRecord]) -> dict[str, dict[str, Any]]:
+    """For each stage: tasks, items, seconds of work, and the span from first start to last stop."""
+    stages: dict[str, list[TaskRecord]] = {}
+    for record in records:
+        stages.setdefault(record.stage, []).append(record)
+    return {
+        stage: {
+            "partition": group[0].partition,
+            "tasks": len(group),
+            "items": sum(record.items for record in group),
+            "task_seconds": round(sum(record.seconds for record in group), 4),
+            "span_seconds": round(max(r.stop for r in group) - min(r.start for r in group), 4),
+            "workers": sorted({record.worker for record in group}),
+        }
+        for stage, group in stages.items()
+    }
+
+
+def _tasks(records: Iterable[TaskRecord]) -> dict[str, dict[str, int]]:
+    """Tasks by the partition that they really ran on, and by stage."""
+    tasks: dict[str, dict[str, int]] = {}
+    for record in records:
+        for name in record.resources or ("none",):
+            stages = tasks.setdefault(name, {})
+            stages[record.stage] = stages.get(record.stage, 0) + 1
+    return tasks
+
+
+def overlap_seconds(records: Sequence[TaskRecord]) -> float:
+    """Time during which stage 2 and planning trials were both under way."""
+    spans = [
+        [(r.start, r.stop) for r in records if r.stage == stage] for stage in (INTERSECT, TRIAL)
+    ]
+    casting, planning = ([*_union(span)] for span in spans)
+    return sum(
+        max(0.0, min(a[1], b[1]) - max(a[0], b[0])) for a in casting for b in planning
+    )
+
+
+def _union(spans: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    merged: list[tuple[float, float]] = []
+    for start, stop in sorted(spans):
+        if merged and start <= merged[-1][1]:
+            merged[-1] = (merged[-1][0], max(stop, merged[-1][1]))
+        else:
+            merged.append((start, stop))
+    return merged
+
+
+def _planning(result: Result, planning: Planning | None) -> dict[str, Any] | None:
+    plan = result.plan
+    if plan is None or planning is None:
+        return None
+    return {
+        "start": list(planning.start),
+        "target": list(planning.target),
+        "obstacles": len(planning.radii),
+        "trials": plan.trials,
+        "collision_free_trials": sum(trial.collision_free for trial in result.trials),
+        "particles": planning.particles,
+        "iterations": planning.iterations,
+        "seed": planning.seed,
+        "best_trial": plan.trial,
+        "best_length": plan.length,
+        "shortest_possible": _finite(plan.shortest_possible),
+        "excess": _finite(plan.excess),
+        "clearance": _finite(plan.clearance),
+        "collision_free": plan.collision_free,
+        "path": plan.path.tolist(),
+    }
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
