@@ -31,7 +31,7 @@ def visible(shot: Shot, points: Floats, slack: float = 2.0) -> tuple[Floats, Boo
     """
     pixels, distance = shot.camera.project(points)
     inside, column, row = shot.camera.cells(pixels)
-    return pixels, inside | (
+    return pixels, inside & (
         distance <= shot.depth[row, column] + slack * shot.camera.footprint(distance)
     )
 
