@@ -72,12 +72,12 @@ def local_mesh(vertices: ArrayLike, faces: ArrayLike) -> LocalMesh:
     low, high = used.min(axis=0), used.max(axis=0)
     centre = low / 2 + high / 2
     half = float(np.abs(used - centre).max())
-    scale = math.ldexp(1.0, -math.frexp(half)[1]) if half > 0 else 1.0
-    if not np.isfinite(half) or not np.isfinite(scale):
+    if half > 0 and not 1e-100 < half < 1e100:
         raise ValueError(
-            f"The mesh reaches from {low.tolist()} to {high.tolist()}; "
-            "its size cannot be held in float64."
+            f"The mesh reaches from {low.tolist()} to {high.tolist()}: "
+            "its size must be between 1e-100 and 1e100 metres."
         )
+    scale = math.ldexp(1.0, -math.frexp(half)[1]) if half > 0 else 1.0
     corners = ((points - centre) * scale)[rows]
     edges = corners[:, 1:] - corners[:, :1]
     solid = np.cross(edges[:, 0], edges[:, 1]).any(axis=1)

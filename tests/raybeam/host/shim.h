@@ -15,7 +15,7 @@ struct float4 {
 struct Dim {
     unsigned x, y, z;
 };
-static Dim blockIdx, blockDim, threadIdx;
+static thread_local Dim blockIdx, blockDim, threadIdx;
 
 static inline int __float_as_int(float f)
 {

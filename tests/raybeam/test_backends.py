@@ -1,0 +1,101 @@
+"""Which backend is taken, and what is said when it cannot be."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from raybeam import BackendUnavailable, RayCaster, available_backends, registry
+from raybeam.cuda_backend import CudaBackend
+from raybeam.embree_backend import EmbreeBackend
+
+MESH = [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]
+
+
+def test_names_in_order_of_speed():
+    assert list(available_backends()) == ["cuda", "embree", "numpy"]
+    assert available_backends()["numpy"] == ""
+
+
+def test_auto_takes_the_first_that_can_be_used(monkeypatch):
+    usable = [name for name, reason in available_backends().items() if not reason]
+    assert RayCaster(*MESH).backend == usable[0]
+    for backend in (CudaBackend, EmbreeBackend):
+        monkeypatch.setattr(backend, "missing", classmethod(lambda _: "not today"))
+    assert RayCaster(*MESH).backend == "numpy"
+
+
+def test_backend_asked_for_is_taken(backend):
+    assert RayCaster(*MESH, backend).backend == backend
+    assert RayCaster(*MESH, backend=backend, threads=1).backend == backend
+
+
+def test_unavailable_backend_says_why(monkeypatch):
+    monkeypatch.setattr(EmbreeBackend, "missing", classmethod(lambda _: "Open3D is not installed"))
+    with pytest.raises(BackendUnavailable, match="'embree' cannot be used here: Open3D is not"):
+        RayCaster(*MESH, backend="embree")
+
+
+@pytest.mark.parametrize(
+    ("module", "backend", "words"),
+    [("open3d", EmbreeBackend, "pip install open3d"), ("cupy", CudaBackend, "pip install cupy")],
+)
+def test_missing_package_says_what_to_install(monkeypatch, module, backend, words):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert words in backend.missing()
+
+
+def test_unknown_backend():
+    with pytest.raises(ValueError, match="no backend 'optix': use auto, cuda, embree, numpy"):
+        RayCaster(*MESH, backend="optix")
+
+
+def test_bad_threads():
+    with pytest.raises(ValueError, match="threads is 0"):
+        RayCaster(*MESH, backend="numpy", threads=0)
+
+
+def test_repr():
+    assert repr(RayCaster(*MESH, "numpy")) == "RayCaster(1 triangles, backend='numpy')"
+
+
+def test_every_backend_has_a_name_of_its_own():
+    names = [backend.name for backend in registry._BACKENDS]
+    assert len(set(names)) == len(names)
+
+
+def test_import_needs_numpy_only():
+    """Neither Open3D nor CuPy is loaded by importing, nor by casting with numpy."""
+    code = (
+        "import sys, raybeam; "
+        "raybeam.RayCaster([[0,0,0],[1,0,0],[0,1,0]], [[0,1,2]], 'numpy').cast([0,0,1],[0,0,-1]); "
+        "heavy = {'open3d', 'cupy', 'dask', 'trimesh', 'scipy'} & set(sys.modules); "
+        "sys.exit(str(heavy) if heavy else 0)"
+    )
+    path = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=path)
+    assert done.returncode == 0, done.stderr
+
+
+def test_threads_of_one_process_may_share_a_caster(backend, shapes):
+    from concurrent.futures import ThreadPoolExecutor
+
+    caster = RayCaster(*shapes["vase"](), backend, threads=1)
+    directions = np.random.default_rng(0).normal(size=(8, 5000, 3))
+    want = [caster.cast([0.05, 0.1, 0.4], part) for part in directions]
+    with ThreadPoolExecutor(4) as pool:
+        got = list(pool.map(lambda part: caster.cast([0.05, 0.1, 0.4], part), directions))
+    for one, other in zip(got, want, strict=True):
+        np.testing.assert_array_equal(one.distance, other.distance)
+
+
+@pytest.mark.gpu
+def test_device_that_is_not_there():
+    if reason := available_backends()["cuda"]:
+        pytest.skip(f"cuda: {reason}")
+    with pytest.raises(ValueError, match="no CUDA device 99"):
+        RayCaster(*MESH, backend="cuda", device=99)

@@ -1,0 +1,141 @@
+"""The same ray has the same bits in every batch, and with every backend that decides exactly."""
+
+from __future__ import annotations
+
+import tracemalloc
+
+import numpy as np
+import pytest
+
+from raybeam import RayCaster, traverse
+
+FIELDS = ("distance", "triangle", "u", "v")
+
+
+def rays(count, seed):
+    """From inside, outside and far away; of any length; some along the axes."""
+    rng = np.random.default_rng(seed)
+    origins = rng.normal(size=(count, 3)) * 10.0 ** rng.integers(-1, 4, (count, 1))
+    directions = (
+        rng.normal(size=(count, 3)) - 0.9 * origins / np.linalg.norm(origins, axis=1)[:, None]
+    )
+    directions[::9] = np.eye(3)[rng.integers(3, size=len(directions[::9]))]
+    return origins, directions * 10.0 ** rng.integers(-3, 4, (count, 1))
+
+
+def same(one, other):
+    for name in FIELDS:
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+
+
+def test_batches_may_be_cut_anywhere(caster, shapes, monkeypatch):
+    vase = caster(*shapes["vase"]())
+    origins, directions = rays(3000, 1)
+    whole = vase.cast(origins, directions)
+    assert 0.1 < whole.hit.mean() < 0.9
+    for cut in (1, 7, 1000):
+        parts = range(0, 300 if cut == 1 else 3000, cut)
+        cast = [vase.cast(origins[k : k + cut], directions[k : k + cut]) for k in parts]
+        for name in FIELDS:
+            joined = np.concatenate([getattr(part, name) for part in cast])
+            np.testing.assert_array_equal(joined, getattr(whole, name)[: len(joined)])
+    order = np.random.default_rng(2).permutation(3000)
+    shuffled = vase.cast(origins[order], directions[order])
+    for name in FIELDS:
+        np.testing.assert_array_equal(getattr(shuffled, name), getattr(whole, name)[order])
+    monkeypatch.setattr(type(vase._engine), "chunk", 97)
+    same(vase.cast(origins, directions), whole)
+
+
+def test_blocks_may_be_of_any_size(shapes, monkeypatch):
+    vase = RayCaster(*shapes["vase"](), "numpy")
+    origins, directions = rays(2000, 3)
+    whole = vase.cast(origins, directions)
+    for size in (5, 333, 1 << 20):
+        monkeypatch.setattr(traverse, "_BLOCK", size)
+        same(vase.cast(origins, directions), whole)
+
+
+def test_returns_are_the_hits_of_cast(caster, shapes, monkeypatch):
+    vase = caster(*shapes["vase"]())
+    origins, directions = rays(2000, 4)
+    hits = vase.cast(origins, directions, 0.5, 500)
+    assert 0.1 < hits.hit.mean() < 0.9
+    for chunk in (type(vase._engine).chunk, 77):
+        monkeypatch.setattr(type(vase._engine), "chunk", chunk)
+        found = vase.returns(origins, directions, 0.5, 500)
+        np.testing.assert_array_equal(found.ray, np.flatnonzero(hits.hit))
+        np.testing.assert_array_equal(found.distance, hits.distance[hits.hit])
+        np.testing.assert_array_equal(found.triangle, hits.triangle[hits.hit])
+        assert len(found) == hits.hit.sum()
+
+
+def test_one_origin_is_the_same_as_many(caster, shapes):
+    vase = caster(*shapes["vase"]())
+    _, directions = rays(2000, 5)
+    for origin in ([0.1, 0.2, 0.3], [30, 40, 50.0]):
+        same(vase.cast(origin, directions), vase.cast(np.tile(origin, (2000, 1)), directions))
+
+
+@pytest.mark.parametrize("kind", ["random", "sliver", "huge", "tiny"])
+def test_exact_backends_have_the_same_bits(exact_caster, shapes, kind):
+    """Every backend but embree against numpy: distances, weights, and the triangle on a tie."""
+    vertices, faces = shapes["soup"](kind)
+    origins, directions = rays(5000, 6)
+    aim = vertices[faces[np.arange(2500) % len(faces)]].mean(axis=1)
+    directions[:2500] = aim - origins[:2500]
+    for offset in (0, 5e5):
+        reference = RayCaster(vertices + offset, faces, "numpy")
+        other = exact_caster(vertices + offset, faces)
+        for limits in ((0, np.inf), (1, 100)):
+            want = reference.cast(origins + offset, directions, *limits)
+            assert want.hit.any()
+            same(other.cast(origins + offset, directions, *limits), want)
+
+
+@pytest.mark.parametrize("name", ["cube", "sphere", "vase", "terrain box"])
+def test_exact_backends_have_the_same_bits_at_seams(exact_caster, shapes, name):
+    vertices, faces = shapes[name]()
+    rng = np.random.default_rng(7)
+    directions = vertices[faces[rng.integers(len(faces), size=20_000)]]
+    weights = rng.integers(0, 2, (20_000, 3)) + np.array([1e-9, 0, 0])
+    directions = (directions * (weights / weights.sum(axis=1, keepdims=True))[..., None]).sum(
+        axis=1
+    )
+    origin = np.array([0.05, 0.1, 0.4])
+    want = RayCaster(vertices, faces, "numpy").cast(origin, directions - origin)
+    assert want.hit.all()
+    same(exact_caster(vertices, faces).cast(origin, directions - origin), want)
+
+
+def test_embree_and_numpy_agree(shapes):
+    from raybeam import available_backends
+
+    if reason := available_backends()["embree"]:
+        pytest.skip(f"embree: {reason}")
+    vertices, faces = shapes["vase"]()
+    origins, directions = rays(20_000, 8)
+    one = RayCaster(vertices, faces, "embree").cast(origins, directions)
+    two = RayCaster(vertices, faces, "numpy").cast(origins, directions)
+    equal = one.triangle == two.triangle
+    assert equal.mean() > 0.995
+    np.testing.assert_allclose(one.distance[equal], two.distance[equal], rtol=0, atol=1e-6)
+    both = one.hit & two.hit
+    assert np.abs(one.distance[both] - two.distance[both]).max() < 0.05
+
+
+def test_memory_of_a_cast_is_bounded(shapes):
+    """Beyond its answer, a cast of a million rays takes no more than one of a chunk."""
+    vertices, faces = shapes["vase"]()
+    vase = RayCaster(vertices, faces, "numpy")
+    directions = np.random.default_rng(9).normal(size=(600_000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    peaks = []
+    for count in (100_000, 600_000):
+        tracemalloc.start()
+        vase.cast([0.05, 0.1, 30], directions[:count])
+        peaks.append(tracemalloc.get_traced_memory()[1] - 28 * count)
+        tracemalloc.stop()
+    per_ray = (peaks[1] - peaks[0]) / 500_000
+    assert per_ray < 64  # checking directions needs their squares
+    assert peaks[1] < 128 * 2**20

@@ -1,0 +1,291 @@
+"""Closest hits against an independent oracle and against shapes whose answer is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from raybeam import RayCaster
+
+TRIANGLE = np.array([[0.0, 0, 0], [4, 0, 0], [0, 4, 0]]), np.array([[0, 1, 2]])
+
+
+def lines_and_triangles(vertices, faces, origin, direction):
+    """For one ray and every triangle: distance, and how far inside the ray passes, in metres.
+
+    Float64 brute force on the geometry's definition, with none of the package's formulas: the
+    plane's distance from its normal, then the least signed distance of the point to an edge's
+    plane that holds the ray.
+    """
+    a, b, c = (vertices[faces[:, k]] - origin for k in range(3))
+    normal = np.cross(b - a, c - a)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = (normal * a).sum(axis=1) / (normal @ direction)
+        facing = np.sign(normal @ direction)
+        sides = []
+        for p, q in ((a, b), (b, c), (c, a)):
+            across = np.cross(q - p, direction)
+            sides.append(-(across * p).sum(axis=1) / np.linalg.norm(across, axis=1))
+        margin = np.min(sides * -facing, axis=0)
+    bad = ~np.isfinite(t) | ~np.isfinite(margin)
+    return np.where(bad, np.inf, t), np.where(bad, -np.inf, margin)
+
+
+def check(hits, vertices, faces, origins, directions, graze, t_min=0.0, t_max=np.inf):
+    """Compare with the oracle; within `graze` metres of an edge either answer is right."""
+    unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    origins = np.broadcast_to(origins, unit.shape)
+    surely_hit = 0
+    for i in range(len(unit)):
+        t, margin = lines_and_triangles(vertices, faces, origins[i], unit[i])
+        sure = (margin > graze) & (t >= t_min) & (t <= t_max)
+        nearest = t[sure].min(initial=np.inf)
+        tolerance = 1e-4 + 2e-7 * min(nearest, 1e9)
+        k = hits.triangle[i]
+        if k < 0:
+            assert nearest == np.inf
+            assert (hits.distance[i], hits.u[i], hits.v[i]) == (np.inf, 0, 0)
+            continue
+        surely_hit += sure.any()
+        assert t_min <= hits.distance[i] <= min(nearest + tolerance, t_max)
+        assert margin[k] > -graze
+        if margin[k] > graze:
+            assert abs(hits.distance[i] - t[k]) < tolerance
+            a, b, c = vertices[faces[k]]
+            point = a + hits.u[i] * (b - a) + hits.v[i] * (c - a)
+            # where a ray grazes, a hair's breadth of weight is a long way along the ray
+            off = np.cross(point - origins[i], unit[i])
+            assert np.linalg.norm(off) < tolerance
+    return surely_hit
+
+
+@pytest.mark.parametrize("kind", ["random", "sliver", "huge", "tiny"])
+@pytest.mark.parametrize("offset", [0.0, 5e5, 4e6])
+def test_agrees_with_brute_force(caster, backend, shapes, kind, offset):
+    vertices, faces = shapes["soup"](kind)
+    vertices = vertices + offset
+    rng = np.random.default_rng(1)
+    n = 400
+    origins = rng.uniform(-60, 60, (n, 3)) + offset
+    weights = rng.dirichlet([1, 1, 1], n)  # most rays are aimed at a triangle
+    targets = (vertices[faces[rng.integers(len(faces), size=n)]] * weights[..., None]).sum(axis=1)
+    directions = targets - origins
+    directions[::10] = rng.normal(size=(len(directions[::10]), 3))
+    size = np.ptp(vertices, axis=0).max()
+    graze = size * (4e-6 if backend == "embree" else 1e-12) + 1e-8
+    hits = caster(vertices, faces).cast(origins, directions)
+    sure = check(hits, vertices, faces, origins, directions, graze)
+    if kind in ("random", "huge") or (kind == "tiny" and backend != "embree"):
+        assert sure > 0.8 * n  # else the comparison says little
+
+
+def test_sphere_is_hit_where_it_is(caster, shapes):
+    rows, columns = 200, 300
+    vertices, faces = shapes["sphere"](rows, columns)
+    rng = np.random.default_rng(2)
+    directions = rng.normal(size=(5000, 3))
+    hits = caster(vertices + np.array([7, 8, 9]), faces).cast([7.1, 8.2, 9.3], directions)
+    # A chord between neighbours is at most 1 - cos(step / 2) inside the sphere.
+    sag = 1 - np.cos(2 * np.pi / columns) ** 2
+    points = np.array([0.1, 0.2, 0.3]) + hits.distance[:, None] * (
+        directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    )
+    radius = np.linalg.norm(points, axis=1)
+    assert (radius < 1 + 1e-9).all()
+    assert (radius > 1 - sag).all()
+
+
+def test_cube_from_inside_and_outside(caster, shapes):
+    cube = caster(*shapes["cube"]())
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    inside = cube.cast([0.25, 0.5, -0.5], axes)
+    np.testing.assert_allclose(inside.distance, [0.75, 0.5, 1.5, 1.25, 1.5, 0.5], rtol=1e-15)
+    outside = cube.cast(10 * axes + [0.1, 0.2, 0.3], -axes)
+    np.testing.assert_allclose(outside.distance, [9.1, 9.2, 9.3, 8.9, 8.8, 8.7], rtol=1e-14)
+    assert not cube.cast(10 * axes, axes).hit.any()
+
+
+def test_axis_parallel_rays_over_a_fine_grid(caster):
+    """Rays down a grid of planes whose faces are parallel to the rays' zero components."""
+    line = np.arange(6.0)
+    x, y = np.meshgrid(line, line)
+    corner = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 1, 3)
+    quad = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 0, 0], [1, 1, 0], [0, 1, 0]])
+    vertices = (corner + quad).reshape(-1, 3)
+    grid = caster(vertices, np.arange(len(vertices)).reshape(-1, 3))
+    x, y = np.meshgrid(np.arange(0.25, 6, 0.5), np.arange(0.125, 6, 0.5))
+    origins = np.stack([x, y, np.full_like(x, 3)], axis=-1).reshape(-1, 3)
+    for zero in (0.0, -0.0):
+        hits = grid.cast(origins, np.broadcast_to([zero, zero, -1.0], origins.shape))
+        np.testing.assert_array_equal(hits.distance, 3)
+
+
+def test_length_of_direction_does_not_matter(caster, shapes):
+    vertices, faces = shapes["vase"]()
+    vase = caster(vertices, faces)
+    directions = np.random.default_rng(3).normal(size=(200, 3))
+    want = vase.cast([0.1, 0, 0], directions)
+    assert want.hit.all()
+    for factor in (1e-200, 1e-3, 1e3, 1e200):
+        got = vase.cast([0.1, 0, 0], directions * factor)
+        np.testing.assert_allclose(got.distance, want.distance, rtol=1e-12)
+
+
+def test_both_faces_count(caster):
+    hits = caster(*TRIANGLE).cast([[1, 1, 2], [1, 1, -2]], [[0, 0, -1], [0, 0, 1]])
+    np.testing.assert_array_equal(hits.distance, 2)
+    np.testing.assert_allclose(hits.u, 0.25)
+    np.testing.assert_allclose(hits.v, 0.25)
+
+
+def test_limits_count_on_both_ends(exact_caster, shapes):
+    cube = exact_caster(*shapes["cube"]())
+    ray = [-4, 0.25, 0.5], [[1, 0, 0]]
+    assert cube.cast(*ray, t_min=3).distance == 3
+    assert cube.cast(*ray, t_min=np.nextafter(3, 4)).distance == 5
+    assert cube.cast(*ray, t_min=5).distance == 5
+    assert not cube.cast(*ray, t_min=np.nextafter(5, 6)).hit
+    assert cube.cast(*ray, t_max=3).distance == 3
+    assert not cube.cast(*ray, t_max=np.nextafter(3, 0)).hit
+    assert not cube.cast(*ray, t_min=3.5, t_max=4.5).hit
+
+
+def test_limits_within_rounding(caster, shapes):
+    cube = caster(*shapes["cube"]())
+    ray = [-4, 0.25, 0.5], [[1, 0, 0]]
+    assert cube.cast(*ray, t_min=2.999).distance == pytest.approx(3)
+    assert cube.cast(*ray, t_min=3.001).distance == pytest.approx(5)
+    assert cube.cast(*ray, t_max=3.001).distance == pytest.approx(3)
+    assert not cube.cast(*ray, t_min=3.001, t_max=4.999).hit
+
+
+def test_limits_agree_with_brute_force(caster, backend, shapes):
+    vertices, faces = shapes["soup"]("random")
+    rng = np.random.default_rng(4)
+    origins, directions = rng.uniform(-20, 20, (300, 3)), rng.normal(size=(300, 3))
+    graze = 2e-4 if backend == "embree" else 1e-8
+    hits = caster(vertices, faces).cast(origins, directions, 5, 25)
+    sure = check(hits, vertices, faces, origins, directions, graze, 5, 25)
+    assert 50 < sure < 290
+
+
+def test_start_on_a_surface(exact_caster, shapes):
+    cube = exact_caster(*shapes["cube"]())
+    start = [1, 0.25, 0.5]
+    assert cube.cast(start, [[-1, 0, 0]]).distance == 0
+    assert cube.cast(start, [[1, 0, 0]]).distance == 0
+    assert cube.cast(start, [[-1, 0, 0]], t_min=1e-9).distance == 2
+    assert not cube.cast(start, [[1, 0, 0]], t_min=1e-9).hit
+
+
+def test_start_on_a_surface_within_rounding(caster, shapes):
+    hits = caster(*shapes["cube"]()).cast([1, 0.25, 0.5], [[-1, 0, 0]], t_min=1e-4)
+    assert hits.distance == pytest.approx(2)
+
+
+def test_edges_and_corners_belong_to_the_triangle(exact_caster):
+    triangle = exact_caster(*TRIANGLE)
+    on = np.array([[0, 0, 1], [4, 0, 1], [0, 4, 1], [2, 0, 1], [0, 2, 1], [2, 2, 1], [1, 3, 1.0]])
+    assert triangle.cast(on, np.broadcast_to([0, 0, -1], on.shape)).hit.all()
+    off = np.array([[-1e-9, 1, 1], [1, -1e-9, 1], [2 + 1e-9, 2, 1], [4 + 1e-9, 0, 1]])
+    assert not triangle.cast(off, np.broadcast_to([0, 0, -1], off.shape)).hit.any()
+
+
+def test_in_the_plane_is_a_miss(exact_caster):
+    triangle = exact_caster(*TRIANGLE)
+    origins = [[-1, 1, 0], [1, -1, 0], [-1, 0, 0], [-1, -1, 0], [1, 1, 0]]
+    directions = [[1, 0, 0], [0, 1, 0], [1, 0, 0], [1, 1, 0], [1, 2, 0]]
+    assert not triangle.cast(origins, directions).hit.any()
+
+
+def test_nearly_in_the_plane_stays_beside_the_triangle(exact_caster):
+    """Planes that float64 cannot hold: hit or miss is rounding, but no distance from elsewhere."""
+    rng = np.random.default_rng(5)
+    met = 0
+    for _ in range(50):
+        corners = rng.normal(size=(3, 3))
+        weights = rng.dirichlet([1, 1, 1], (100, 2))
+        start, end = np.einsum("nkc,cx->knx", weights, corners)
+        origins, directions = start - 3 * (end - start), end - start
+        hits = exact_caster(corners, [[0, 1, 2]]).cast(origins, directions)
+        axis = np.argmax(np.abs(directions), axis=1)[:, None]
+        unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+        points = origins + np.where(hits.hit, hits.distance, 0)[:, None] * unit
+        along = np.take_along_axis(points, axis, axis=1)[:, 0][hits.hit]
+        low, high = corners.min(axis=0)[axis[:, 0]], corners.max(axis=0)[axis[:, 0]]
+        assert (along >= low[hits.hit] - 1e-9).all()
+        assert (along <= high[hits.hit] + 1e-9).all()
+        met += len(along)
+    assert met > 0
+
+
+def test_triangles_without_area_are_not_hit(caster):
+    vertices = [[0, 0, 0], [1, 1, 1], [3, 3, 3], [0, 0, 0], [5, 0, 0]]
+    degenerate = [[0, 0, 0], [0, 1, 1], [0, 1, 2], [0, 3, 4]]
+    targets = np.array([[0, 0, 0], [1, 1, 1], [2, 2, 2], [2.5, 0, 0]])
+    origin = np.array([1.0, 2, 5])
+    alone = caster(vertices, degenerate)
+    assert not alone.cast(origin, targets - origin).hit.any()
+    assert len(alone.returns(origin, targets - origin)) == 0
+    beside = caster([*vertices, [-9, -9, -1], [9, -9, -1], [0, 9, -1]], [*degenerate, [5, 6, 7]])
+    assert (beside.cast(origin, targets - origin).triangle == 4).all()
+
+
+def test_nearest_of_equals_is_the_first(exact_caster, shapes):
+    vertices, faces = shapes["sphere"](12, 18)
+    copies = np.concatenate([faces[::-1], faces, faces])
+    directions = np.random.default_rng(6).normal(size=(2000, 3))
+    once = exact_caster(vertices, faces[::-1]).cast([0, 0, 0], directions)
+    many = exact_caster(vertices, copies).cast([0, 0, 0], directions)
+    np.testing.assert_array_equal(many.triangle, once.triangle)
+    np.testing.assert_array_equal(many.distance, once.distance)
+
+
+def test_far_origins_lose_nothing(exact_caster, shapes):
+    vertices, faces = shapes["sphere"]()
+    rng = np.random.default_rng(7)
+    out = rng.normal(size=(500, 3))
+    out /= np.linalg.norm(out, axis=1, keepdims=True)
+    aim = 0.9 * np.cross(out, rng.normal(size=(500, 3)))
+    aim *= rng.uniform(0, 0.95, (500, 1)) / np.linalg.norm(aim, axis=1, keepdims=True)
+    sphere = exact_caster(vertices, faces)
+    for far in (10, 1e3, 1e6):
+        hits = sphere.cast(out * far + aim, -out)
+        assert hits.hit.all()
+        points = (far - hits.distance)[:, None] * out + aim
+        np.testing.assert_allclose(np.linalg.norm(points, axis=1), 1, atol=0.01)
+
+
+@pytest.mark.parametrize("size", [1e-30, 1e-6, 1e6, 1e30])
+def test_any_unit_of_length(exact_caster, shapes, size):
+    vertices, faces = shapes["vase"](20, 20)
+    rng = np.random.default_rng(8)
+    origins, directions = 0.1 * rng.normal(size=(300, 3)), rng.normal(size=(300, 3))
+    want = exact_caster(vertices, faces).cast(origins, directions)
+    got = exact_caster(vertices * size, faces).cast(origins * size, directions)
+    np.testing.assert_array_equal(got.triangle, want.triangle)
+    np.testing.assert_allclose(got.distance / size, want.distance, rtol=1e-12)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5])
+def test_few_triangles(caster, count):
+    vertices = np.concatenate([np.array([[0, 0, k], [1, 0, k], [0, 1, k]]) for k in range(count)])
+    hits = caster(vertices, np.arange(3 * count).reshape(-1, 3)).cast(
+        [[0.2, 0.2, -1], [0.2, 0.2, 9]], [[0, 0, 1], [0, 0, -1]]
+    )
+    np.testing.assert_allclose(hits.distance, [1, 10 - count])
+    assert hits.triangle.tolist() == [0, count - 1]
+
+
+def test_types_of_input(caster):
+    vertices, faces = TRIANGLE
+    for real in (np.float16, np.float32, np.float64, np.int32):
+        for whole in (np.int8, np.uint32, np.int64):
+            hits = caster(vertices.astype(real), faces.astype(whole)).cast(
+                np.array([1, 1, 2], real), np.array([[0, 0, -1]], real)
+            )
+            assert hits.distance == 2
+            assert hits.distance.dtype == np.float64
+            assert hits.triangle.dtype == np.int32
+    hits = RayCaster(vertices.tolist(), faces.tolist(), "numpy").cast([1, 1, 2], [0, 0, -1])
+    assert hits.distance.shape == (1,)

@@ -1,0 +1,92 @@
+"""Meshes and rays on a grid of small integers, where exact arithmetic says what is right."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from raybeam import RayCaster
+
+pytest.importorskip("hypothesis")
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+relaxed = settings(
+    deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+grid = st.integers(-8, 8)
+
+
+def points(most):
+    return hnp.arrays(np.int64, st.tuples(st.integers(1, most), st.just(3)), elements=grid)
+
+
+def exact(corners, origin, direction):
+    """Least of the three weights, their sum and the numerator of t, in integers: (f,) each.
+
+    The ray hits strictly inside where the least weight is positive (weights and sum are turned
+    to be positive for a hit), and passes through an edge or corner where it is zero.
+    """
+    a, b, c = corners[:, 0] - origin, corners[:, 1] - origin, corners[:, 2] - origin
+    weights = np.stack([np.cross(c, b), np.cross(a, c), np.cross(b, a)]) @ direction
+    total = weights.sum(axis=0)
+    sign = np.where(total < 0, -1, 1)
+    normal = np.cross(b - a, c - a)
+    return (weights * sign).min(axis=0), total * sign, (normal * a).sum(axis=1) * -sign
+
+
+@relaxed
+@given(
+    corners=hnp.arrays(
+        np.int64, st.tuples(st.integers(1, 12), st.just(3), st.just(3)), elements=grid
+    ),
+    origins=points(10),
+    data=st.data(),
+)
+def test_integer_triangles(exact_backend, corners, origins, data):
+    directions = data.draw(
+        hnp.arrays(np.int64, origins.shape, elements=grid).filter(lambda d: d.any(axis=1).all())
+    )
+    faces = np.arange(3 * len(corners)).reshape(-1, 3)
+    hits = RayCaster(corners.reshape(-1, 3), faces, exact_backend).cast(origins, directions)
+    for i, (origin, direction) in enumerate(zip(origins, directions, strict=True)):
+        weight, total, t = exact(corners, origin, direction)
+        length = np.linalg.norm(direction)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            distance = np.where(total > 0, t / total * length, np.inf)
+        # What touches an edge, or the origin, may go either way by the direction's rounding.
+        clear = (weight > 0) & (t > 0)
+        nearest = distance[clear].min(initial=np.inf)
+        k = hits.triangle[i]
+        assert hits.distance[i] <= nearest + 1e-9
+        if k < 0:
+            assert nearest == np.inf
+        elif total[k] > 0:
+            assert weight[k] >= 0
+            assert hits.distance[i] == pytest.approx(distance[k], abs=1e-9)
+
+
+@relaxed
+@given(
+    heights=hnp.arrays(np.int64, (6, 6), elements=st.integers(0, 5)),
+    target=st.tuples(st.integers(0, 20), st.integers(0, 20)),
+    origin=st.tuples(st.integers(-9, 30), st.integers(-9, 30), st.integers(25, 40)),
+)
+def test_rays_at_the_seams_of_any_terrain_hit(exact_backend, heights, target, origin):
+    """A height field has no holes: straight down, and at its corners from anywhere above."""
+    line = 4 * np.arange(6)
+    x, y = np.meshgrid(line, line, indexing="ij")
+    vertices = np.stack([x, y, heights], axis=-1).reshape(-1, 3)
+    k = (np.arange(5)[:, None] * 6 + np.arange(5)).ravel()
+    faces = np.concatenate([
+        np.stack([k, k + 6, k + 7], axis=-1), np.stack([k, k + 7, k + 1], axis=-1)
+    ])  # fmt: skip
+    caster = RayCaster(vertices, faces, exact_backend)
+    straight = np.array([*target, 40])
+    down = caster.cast(straight, [[0, 0, -1]])
+    assert down.hit.all()
+    assert (down.distance >= 35).all()
+    through = vertices - np.array(origin)
+    inner = ((vertices[:, :2] > 0) & (vertices[:, :2] < 20)).all(axis=1)
+    assert caster.cast(origin, through[inner]).hit.all()

@@ -1,0 +1,59 @@
+"""Meshes are checked, moved near zero and scaled without losing anything."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from raybeam import RayCaster
+from raybeam.mesh import local_mesh
+
+POINTS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+
+
+@pytest.mark.parametrize(
+    ("vertices", "faces", "words"),
+    [
+        (POINTS, np.empty((0, 3), int), "at least one triangle"),
+        (np.empty((0, 3)), [[0, 1, 2]], "Face 0 is .* 0 vertices"),
+        (POINTS[:, :2], [[0, 1, 2]], r"vertices must be .*\(3, 2\)"),
+        (POINTS.ravel(), [[0, 1, 2]], r"vertices must be .*\(9,\)"),
+        (POINTS.astype(complex), [[0, 1, 2]], "complex"),
+        (POINTS, [0, 1, 2], r"faces must have the shape \(f, 3\)"),
+        (POINTS, [[0, 1, 2, 2]], r"\(1, 4\): triangulate"),
+        (POINTS, [[0.0, 1, 2]], "faces must be integers"),
+        (POINTS, [[0, 1, 2], [0, 1, 3]], r"Face 1 is \[0, 1, 3\].*indices must be 0 to 2"),
+        (POINTS, [[0, 1, -1]], "Face 0 is"),
+        ([[0, 0, 0], [1, 0, 0], [0, np.nan, 0]], [[0, 1, 2]], "Vertex 2 is .*nan"),
+        ([[0, 0, 0], [1, 0, 0], [0, np.inf, 0]], [[0, 1, 2]], "Vertex 2 is .*inf"),
+        ([[0, 0, 0], [1e308, 0, 0], [-1e308, 1, 0]], [[0, 1, 2]], "its size must be"),
+        (POINTS * 5e-324, [[0, 1, 2]], "its size must be"),
+    ],
+)
+def test_refused(vertices, faces, words):
+    with pytest.raises(ValueError, match=words):
+        RayCaster(vertices, faces, "numpy")
+
+
+def test_local_coordinates():
+    rng = np.random.default_rng(0)
+    vertices = rng.uniform(-300, 300, (30, 3)) + np.array([5e5, 4e6, 100])
+    faces = rng.integers(0, 30, (40, 3))
+    mesh = local_mesh(vertices, faces)
+    assert np.abs(mesh.corners).max() <= 1
+    assert np.abs(mesh.corners).max() > 0.5
+    assert np.log2(mesh.scale) % 1 == 0
+    assert mesh.face_count == 40
+    back = mesh.corners / mesh.scale + mesh.centre
+    np.testing.assert_allclose(back, vertices[faces[mesh.index]], rtol=0, atol=1e-9)
+
+
+def test_unused_vertices_do_not_count():
+    far = np.concatenate([POINTS, [[1e9, 0, 0]]])
+    assert local_mesh(far, [[0, 1, 2]]).scale == local_mesh(POINTS, [[0, 1, 2]]).scale
+
+
+def test_triangles_without_area_are_left_out():
+    mesh = local_mesh([*POINTS, [2, 0, 0]], [[0, 1, 1], [0, 1, 2], [0, 1, 3], [2, 2, 2]])
+    assert mesh.index.tolist() == [1]
+    assert mesh.face_count == 4

@@ -1,0 +1,133 @@
+"""Rays that are none are refused with a message that names the first; the rest are unit vectors."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from raybeam import Pattern, RayCaster
+from raybeam.rays import check_rays, rotated, unit_directions
+
+DOWN = [[0.0, 0, -1]]
+
+
+@pytest.mark.parametrize(
+    ("origins", "directions", "words"),
+    [
+        (
+            [0, 0, 1],
+            [[0, 0, -1], [0, 0, 0], [0, 0, 0]],
+            r"Direction 1 is \[0.0, 0.0, 0.0\].*2 of 3",
+        ),
+        ([0, 0, 1], [[0, 0, -1], [0, np.nan, 1]], "Direction 1 is .*nan"),
+        ([0, 0, 1], [[0, 0, -1], [np.inf, 0, 0]], "Direction 1 is .*inf"),
+        ([0, 0, np.nan], DOWN, "Origin 0 is .*nan"),
+        ([[0, 0, 1], [0, np.inf, 1]], [[0, 0, -1], [0, 0, -1]], "Origin 1 is .*inf"),
+        ([[0, 0, 1], [0, 0, 1]], DOWN * 3, "2 origins and 3 directions"),
+        ([0, 0, 1], [[0, 0]], r"directions must have the shape \(n, 3\)"),
+        ([0, 0], DOWN, r"origins must have the shape \(n, 3\) or \(3,\), not \(2,\)"),
+        ([0, 0, 1], [["a", "b", "c"]], "directions must be real numbers"),
+        ([0, 0, 1], [[0, 0, 1j]], "directions must be real numbers"),
+    ],
+)
+def test_refused(backend, origins, directions, words):
+    caster = RayCaster([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], backend)
+    for method in (caster.cast, caster.returns):
+        with pytest.raises(ValueError, match=words):
+            method(origins, directions)
+
+
+@pytest.mark.parametrize(
+    "limits", [(-1, 5), (np.nan, 5), (0, np.nan), (3, 2), (np.inf, np.inf)], ids=str
+)
+def test_limits_refused(limits):
+    with pytest.raises(ValueError, match="t_min is"):
+        check_rays([0, 0, 0], DOWN, *limits)
+
+
+def test_no_rays(backend):
+    caster = RayCaster([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], backend)
+    for origins in ([0, 0, 1], np.empty((0, 3))):
+        assert len(caster.cast(origins, np.empty((0, 3)))) == 0
+        assert len(caster.returns(origins, np.empty((0, 3)))) == 0
+    assert len(caster.scan(Pattern(np.empty((0, 3))), [0, 0, 1])) == 0
+
+
+def test_unit_directions():
+    rng = np.random.default_rng(0)
+    given = rng.normal(size=(1000, 3)) * 10.0 ** rng.integers(-150, 150, (1000, 1))
+    given[0] = [0, 0, 5e-324]
+    given[1] = [1e308, 1e308, 1e308]
+    out = unit_directions(given)
+    np.testing.assert_allclose(np.linalg.norm(out, axis=1), 1, rtol=1e-15)
+    np.testing.assert_allclose(
+        np.cross(out, given / np.abs(given).max(axis=1)[:, None]), 0, atol=1e-15
+    )
+
+
+def test_unit_vectors_stay_as_they_are():
+    rng = np.random.default_rng(1)
+    unit = rng.normal(size=(1000, 3))
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    np.testing.assert_array_equal(unit_directions(unit), unit)
+    mixed = unit.copy()
+    mixed[::2] *= 7
+    np.testing.assert_array_equal(unit_directions(mixed)[1::2], unit[1::2])
+
+
+def test_input_is_not_touched():
+    given = np.array([[0.0, 0, -3], [0, 4, 0]])
+    check_rays([0, 0, 0], given, 0, np.inf)
+    Pattern(given)
+    assert given.tolist() == [[0, 0, -3], [0, 4, 0]]
+
+
+def test_rotated():
+    quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    np.testing.assert_array_equal(rotated(np.eye(3), quarter), quarter.T)
+    assert rotated(np.eye(3), None).tolist() == np.eye(3).tolist()
+
+
+def test_scan_is_the_same_as_its_rays(backend, shapes):
+    vertices, faces = shapes["vase"]()
+    caster = RayCaster(vertices, faces, backend)
+    rng = np.random.default_rng(2)
+    pattern = Pattern(rng.normal(size=(3000, 3)))
+    turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    origin = [0.3, -0.2, 2.9]
+    for rotation in (None, turn):
+        for window in ((0, 3000), (1000, 1777), (5, 5)):
+            got = caster.scan(pattern, origin, rotation, window=window, t_min=0.5, t_max=9)
+            rays = rotated(pattern.directions[slice(*window)], rotation)
+            want = caster.returns(origin, rays, 0.5, 9)
+            assert window[0] == window[1] or 0 < len(got) < len(rays)
+            np.testing.assert_array_equal(got.ray, want.ray)
+            np.testing.assert_array_equal(got.triangle, want.triangle)
+            np.testing.assert_array_equal(got.distance, want.distance)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"window": (0, 4)}, "Rows 0 to 4 are not within the pattern's 3"),
+        ({"window": (2, 1)}, "Rows 2 to 1"),
+        ({"window": (-1, 2)}, "Rows -1 to 2"),
+        ({"rotation": 2 * np.eye(3)}, "orthonormal"),
+        ({"rotation": np.eye(2)}, "orthonormal"),
+        ({"rotation": np.full((3, 3), np.nan)}, "orthonormal"),
+        ({"origin": [0, 0, np.nan]}, "Origin 0"),
+        ({"origin": [[0, 0, 0], [0, 0, 1]]}, "2 origins and 1"),
+        ({"t_min": 2, "t_max": 1}, "t_min is 2.0 and t_max 1.0"),
+    ],
+)
+def test_scan_refused(change, words):
+    caster = RayCaster([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], "numpy")
+    with pytest.raises(ValueError, match=words):
+        caster.scan(Pattern(np.eye(3)), **{"origin": [0, 0, 0], **change})
+
+
+def test_pattern_refused():
+    with pytest.raises(ValueError, match="Direction 2 is"):
+        Pattern([[0, 0, 1], [0, 1, 0], [0, 0, 0]])
+    with pytest.raises(ValueError, match="read-only"):
+        Pattern(np.eye(3)).directions[0] = 1
