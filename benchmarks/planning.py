@@ -1,7 +1,7 @@
 """Seconds of a planning trial, and of its cost evaluations alone.
 
 Run it on an idle core: `python benchmarks/planning.py`. Trials and evaluations take turns, so
-that a machine which slows down slows both.
+that a machine which slows down slows both, and the time is the thread's own.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ def seconds_of_evaluations(planning: Planning) -> float:
     costs = np.empty(swarm.groups, np.float32)
     for _ in range(min(20, planning.iterations)):
         swarm.step(costs)
-    begun = time.perf_counter()
+    begun = time.thread_time()
     for _ in range(planning.iterations):
         swarm.paths.evaluate()
-    return time.perf_counter() - begun
+    return time.thread_time() - begun
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -55,18 +55,18 @@ def main(arguments: list[str] | None = None) -> None:
                 particles=options.particles,
                 iterations=options.iterations,
             )
-            trials, alone = [], []
+            trials, whole, alone = [], [], []
             for number in range(options.repeats):
+                begun = time.thread_time()
                 trials.append(run_trial(planning, number))
+                whole.append(time.thread_time() - begun)
                 alone.append(seconds_of_evaluations(planning))
-            trial_s = statistics.median(trial.seconds for trial in trials)
-            alone_s = statistics.median(alone)
-            ratio = statistics.median(t.seconds / a for t, a in zip(trials, alone, strict=True))
+            ratio = statistics.median(w / a for w, a in zip(whole, alone, strict=True))
             plan = best(trials, planning)
             found = f"{plan.excess:+.4%}" if plan.collision_free else "no free path found"
             print(
-                f"{discs:5d}  {waypoints:9d}  {1e3 * trial_s:10.1f}  {1e3 * alone_s:22.1f}"
-                f"  {ratio:5.2f}  {found}"
+                f"{discs:5d}  {waypoints:9d}  {1e3 * statistics.median(whole):10.1f}"
+                f"  {1e3 * statistics.median(alone):22.1f}  {ratio:5.2f}  {found}"
             )
 
 

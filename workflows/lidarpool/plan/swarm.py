@@ -11,7 +11,7 @@ from .cost import PathCost, Singles
 from .geometry import Floats
 from .randoms import Randoms, Windows
 
-_GROUPS = 8
+_GROUPS = 5
 _LEAST_GROUP = 20  # particles
 _NARROWEST = 0.05  # spread of the first group; the unit is the distance from start to target
 _LEAST_WIDEST = 0.2  # spread of the last group, at least
@@ -45,7 +45,7 @@ class Swarm:
     paths : PathCost
         As given.
     groups : int
-        The most, up to 8, that divide the particles evenly into 20 or more.
+        The most, up to 5, that divide the particles evenly into 20 or more.
     """
 
     def __init__(self, paths: PathCost, widest: float, randoms: Randoms) -> None:
