@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
 from numpy.typing import NDArray
+
+_PLACES = 1021  # that windows of a table start at, before the first comes again
 
 
 class Randoms:
@@ -43,9 +46,9 @@ class Randoms:
         centred = total.astype(np.float32) - np.float32(2 * (2**16 - 1))
         return centred * np.float32(math.sqrt(3) / 2**16)
 
-    def below(self, end: int) -> int:
-        """Draw a whole number from 0 to end - 1, for an `end` far below 2**64."""
-        return int(self._bits.random_raw()) % end
+    def below(self, end: int, count: int) -> list[int]:
+        """Draw whole numbers from 0 to end - 1, for an `end` far below 2**64."""
+        return (self._bits.random_raw(count) % np.uint64(end)).tolist()
 
 
 class Windows:
@@ -54,6 +57,7 @@ class Windows:
     Fresh random numbers for each move of a swarm would cost as much as all its other
     arithmetic. Here they are drawn once, and a draw is a view of the table that starts
     anywhere. Draws overlap, but a number serves another particle and coordinate in each.
+    After a thousand draws the places come again in the same order.
 
     Parameters
     ----------
@@ -68,9 +72,9 @@ class Windows:
     def __init__(self, table: NDArray[np.float32], count: int, randoms: Randoms) -> None:
         self._table = table
         self._count = count
-        self._randoms = randoms
+        self._starts = itertools.cycle(randoms.below(len(table) - count + 1, _PLACES))
 
     def draw(self) -> NDArray[np.float32]:
         """Numbers, (count,): a view, not to be written to."""
-        start = self._randoms.below(len(self._table) - self._count + 1)
+        start = next(self._starts)
         return self._table[start : start + self._count]

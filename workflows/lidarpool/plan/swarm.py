@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -62,6 +60,7 @@ class Swarm:
         self._jump = np.zeros_like(self._best)  # from a particle's best to where it is
         self._better = np.empty(particles, np.float32)
         self._leaders = np.empty((rows, self.groups), np.float32)
+        self._leader_numbers = np.empty(self.groups, np.intp)
         self._group_starts = np.arange(self.groups) * (particles // self.groups)
         # Where a particle lands on the way from its best, 0, to its leader's, 1.
         table = randoms.normal(_TABLE_WINDOWS * rows * particles) + np.float32(0.5)
@@ -92,7 +91,8 @@ class Swarm:
         # to the position, so the best is exactly what was evaluated.
         np.multiply(self._jump, self._better, out=self._jump)
         np.add(self._flat_best, self._flat_jump, out=self._flat_best)
-        leaders = self._best_cost_by_group.argmin(axis=1) + self._group_starts
+        leaders = self._best_cost_by_group.argmin(axis=1, out=self._leader_numbers)
+        np.add(leaders, self._group_starts, out=leaders)
         # Without mode="clip", take with out= goes through a copy.
         self._best.take(leaders, axis=1, out=self._leaders, mode="clip")
         self._best_cost.take(leaders, out=leader_costs, mode="clip")
@@ -129,17 +129,15 @@ def _scattered(corners: int, particles: int, spreads: Floats, randoms: Randoms) 
     path rarely happens on when every corner is drawn by itself.
     """
     groups = len(spreads)
-    shape = (corners, 2, groups, particles // groups)
-    turns = 2 * randoms.uniform(2 * corners * particles).reshape(shape) - 1
-    turns *= spreads.astype(np.float32)[:, None]
-    at = np.zeros(shape, np.float32)
-    for group in range(groups):
+    size = particles // groups
+    turns = 2 * randoms.uniform(2 * corners * particles).reshape(groups, corners, 1, 2, size) - 1
+    place = np.arange(1, corners + 1) / (corners + 1)
+    at = np.empty((corners, 2, groups, size), np.float32)
+    for group, spread in enumerate(spreads):
         count = group % corners + 1
-        for turn, corner in itertools.product(range(count), range(corners)):
-            # 1 where the corner is at the turn, 0 from the turns on either side of it
-            share = 1 - abs((corner + 1) * (count + 1) / (corners + 1) - (turn + 1))
-            if share > 0:
-                at[corner, :, group] += np.float32(share) * turns[turn, :, group]
-    along = np.arange(1, corners + 1) / (corners + 1) - 0.5
-    at[:, 0] += along.astype(np.float32)[:, None, None]
+        # 1 where a corner is at a turn, 0 from the turns on either side of it
+        apart = np.abs(place * (count + 1) - np.arange(1, count + 1)[:, None])
+        shares = (spread * np.maximum(1 - apart, 0)).astype(np.float32)[..., None, None]
+        np.add.reduce(shares * turns[group, :count], axis=0, out=at[:, :, group])
+    at[:, 0] += (place - 0.5).astype(np.float32)[:, None, None]
     return at
