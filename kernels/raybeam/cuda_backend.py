@@ -45,10 +45,8 @@ class CudaBackend(Backend):
     def __init__(
         self, mesh: LocalMesh, threads: int | None = None, device: int | None = None
     ) -> None:
-        import cupy
-
         super().__init__(mesh, threads, device)
-        self._cupy = cupy
+        self._cupy = cupy = self._library()
         self._device = _device(cupy, device)
         layout = lay_out(mesh)
         with self._device:
@@ -56,9 +54,16 @@ class CudaBackend(Backend):
             tables = (layout.nodes, layout.triangles, layout.corners, layout.faces, layout.frame)
             self._scene = tuple(cupy.asarray(table) for table in tables)
             stack = -(-max(layout.stack, 1) // _STACK_STEP) * _STACK_STEP
-            self._module = _module(self._device.id, stack)
+            self._module = _module(cupy, self._device.id, stack)
         # {pattern: its directions on the device}
         self._patterns: WeakKeyDictionary[Pattern, Any] = WeakKeyDictionary()
+
+    @staticmethod
+    def _library() -> Any:
+        """CuPy, loaded when it is needed; the tests put another in its place."""
+        import cupy
+
+        return cupy
 
     def closest(self, rays: Rays) -> Found:
         """See `Backend.closest`."""
@@ -147,10 +152,8 @@ def options(stack: int) -> tuple[str, ...]:
 
 
 @lru_cache(maxsize=32)
-def _module(device: int, stack: int) -> Any:
+def _module(cupy: Any, device: int, stack: int) -> Any:
     """Compile for the current device, once."""
-    import cupy
-
     module = cupy.RawModule(code=source(), options=options(stack))
     module.compile()
     return module

@@ -9,15 +9,15 @@ import ctypes
 import importlib.resources
 import shutil
 import subprocess
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from raybeam import RayCaster, available_backends, registry
-from raybeam.backend import Backend, Found
-from raybeam.hits import Returns
-from raybeam.layout import lay_out
+from raybeam.cuda_backend import CudaBackend
 
 HERE = Path(__file__).parent
 STACK = 256
@@ -32,70 +32,83 @@ def pytest_collection_modifyitems(config, items):
             item.add_marker(pytest.mark.skip(reason="slow: run with -m slow"))
 
 
-def pointer(array):
-    return array.ctypes.data_as(ctypes.c_void_p)
+class Array(np.ndarray):
+    """An array "on the device"."""
+
+    def get(self):
+        return np.array(self)
 
 
-class Tables(ctypes.Structure):
-    _fields_ = [
-        (name, ctypes.c_void_p) for name in ("nodes", "triangles", "corners", "faces", "frame")
-    ]
+class Device(nullcontext):
+    def __init__(self, number=None):
+        super().__init__()
+        self.id = number or 0
 
 
-class SourceBackend(Backend):
-    """The kernels of intersect.cu, run thread by thread on the CPU."""
+KINDS = {np.int32: ctypes.c_int, np.int64: ctypes.c_longlong, np.float64: ctypes.c_double}
+
+
+class Kernels:
+    """Stands for CuPy's RawModule: the kernels of intersect.cu, run thread by thread."""
+
+    library: ctypes.CDLL
+
+    def __init__(self, code, options):
+        stack = int(next(option for option in options if "STACK" in option).split("=")[1])
+        assert stack <= STACK
+
+    def compile(self):
+        pass
+
+    def get_function(self, name):
+        def launch(grid, block, arguments):
+            assert block == (128,)
+            plain = [
+                ctypes.c_void_p(a.ctypes.data) if isinstance(a, np.ndarray) else KINDS[type(a)](a)
+                for a in arguments
+            ]
+            assert all(a.flags.c_contiguous for a in arguments if isinstance(a, np.ndarray))
+            getattr(self.library, f"run_{name}")(ctypes.c_uint(grid[0]), *plain)
+
+        return launch
+
+
+class Module(SimpleNamespace):
+    __hash__ = object.__hash__
+
+
+# As much of CuPy as the backend uses, on the CPU.
+HOST = Module(
+    RawModule=Kernels,
+    asarray=lambda a: np.array(a, order="C").view(Array),
+    empty=lambda n, dtype=np.float64: np.empty(n, dtype).view(Array),
+    flatnonzero=lambda a: np.flatnonzero(a).view(Array),
+    get_default_memory_pool=lambda: SimpleNamespace(free_bytes=lambda: 0),
+    cuda=SimpleNamespace(
+        Device=Device,
+        runtime=SimpleNamespace(getDeviceCount=lambda: 1, memGetInfo=lambda: (1 << 34, 1 << 35)),
+    ),
+)
+
+
+class SourceBackend(CudaBackend):
+    """The cuda backend, its kernels compiled for the CPU and CuPy's part played by NumPy."""
 
     name = "source"
     chunk = 1 << 16
-    library: ctypes.CDLL
 
     @classmethod
     def missing(cls):
         return ""
 
-    def __init__(self, mesh, threads=None, device=None):
-        super().__init__(mesh, threads, device)
-        self.layout = lay_out(mesh)
-        assert self.layout.stack <= STACK
-        names = [name for name, _ in Tables._fields_]
-        self.tables = Tables(*(pointer(getattr(self.layout, name)) for name in names))
-
-    def run(self, kernel, count, rays, t_min, t_max):
-        t, place = np.full(count, np.nan), np.empty(count, np.int32)
-        scale = self._mesh.scale
-        limits = ctypes.c_double(t_min * scale), ctypes.c_double(t_max * scale)
-        getattr(self.library, f"run_{kernel}")(
-            ctypes.byref(self.tables), *rays, ctypes.c_longlong(count), *limits,
-            pointer(t), pointer(place),
-        )  # fmt: skip
-        ray = np.flatnonzero(place >= 0)
-        return ray, t[ray], place[ray]
-
-    def closest(self, rays):
-        stride = 0 if len(rays.origins) == 1 else 3
-        origins = np.ascontiguousarray(rays.origins)
-        directions = np.ascontiguousarray(rays.directions)
-        table = pointer(origins), ctypes.c_int(stride), pointer(directions)
-        ray, t, place = self.run("cast_table", len(rays), table, rays.t_min, rays.t_max)
-        u, v = np.empty((2, len(ray)))
-        self.library.run_weigh_table(
-            ctypes.byref(self.tables), *table, pointer(ray), pointer(place),
-            ctypes.c_longlong(len(ray)), pointer(u), pointer(v),
-        )  # fmt: skip
-        return Found(ray, t, self.layout.faces[place], u, v)
-
-    def scan(self, pattern, window, origin, rotation, interval):
-        turn = np.eye(3) if rotation is None else rotation
-        pose = np.concatenate([origin.ravel(), turn.ravel()])
-        directions = np.ascontiguousarray(pattern.directions[slice(*window)])
-        rays = pointer(pose), ctypes.c_int(rotation is not None), pointer(directions)
-        ray, t, place = self.run("cast_pattern", len(directions), rays, *interval)
-        return Returns(ray, t / self._mesh.scale, self.layout.faces[place])
+    @staticmethod
+    def _library():
+        return HOST
 
 
 @pytest.fixture(scope="session")
 def source_backend(tmp_path_factory):
-    """`SourceBackend` with its library, made by g++."""
+    """`SourceBackend`, its library made by g++."""
     compiler = shutil.which("g++")
     if compiler is None:
         pytest.skip("g++ is not here to compile intersect.cu for the CPU")
@@ -110,7 +123,7 @@ def source_backend(tmp_path_factory):
         ]  # fmt: skip
         done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    SourceBackend.library = ctypes.CDLL(str(library))
+    Kernels.library = ctypes.CDLL(str(library))
     return SourceBackend
 
 

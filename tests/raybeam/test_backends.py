@@ -12,6 +12,7 @@ import pytest
 from raybeam import BackendUnavailable, RayCaster, available_backends, registry
 from raybeam.cuda_backend import CudaBackend
 from raybeam.embree_backend import EmbreeBackend
+from raybeam.mesh import local_mesh
 
 MESH = [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]
 
@@ -93,9 +94,14 @@ def test_threads_of_one_process_may_share_a_caster(backend, shapes):
         np.testing.assert_array_equal(one.distance, other.distance)
 
 
-@pytest.mark.gpu
-def test_device_that_is_not_there():
-    if reason := available_backends()["cuda"]:
-        pytest.skip(f"cuda: {reason}")
-    with pytest.raises(ValueError, match="no CUDA device 99"):
-        RayCaster(*MESH, backend="cuda", device=99)
+@pytest.mark.parametrize("device", [99, -1])
+def test_device_that_is_not_there(source_backend, device):
+    with pytest.raises(ValueError, match=f"no CUDA device {device}: this process sees 1"):
+        source_backend(local_mesh(*MESH), device=device)
+
+
+def test_mesh_that_does_not_fit_the_device(source_backend, monkeypatch):
+    runtime = source_backend._library().cuda.runtime
+    monkeypatch.setattr(runtime, "memGetInfo", lambda: (200 << 20, 1 << 30))
+    with pytest.raises(MemoryError, match=r"needs 256 MiB .* and 200 MiB are free"):
+        source_backend(local_mesh(*MESH))
