@@ -29,7 +29,7 @@ Floats = NDArray[np.float64]
 DPI = 200
 FONT = "DejaVu Sans"  # comes with matplotlib
 MANY_POSES = 40  # more than this are drawn as small dots
-MOST_POSES = 3000
+MOST_POSES = 800
 LEGEND_ROWS = 30
 LEGEND_LETTERS = 18
 
@@ -80,13 +80,13 @@ class Page:
 
     def title(self, text: str, detail: str = "") -> None:
         """Write a title at the top left, and a line of detail under it."""
-        top = 1 - 0.05 * self.size[0] / self.size[1] / 1.6
+        line = 0.05 * self.size[0] / self.size[1] / 1.6
         self.figure.text(
-            0.03, top, text, fontsize=11 * self.unit, fontweight="bold",
+            0.03, 1 - line, text, fontsize=11 * self.unit, fontweight="bold",
             color=self.theme.ink, va="center", family=FONT,
         )  # fmt: skip
         self.figure.text(
-            0.03, top - 0.042, detail, fontsize=7.2 * self.unit, color=self.theme.muted,
+            0.03, 1 - 1.84 * line, detail, fontsize=7.2 * self.unit, color=self.theme.muted,
             va="center", family=FONT,
         )  # fmt: skip
 

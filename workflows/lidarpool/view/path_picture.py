@@ -26,7 +26,7 @@ Floats = NDArray[np.float64]
 
 FRAME = (0.085, 0.115, 0.70, 0.755)  # left, bottom, width, height of the plot on the page
 MOST_TRIALS = 1000
-PATH_COLOUR, TRIAL_COLOUR = "#d6336c", "#4477aa"
+PATH_COLOUR, TRIAL_COLOUR = "#d6336c", "#5b8fd0"
 
 
 def draw_path(
