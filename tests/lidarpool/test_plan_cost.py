@@ -1,0 +1,118 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidarpool.plan import cost as cost_module
+from lidarpool.plan import shortest_path_length
+from lidarpool.plan.cost import PathCost
+from lidarpool.plan.geometry import clearance, path_length
+
+START, TARGET = (-0.5, 0.0), (0.5, 0.0)
+
+disc = st.tuples(st.floats(-1, 1), st.floats(-1, 1), st.floats(0.01, 0.4))
+
+
+def discs_of(triples):
+    """Centres and radii of the discs that hold neither end."""
+    kept = [
+        (x, y, r)
+        for x, y, r in triples
+        if min(math.dist((x, y), START), math.dist((x, y), TARGET)) > r + 1e-4
+    ]
+    array = np.array(kept).reshape(-1, 3)
+    return array[:, :2], array[:, 2]
+
+
+def paths_of(cost):
+    """Whole paths, float64: (particles, k + 2, 2)."""
+    corners = np.moveaxis(cost.waypoints, -1, 0).astype(np.float64)
+    ends = np.broadcast_to(np.array([[START], [TARGET]]), (2, len(corners), 2))
+    return np.concatenate([ends[0][:, None], corners, ends[1][:, None]], axis=1)
+
+
+def random_paths(cost, seed, spread=0.6):
+    random = np.random.default_rng(seed)
+    cost.waypoints[:] = random.uniform(-spread, spread, cost.waypoints.shape)
+
+
+@settings(deadline=None)
+@given(
+    discs=st.lists(disc, max_size=6), waypoints=st.integers(1, 5), seed=st.integers(0, 2**32 - 1)
+)
+def test_free_paths_cost_their_length_and_others_more_than_any_detour(discs, waypoints, seed):
+    centres, radii = discs_of(discs)
+    cost = PathCost(centres, radii, waypoints, particles=40)
+    random_paths(cost, seed)
+    found = cost.evaluate()
+    for path, price in zip(paths_of(cost), found, strict=True):
+        room, length = clearance(path, centres, radii), path_length(path)
+        if room > 1e-4:
+            assert price == pytest.approx(length, rel=1e-5)
+        if room < 0:
+            # at least 8 for each unit of depth, besides the fixed price
+            assert price > (length + cost.entry_price - 8 * room) * (1 - 1e-5)
+        if price < cost.entry_price:
+            assert room >= 0, "what is cheap passes the exact check"
+
+
+@settings(deadline=None)
+@given(discs=st.lists(disc, min_size=1, max_size=6))
+def test_the_price_of_entry_is_above_the_shortest_detour(discs):
+    centres, radii = discs_of(discs)
+    cost = PathCost(centres, radii, waypoints=2, particles=1)
+    shortest = shortest_path_length(START, TARGET, centres, radii)
+    assert cost.entry_price > shortest or shortest == math.inf
+
+
+def test_going_deeper_costs_more():
+    """So the way out of a disc leads downhill: across it, in steps of a tenth of its radius."""
+    depths = np.linspace(0.01, 0.19, 19)
+    cost = PathCost(np.array([[0.0, 0.0]]), np.array([0.2]), waypoints=2, particles=19)
+    cost.waypoints[0, 0], cost.waypoints[1, 0] = -0.4, 0.4
+    cost.waypoints[:, 1] = 0.2 - depths
+    lengths = [path_length(path) for path in paths_of(cost)]
+    price = cost.evaluate() - np.array(lengths) - cost.entry_price
+    assert (price >= 8 * depths).all()
+    assert (price <= 16 * depths * 1.001).all()
+    assert (np.diff(cost.evaluate()) > 0).all()
+
+
+def test_all_corners_in_one_point_are_no_collision():
+    cost = PathCost(np.array([[0.0, 0.4]]), np.array([0.2]), waypoints=4, particles=3)
+    cost.waypoints[:] = 0
+    cost.waypoints[:, 0, 1] = -0.5  # all at the start
+    cost.waypoints[:, 0, 2] = 0.5  # all at the target
+    assert cost.evaluate() == pytest.approx([1, 1, 1])
+
+
+def test_discs_far_away_and_very_large_keep_their_edges():
+    """A disc a hundred times as large as the path, whose edge the path runs along."""
+    centres, radii = np.array([[0.0, -100.01]]), np.array([100.0])
+    cost = PathCost(centres, radii, waypoints=1, particles=2)
+    cost.waypoints[0, :, 0] = 0, 0
+    cost.waypoints[0, :, 1] = 0, -0.02
+    free, collides = cost.evaluate()
+    assert free == pytest.approx(1)
+    assert collides > cost.entry_price
+
+
+def test_an_end_on_the_edge_of_a_disc_may_leave_it():
+    cost = PathCost(np.array([[-0.7, 0.0]]), np.array([0.2]), waypoints=1, particles=1)
+    cost.waypoints[:] = 0
+    assert cost.evaluate() == pytest.approx([1])
+
+
+@pytest.mark.parametrize(("discs", "waypoints", "particles"), [(6, 5, 101), (25, 3, 64), (3, 1, 1)])
+def test_blocks_change_no_bit(monkeypatch, discs, waypoints, particles):
+    random = np.random.default_rng(3)
+    centres, radii = random.uniform(-1, 1, (discs, 2)), np.full(discs, 0.05)
+    found = []
+    for elements in (10**9, 1000, 1):
+        monkeypatch.setattr(cost_module, "_BLOCK_ELEMENTS", elements)
+        cost = PathCost(centres, radii, waypoints, particles)
+        random_paths(cost, seed=1)
+        found.append(cost.evaluate().tobytes())
+    assert found[0] == found[1] == found[2]

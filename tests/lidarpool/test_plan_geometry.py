@@ -1,0 +1,77 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidarpool.plan.frame import Frame
+from lidarpool.plan.geometry import clearance, path_length, segment_distances
+
+coordinate = st.floats(-50, 50)
+point = st.tuples(coordinate, coordinate)
+
+
+@pytest.mark.parametrize(
+    ("centre", "distance"),
+    [((5, 3), 3), ((-3, 4), 5), ((14, -3), 5), ((10, 0), 0), ((4, 0), 0)],
+)
+def test_distance_is_to_the_closest_point_of_the_segment(centre, distance):
+    found = segment_distances(np.array([[0.0, 0]]), np.array([[10.0, 0]]), np.array([centre]))
+    assert found == pytest.approx(distance)
+
+
+@settings(deadline=None)
+@given(first=point, last=point, centre=point)
+def test_distance_is_below_and_close_to_that_of_any_sample(first, last, centre):
+    share = np.linspace(0, 1, 401)[:, None]
+    samples = np.array(first) * (1 - share) + np.array(last) * share
+    sampled = np.hypot(*(samples - centre).T).min()
+    found = segment_distances(np.array([first]), np.array([last]), np.array([centre]))[0, 0]
+    spacing = math.dist(first, last) / 400
+    assert found <= sampled + 1e-9
+    assert found >= sampled - spacing / 2 - 1e-9
+
+
+def test_a_segment_without_length_is_its_point():
+    point = np.array([[1.0, 1.0]])
+    assert segment_distances(point, point, np.array([[4.0, 5.0]]))[0, 0] == 5
+
+
+def test_a_disc_between_samples_is_not_missed():
+    """A disc of a thousandth of the segment's length, that no coarse sampling would meet."""
+    path = np.array([[0.0, 0], [1000.0, 0]])
+    assert clearance(path, np.array([[333.3, 0.4]]), np.array([0.5])) == pytest.approx(-0.1)
+
+
+def test_clearance_signs():
+    path, centre = np.array([[0.0, 0], [10.0, 0]]), np.array([[5.0, 2.0]])
+    assert clearance(path, centre, np.array([1.5])) == pytest.approx(0.5)
+    assert clearance(path, centre, np.array([2.0])) == 0
+    assert clearance(path, centre, np.array([3.0])) == pytest.approx(-1)
+    assert clearance(path, np.empty((0, 2)), np.empty(0)) == math.inf
+
+
+def test_path_length():
+    assert path_length(np.array([[0.0, 0], [3, 4], [3, 5], [3, 5]])) == 6
+
+
+@settings(deadline=None)
+@given(start=point, target=point, points=st.lists(point, min_size=1, max_size=5))
+def test_frame_puts_the_ends_half_a_unit_from_the_middle(start, target, points):
+    if math.dist(start, target) < 1e-3:
+        return
+    frame = Frame(start, target)
+    ends = frame.to_local(np.array([start, target]))
+    assert ends == pytest.approx(np.array([[-0.5, 0], [0.5, 0]]), abs=1e-9)
+    points = np.array(points)
+    assert frame.to_plane(frame.to_local(points)) == pytest.approx(points, abs=1e-9)
+    there = path_length(frame.to_local(points)) * frame.unit_m
+    assert there == pytest.approx(path_length(points), abs=1e-9)
+
+
+def test_frame_keeps_georeferenced_coordinates():
+    start, target = (500_000.25, 5_400_000.5), (500_055.25, 5_400_045.5)
+    frame = Frame(start, target)
+    points = np.array([[500_010.125, 5_400_020.375]])
+    assert frame.to_plane(frame.to_local(points)) == pytest.approx(points, abs=2e-9, rel=0)

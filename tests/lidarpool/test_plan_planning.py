@@ -1,0 +1,69 @@
+import pickle
+
+import numpy as np
+import pytest
+
+from lidarpool.errors import LidarpoolError
+from lidarpool.plan import Planning
+
+BAD = {
+    "start within": ({"centres": [(25, 24)], "radii": 2}, r"start \(25, 25\) lies within disc 0"),
+    "target within": ({"centres": [(0, 0), (-30, -21)], "radii": 2}, "target .* within disc 1"),
+    "no way to go": ({"start": (1, 2), "target": (1, 2)}, "nothing to plan"),
+    "start not finite": ({"start": (np.nan, 0)}, "start holds a number that is not finite"),
+    "target in space": ({"target": (0, 0, 0)}, "target is .* two finite numbers"),
+    "start a word": ({"start": "here"}, "start is 'here'; it must be numbers"),
+    "centres not finite": ({"centres": [(0, np.inf)], "radii": 1}, "centres holds a number"),
+    "centres in space": ({"centres": [(0, 0, 0)], "radii": 1}, r"centres have shape \(1, 3\)"),
+    "centres ragged": ({"centres": [(0, 0), (1,)], "radii": 1}, "centres is .* must be numbers"),
+    "radii too many": ({"centres": [(0, 0)], "radii": [1, 2]}, "2 radii for 1 discs"),
+    "radius 0": ({"centres": [(0, 0), (5, 5)], "radii": [1, 0]}, "disc 1 is 0; .* above 0"),
+    "radius below 0": ({"centres": [(0, 0)], "radii": -1}, "disc 0 is -1; .* above 0"),
+    "radius not finite": ({"centres": [(0, 0)], "radii": np.inf}, "radii holds a number"),
+    "no trials": ({"trials": 0}, "trials is 0; .* at least 1"),
+    "no particles": ({"particles": 0}, "particles is 0; .* at least 1"),
+    "no iterations": ({"iterations": -1}, "iterations is -1; .* at least 1"),
+    "no waypoints": ({"waypoints": 0}, "waypoints is 0; .* at least 1"),
+    "half a trial": ({"trials": 1.5}, "trials is 1.5; .* whole number"),
+    "true particles": ({"particles": True}, "particles is True; .* whole number"),
+    "seed below 0": ({"seed": -1}, "seed is -1; .* at least 0"),
+}
+
+
+@pytest.mark.parametrize(("fields", "message"), BAD.values(), ids=BAD.keys())
+def test_bad_values_are_named(fields, message):
+    with pytest.raises(LidarpoolError, match=message) as error:
+        Planning(**fields)
+    assert len(str(error.value).splitlines()) <= 2
+
+
+def test_one_radius_serves_all_discs():
+    planning = Planning(centres=[(0, 0), (5, 5)], radii=2)
+    assert planning.radii.tolist() == [2, 2]
+    assert planning.centres.shape == (2, 2)
+
+
+def test_no_discs():
+    planning = Planning(centres=[], radii=2)
+    assert planning.centres.shape == (0, 2)
+    assert planning.radii.shape == (0,)
+
+
+def test_an_end_may_touch_a_disc():
+    assert Planning((0, 0), (10, 0), centres=[(2, 0)], radii=2).start == (0, 0)
+
+
+def test_the_description_does_not_change():
+    given = np.array([(0.0, 0.0)])
+    planning = Planning(centres=given, radii=2)
+    given[:] = 25
+    assert planning.centres.tolist() == [[0, 0]]
+    with pytest.raises(ValueError, match="read-only"):
+        planning.centres[:] = 1
+
+
+def test_travels_to_a_worker():
+    planning = Planning(centres=[(0, 0), (5, 5)], radii=[1, 2], seed=3)
+    copy = pickle.loads(pickle.dumps(planning))
+    assert repr(copy) == repr(planning)
+    assert copy.radii.tolist() == [1, 2]
