@@ -30,7 +30,8 @@ from .stages import collect, generate, sort_frames
 
 BATCH_SECONDS = 0.05  # casting time that makes a batch worth its overhead
 BATCH_RAYS = 1_000_000  # bounds a batch's memory, at 16 bytes a hit and 24 a direction
-STALL_SECONDS = 60.0  # without any delivery; then everything under way is sent again
+STALL_SECONDS = 20.0  # with nothing moving; then what was handed on is sent again
+LOOK_FOR_WORKERS_S = 1.0
 DELIVERY_CAPACITY = 16  # messages of at most `stages.DELIVERY_BYTES` on their way to the driver
 
 
@@ -96,9 +97,7 @@ class SurveyPump:
         self._under_way: list[_UnderWay] = []
         self._greeted: Counter[str] = Counter()
         self._consumers = {SORT: 1, COLLECT: collectors}
-        self._last_delivery = time.monotonic()
-        self._was_resent = False
-        self._kept: list[_UnderWay] = []  # sent twice: their keys may still be asked for
+        self._moved_at = time.monotonic()  # when something was last handed on or delivered
         self._closed = False
 
         def pipe(name: str, capacity: int) -> Pipe:
@@ -111,6 +110,8 @@ class SurveyPump:
         self._deliveries = pipe("deliveries", DELIVERY_CAPACITY)
         self._setup = partitions[GPU].submit(_make_setup, *setup.__reduce__()[1], key=self._key("scene"))
         self._stages = self._start_stages()
+        self._prepared: dict[str, Future] = {}  # {address of a GPU worker: task that readies it}
+        self._prepare_workers()
 
     def _key(self, name: str, number: int | None = None) -> str:
         return f"{name}-{self.run_id}" + ("" if number is None else f"-{number}")
@@ -131,6 +132,24 @@ class SurveyPump:
                 key=self._key(COLLECT, number),
             )
         return stages
+
+    def _prepare_workers(self) -> None:
+        """Have each GPU worker that is new fetch the scene and build its ray caster.
+
+        Dask runs a task where its inputs are, unless the wait there is longer than it takes to
+        move them. Scans are so short that it would leave all of them to the one worker that
+        has the scene, and a worker that was restarted would never get one.
+        """
+        self._looked_for_workers = time.monotonic()
+        here = {worker.address for worker in self.partitions[GPU].workers}
+        for address in here - self._prepared.keys():
+            self._prepared[address] = self.partitions[GPU].submit(
+                _prepare,
+                self._setup,
+                key=self._key("prepare", len(self._prepared)),
+                priority=10,
+                workers=[address],
+            )
 
     # -- one turn ----------------------------------------------------------------------
 
@@ -155,6 +174,8 @@ class SurveyPump:
         self._check_tasks()
         if self._closed:
             return False
+        if time.monotonic() - self._looked_for_workers > LOOK_FOR_WORKERS_S:
+            self._prepare_workers()
         moved = self._take_deliveries()
         moved |= self._hand_on()
         moved |= self._take_scans()
@@ -162,7 +183,7 @@ class SurveyPump:
             for inlet in self._inlets.values():
                 inlet.close()
             self._closed = True
-        elif self._under_way and time.monotonic() - self._last_delivery > STALL_SECONDS:
+        elif self._under_way and time.monotonic() - self._moved_at > STALL_SECONDS:
             for stage in self._inlets:
                 self._send_again(stage)
         return moved
@@ -216,6 +237,7 @@ class SurveyPump:
         inlet.put({"base": self.frames.first_missing, "keys": keys}, timeout_s=STALL_SECONDS)
         for item in items:
             item.handed_on.add(stage)
+        self._moved_at = time.monotonic()
 
     # -- what arrives ------------------------------------------------------------------
 
@@ -231,7 +253,7 @@ class SurveyPump:
             else:
                 self.cloud.add(content)
         if deliveries:
-            self._last_delivery = time.monotonic()
+            self._moved_at = time.monotonic()
             self._release_arrived()
         return bool(deliveries)
 
@@ -255,14 +277,7 @@ class SurveyPump:
                 item.waiting_for.discard(COLLECT)
             if item.waiting_for:
                 still.append(item)
-            elif self._was_resent:
-                # A collector may ask for the key of a batch that another has delivered. The
-                # scheduler would make it wait for ever for a key that nobody holds.
-                self._kept.append(item)
         self._under_way = still
-        if not still:
-            self._kept.clear()
-            self._was_resent = False
 
     # -- sending again -----------------------------------------------------------------
 
@@ -276,10 +291,9 @@ class SurveyPump:
         lost = [i for i in self._under_way if stage in i.handed_on and stage in i.waiting_for]
         lost = [item for item in lost if _result_of(item, stage).status == "finished"]
         if lost:
-            self._was_resent = True
             self.replayed += len(lost)
             self._put(stage, self._inlets[stage], lost)
-        self._last_delivery = time.monotonic()
+        self._moved_at = time.monotonic()
 
     # -- the end -----------------------------------------------------------------------
 
@@ -305,13 +319,16 @@ class SurveyPump:
                 self.records.append(future.result(timeout=timeout_s))
         pipes = (self._scans, self._deliveries, *self._inlets.values())
         forget_pipes(self.client, [pipe.name for pipe in pipes])
-        self.client.cancel([*self._stages.values(), self._setup])
+        self.client.cancel([*self._stages.values(), *self._prepared.values(), self._setup])
         self._under_way.clear()
-        self._kept.clear()
 
 
 def _make_setup(*arguments: Any) -> SurveySetup:
     return SurveySetup(*arguments)
+
+
+def _prepare(setup: SurveySetup) -> None:
+    setup.prepare()
 
 
 def _result_of(item: _UnderWay, stage: str) -> Future:

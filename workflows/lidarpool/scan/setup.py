@@ -62,6 +62,10 @@ class SurveySetup:
                 )
             return self._caster, self._pattern
 
+    def prepare(self) -> None:
+        """Build the ray caster now rather than at the first scan."""
+        self._ready()
+
     def cast(self, pose: Pose, azimuths: tuple[int, int]) -> Returns:
         """Closest hits of the rays at a range of azimuths from one pose.
 

@@ -7,12 +7,14 @@ failed it knows why.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
-from distributed import Client, Future, get_client, secede
-from poolpart import Pipe, PipeClosed, PipeFailed, Recorder, TaskRecord
+from distributed import Client, get_client, secede
+from poolpart import Backoff, Pipe, PipeClosed, PipeFailed, Recorder, TaskRecord
+from poolpart.fetch import fetch_available
 
 from ..sensor import Sensor
 from ..survey import ScanSpec, Survey
@@ -21,7 +23,7 @@ from .setup import ray_directions
 from .stage_names import COLLECT, GENERATE, LIDAR, SORT
 
 DELIVERY_BYTES = 4 << 20  # of points or frames in one message through the scheduler
-FETCH_TIMEOUT_S = 30.0  # then the driver is left to send the batch again
+GIVE_UP_S = 120.0  # asking for a result; the driver sends what does not arrive again
 
 
 def generate(survey: Survey, outlet: Pipe) -> TaskRecord:
@@ -53,13 +55,12 @@ def sort_frames(inlet: Pipe, outlet: Pipe) -> TaskRecord:
     following = 0  # the scan whose turn it is
     try:
         outlet.put(Delivery(SORT, Hello()).wire())
-        while True:
-            items = inlet.get_all()
+        for base, results in _arrivals(inlet):
             # Everything before `base` has reached the driver: a sorter that was started again
             # with an empty memory must not wait for it.
-            following = max(following, *(item["base"] for item in items))
+            following = max(following, base)
             records = []
-            for frames, record in _fetch(items):
+            for frames, record in results:
                 records.append(record)
                 waiting.update({frame.scan: frame for frame in frames if frame.scan >= following})
             ready = []
@@ -71,7 +72,8 @@ def sort_frames(inlet: Pipe, outlet: Pipe) -> TaskRecord:
             for run in _frame_runs(ready, records):
                 outlet.put(Delivery(SORT, run).wire())
     except (PipeClosed, PipeFailed):
-        return recorder.done(following)
+        pass
+    return recorder.done(following)
 
 
 def collect(
@@ -83,8 +85,8 @@ def collect(
     scans = 0
     try:
         outlet.put(Delivery(COLLECT, Hello()).wire())
-        while True:
-            batches: list[Batch] = list(_fetch(inlet.get_all()))
+        for _, results in _arrivals(inlet):
+            batches: list[Batch] = results
             tables = [
                 (spec.scan, points_of(sensor, spec, hits[::keep_every], precision_m))
                 for batch in batches
@@ -94,7 +96,8 @@ def collect(
             for part in _parts(tables):
                 outlet.put(Delivery(COLLECT, part).wire())
     except (PipeClosed, PipeFailed):
-        return recorder.done(scans)
+        pass
+    return recorder.done(scans)
 
 
 def points_of(sensor: Sensor, spec: ScanSpec, hits: np.ndarray, precision_m: float) -> np.ndarray:
@@ -108,24 +111,29 @@ def points_of(sensor: Sensor, spec: ScanSpec, hits: np.ndarray, precision_m: flo
     return points
 
 
-def _fetch(items: Sequence[dict[str, Any]]) -> Iterator[Any]:
-    """Results of the batches that some pipe items name, straight from the workers that have them.
+def _arrivals(inlet: Pipe) -> Iterator[tuple[int, list[Any]]]:
+    """What comes through a pipe of the driver: (base, results), until the pipe is closed.
 
     The items carry keys, not futures: the driver holds the futures until the scans have
-    arrived, and a queue that is given a future it does not know yet polls for it.
+    arrived. `base` is the first scan that had not reached the driver when the item was put.
+    Results whose worker has died are asked for until Dask has made them again.
     """
     client: Client = get_client()
-    futures = [
-        Future(key, client=client, state="memory") for item in items for key in item["keys"]
-    ]
-    try:
-        # "skip": a batch that was sent again may have been delivered by another and released.
-        results = client.sync(
-            client._gather, futures, errors="skip", callback_timeout=FETCH_TIMEOUT_S
-        )
-    except TimeoutError:
-        return
-    yield from results
+    pause = Backoff(most_s=0.1)
+    missing: dict[str, float] = {}  # {key: when to stop asking}
+    while True:
+        try:
+            items = inlet.get_all(timeout_s=pause.next() if missing else None)
+        except TimeoutError:
+            items = []
+        now = time.monotonic()
+        missing.update({key: now + GIVE_UP_S for item in items for key in item["keys"]})
+        results = fetch_available(client, missing)
+        # One that nobody makes any more was sent twice, and has arrived through another.
+        missing = {k: until for k, until in missing.items() if k not in results and until > now}
+        if results or not missing:
+            pause.reset()
+        yield max((item["base"] for item in items), default=0), list(results.values())
 
 
 def _hits_by_scan(batch: Batch) -> Iterator[tuple[ScanSpec, np.ndarray]]:
