@@ -208,12 +208,14 @@ class PlanningSection(Section):
 
 
 class PoolSection(Section):
-    """The partitions, and what runs on them; sizes that are not given follow the machine."""
+    """The partitions, and what runs on them; sizes that are not given follow the machine.
+
+    `gpu` and `other` are workers of a cluster on this machine; one that is running already has
+    the workers it has. `collectors` and `queue_capacity` hold for both.
+    """
 
     gpu: Annotated[int, Field(ge=1, le=10_000)] | None = None
-    lidar: Annotated[int, Field(ge=1, le=10_000)] | None = None
     other: Annotated[int, Field(ge=1, le=10_000)] | None = None
-    threads: Annotated[int, Field(ge=1, le=1024)] | None = None
     collectors: Annotated[int, Field(ge=1, le=64)] = 2
     queue_capacity: Annotated[int, Field(ge=1, le=100_000)] = 10
     backend: Literal["auto", "cuda", "embree", "numpy"] = "auto"
