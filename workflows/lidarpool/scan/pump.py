@@ -148,7 +148,7 @@ class SurveyPump:
                 self._setup,
                 key=self._key("prepare", len(self._prepared)),
                 priority=10,
-                workers=[address],
+                worker=address,
             )
 
     # -- one turn ----------------------------------------------------------------------
