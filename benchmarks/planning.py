@@ -13,7 +13,7 @@ import time
 import numpy as np
 
 from lidarpool.plan import Planning, best, run_trial
-from lidarpool.plan.frame import Frame
+from lidarpool.plan.axes import PathAxes
 from lidarpool.plan.trial import prepare_swarm
 
 SEED_SCENE = [(-20, -20), (20, -20), (-20, 20), (20, 20), (-10, -5), (5, 5)]
@@ -28,7 +28,7 @@ def planning_of(discs: int, **search: int) -> Planning:
 
 def seconds_of_evaluations(planning: Planning) -> float:
     """Seconds of as many evaluations as a trial makes, of paths in mid-search."""
-    swarm = prepare_swarm(planning, Frame(planning.start, planning.target), seed=0)
+    swarm = prepare_swarm(planning, PathAxes(planning.start, planning.target), seed=0)
     costs = np.empty(swarm.groups, np.float32)
     for _ in range(min(20, planning.iterations)):
         swarm.step(costs)

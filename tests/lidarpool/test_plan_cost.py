@@ -105,6 +105,20 @@ def test_an_end_on_the_edge_of_a_disc_may_leave_it():
     assert cost.evaluate() == pytest.approx([1])
 
 
+def test_the_margin_is_wider_than_rounding_and_narrower_than_a_millimetre_in_100_m():
+    """Paths that pass a disc at a millionth and at a hundred-thousandth of their length."""
+    centres, radii = np.array([[0.0, 0.0]]), np.array([0.1])
+    cost = PathCost(centres, radii, waypoints=2, particles=2)
+    cost.waypoints[0, 0], cost.waypoints[1, 0] = -0.2, 0.2
+    cost.waypoints[:, 1] = 0.1 + np.array([1e-6, 1e-5])
+    near, far = (clearance(path, centres, radii) for path in paths_of(cost))
+    assert 0 < near < 2e-6
+    assert 9e-6 < far < 2e-5
+    charged, free = cost.evaluate()
+    assert charged > cost.entry_price
+    assert free < 1.1
+
+
 @pytest.mark.parametrize(("discs", "waypoints", "particles"), [(6, 5, 101), (25, 3, 64), (3, 1, 1)])
 def test_blocks_change_no_bit(monkeypatch, discs, waypoints, particles):
     random = np.random.default_rng(3)

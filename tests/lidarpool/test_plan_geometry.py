@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidarpool.plan.frame import Frame
+from lidarpool.plan.axes import PathAxes
 from lidarpool.plan.geometry import clearance, path_length, segment_distances
 
 coordinate = st.floats(-50, 50)
@@ -58,20 +58,20 @@ def test_path_length():
 
 @settings(deadline=None)
 @given(start=point, target=point, points=st.lists(point, min_size=1, max_size=5))
-def test_frame_puts_the_ends_half_a_unit_from_the_middle(start, target, points):
+def test_axes_put_the_ends_half_a_unit_from_the_middle(start, target, points):
     if math.dist(start, target) < 1e-3:
         return
-    frame = Frame(start, target)
-    ends = frame.to_local(np.array([start, target]))
+    axes = PathAxes(start, target)
+    ends = axes.to_local(np.array([start, target]))
     assert ends == pytest.approx(np.array([[-0.5, 0], [0.5, 0]]), abs=1e-9)
     points = np.array(points)
-    assert frame.to_plane(frame.to_local(points)) == pytest.approx(points, abs=1e-9)
-    there = path_length(frame.to_local(points)) * frame.unit_m
+    assert axes.to_plane(axes.to_local(points)) == pytest.approx(points, abs=1e-9)
+    there = path_length(axes.to_local(points)) * axes.unit_m
     assert there == pytest.approx(path_length(points), abs=1e-9)
 
 
-def test_frame_keeps_georeferenced_coordinates():
+def test_axes_keep_georeferenced_coordinates():
     start, target = (500_000.25, 5_400_000.5), (500_055.25, 5_400_045.5)
-    frame = Frame(start, target)
+    axes = PathAxes(start, target)
     points = np.array([[500_010.125, 5_400_020.375]])
-    assert frame.to_plane(frame.to_local(points)) == pytest.approx(points, abs=2e-9, rel=0)
+    assert axes.to_plane(axes.to_local(points)) == pytest.approx(points, abs=2e-9, rel=0)

@@ -67,9 +67,21 @@ def test_discs_that_touch_leave_the_point_they_touch_in():
 
 
 def test_discs_within_discs_and_twice_the_same_count_once():
-    once = shortest_path_length((-5, 0), (5, 0), [(0, 0)], [2])
-    again = shortest_path_length((-5, 0), (5, 0), [(0, 0.5), (0, 0), (0, 0)], [1, 2, 2])
-    assert again == pytest.approx(once, rel=1e-12)
+    """The way over the top is the shorter one, and the inner discs lie on it or beside it."""
+    once = shortest_path_length((-5, 1), (5, 1), [(0, 0)], [2])
+    twice = shortest_path_length((-5, 1), (5, 1), [(0, 0), (0, 0)], [2, 2])
+    inner = shortest_path_length((-5, 1), (5, 1), [(0, 0.5), (0, 0), (0.9, 0)], [1, 2, 1])
+    assert twice == pytest.approx(once, rel=1e-12)
+    assert inner == pytest.approx(once, rel=1e-12)
+
+
+def test_a_disc_over_the_arc_bars_it():
+    """A small disc sits on top of a large one: the way over both rests on the small one alone."""
+    over = shortest_path_length((-5, 1), (5, 1), [(0, 0), (0, 2)], [2, 0.5])
+    apart, radius = math.hypot(5, 1), 0.5
+    bend = math.pi / 2 + math.atan2(1, 5) - math.acos(radius / apart)
+    straight = math.sqrt(apart**2 - radius**2)
+    assert over == pytest.approx(2 * (straight + radius * bend), rel=1e-12)
 
 
 @pytest.mark.parametrize("enclosed", [(0, 0), (9, 9)])

@@ -124,6 +124,19 @@ def test_a_trial_says_what_it_found():
     assert len(pickle.dumps(trial)) < 2000
 
 
+def test_a_trial_does_not_claim_a_path_that_collides():
+    """One particle that never moved: some paths are free, some enter a disc by little or much."""
+    planning = Planning((-5, 0), (5, 0), [(0, 0)], 1.0, particles=1, iterations=1, waypoints=1)
+    rooms = []
+    for number in range(60):
+        trial = run_trial(planning, number)
+        path = np.vstack([planning.start, trial.waypoints, planning.target])
+        rooms.append(clearance(path, planning.centres, planning.radii))
+        assert trial.collision_free == (rooms[-1] >= 0)
+    assert max(rooms) > 0
+    assert any(-0.5 < room < 0 for room in rooms)
+
+
 def test_history_is_above_any_path_while_none_is_free():
     """One particle and one iteration in a scene that is nearly all disc."""
     planning = Planning((0, 0), (10, 0), [(5, 0)], 4.9, particles=1, iterations=1, waypoints=1)

@@ -28,7 +28,7 @@ _BLOCK_ELEMENTS = 160_000  # of each buffer: three of them stay in a second-leve
 
 
 class PathCost:
-    """The cost of many paths between the same two ends, in the coordinates of `Frame`.
+    """The cost of many paths between the same two ends, in the coordinates of `PathAxes`.
 
     A path that enters no disc costs its length. One that does costs, on top, more than any
     detour around all discs is long, and `_SLOPE` to twice that for each unit of depth in each
@@ -37,7 +37,7 @@ class PathCost:
     Parameters
     ----------
     centres, radii
-        The discs, in the frame's coordinates: (m, 2) and (m,).
+        The discs, on `PathAxes`: (m, 2) and (m,).
     waypoints
         Corners of each path between the two ends.
     particles

@@ -34,7 +34,7 @@ class Swarm:
     paths
         Where the particles live: its `waypoints` are their positions.
     widest
-        How far from the straight line the last group starts, in the frame's unit.
+        How far from the straight line the last group starts, in units of its length.
     randoms
         Source of random numbers.
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import LidarpoolError
+from .axes import PathAxes
 from .cost import PathCost
-from .frame import Frame
 from .geometry import Floats, clearance, path_length, segment_distances
 from .planning import Planning
 from .randoms import Randoms
@@ -86,14 +86,14 @@ def run_trial(planning: Planning, trial: int, cancelled: Callable[[], bool] | No
     """
     begun = time.perf_counter()
     seed = trial_seed(planning, trial)
-    frame = Frame(planning.start, planning.target)
-    swarm = prepare_swarm(planning, frame, seed)
+    axes = PathAxes(planning.start, planning.target)
+    swarm = prepare_swarm(planning, axes, seed)
     lowest = np.empty((planning.iterations, swarm.groups), np.float32)
     for iteration in range(planning.iterations):
         if cancelled is not None and iteration % _ITERATIONS_PER_LOOK == 0 and cancelled():
             raise TrialCancelledError(f"Trial {trial} was cancelled at iteration {iteration}.")
         swarm.step(lowest[iteration])
-    waypoints = frame.to_plane(swarm.best().astype(np.float64))
+    waypoints = axes.to_plane(swarm.best().astype(np.float64))
     path = with_ends(planning, waypoints)
     return Trial(
         trial=trial,
@@ -101,7 +101,7 @@ def run_trial(planning: Planning, trial: int, cancelled: Callable[[], bool] | No
         length=path_length(path),
         waypoints=waypoints,
         collision_free=clearance(path, planning.centres, planning.radii) >= 0,
-        history=lowest.min(axis=1) * np.float32(frame.unit_m),
+        history=lowest.min(axis=1) * np.float32(axes.unit_m),
         seconds=time.perf_counter() - begun,
     )
 
@@ -111,9 +111,9 @@ def with_ends(planning: Planning, waypoints: Floats) -> Floats:
     return np.vstack([planning.start, waypoints, planning.target])
 
 
-def prepare_swarm(planning: Planning, frame: Frame, seed: int) -> Swarm:
+def prepare_swarm(planning: Planning, axes: PathAxes, seed: int) -> Swarm:
     """Return the swarm of `planning`, spread as widely as a way around the discs may reach."""
-    centres, radii = frame.to_local(planning.centres), planning.radii / frame.unit_m
+    centres, radii = axes.to_local(planning.centres), planning.radii / axes.unit_m
     cost = PathCost(centres, radii, planning.waypoints, planning.particles)
     line = np.array([[-0.5, 0.0], [0.5, 0.0]])
     edges = segment_distances(line[:1], line[1:], centres)[0] + radii

@@ -12,8 +12,8 @@ from .geometry import Floats
 
 
 @dataclass(frozen=True)
-class Frame:
-    """A frame in which the path starts at (-½, 0) and ends at (½, 0).
+class PathAxes:
+    """Axes in which the path starts at (-½, 0) and ends at (½, 0).
 
     The swarm computes in single precision and with fixed distances; here neither georeferenced
     coordinates nor the size of the scene matter. Made of + - x / and square roots only, which
@@ -30,13 +30,13 @@ class Frame:
 
     @cached_property
     def unit_m(self) -> float:
-        """Metres in one unit of this frame: the distance from start to target."""
+        """Metres in one unit of these axes: the distance from start to target."""
         run, rise = self.target[0] - self.start[0], self.target[1] - self.start[1]
         return math.sqrt(run * run + rise * rise)
 
     @cached_property
     def _axis(self) -> tuple[float, float]:
-        """The direction from start to target: this frame's x axis, in the plane."""
+        """The direction from start to target: the x axis, in the plane."""
         return (
             (self.target[0] - self.start[0]) / self.unit_m,
             (self.target[1] - self.start[1]) / self.unit_m,
@@ -47,11 +47,11 @@ class Frame:
         return (np.array(self.start) + np.array(self.target)) / 2
 
     def to_local(self, points: Floats) -> Floats:
-        """Points of the plane, (p, 2), in this frame."""
+        """Points of the plane, (p, 2), on these axes."""
         (cos, sin), (x, y) = self._axis, (points - self._middle).T / self.unit_m
         return np.stack([cos * x + sin * y, cos * y - sin * x], axis=1)
 
     def to_plane(self, points: Floats) -> Floats:
-        """Points of this frame, (p, 2), in the plane."""
+        """Points on these axes, (p, 2), in the plane."""
         (cos, sin), (x, y) = self._axis, points.T * self.unit_m
         return np.stack([cos * x - sin * y, sin * x + cos * y], axis=1) + self._middle
