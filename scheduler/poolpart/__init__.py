@@ -5,7 +5,8 @@ from .errors import PipeClosed, PipeFailed, PoolError
 from .ledger import Ledger
 from .local import local_cluster
 from .partition import Partition
-from .pipe import Pipe, forget_pipes
+from .pipe import Pipe
+from .pipe_parts import forget_pipes
 from .placement import Recorder, TaskRecord, placement_violations, recorded
 from .pool import Pool
 from .worker_info import WorkerInfo, assign_devices

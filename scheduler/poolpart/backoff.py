@@ -18,6 +18,8 @@ class Backoff:
     """
 
     def __init__(self, least_s: float = 0.001, most_s: float = 0.016) -> None:
+        if not 0 < least_s <= most_s:
+            raise ValueError(f"Pauses must be 0 < least_s <= most_s, not {least_s} and {most_s}.")
         self.least_s, self.most_s = least_s, most_s
         self._next_s = least_s
 

@@ -10,7 +10,9 @@ from distributed.utils import wait_for
 from distributed.utils_comm import gather_from_workers
 
 
-def fetch_available(client: Client, keys: Collection[str], patience_s: float = 2.0) -> dict[str, Any]:
+def fetch_available(
+    client: Client, keys: Collection[str], patience_s: float = 2.0
+) -> dict[str, Any]:
     """Those of the results that can be had now; ask again for the others.
 
     `Client.gather` is the wrong tool for a long-running consumer. When a worker dies, a

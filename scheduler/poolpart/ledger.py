@@ -23,6 +23,8 @@ class Ledger:
     """
 
     def __init__(self, total: int) -> None:
+        if total < 0:
+            raise ValueError(f"A ledger of {total} items cannot be; give 0 or more.")
         self.total = total
         self.delivered = 0
         self.duplicates = 0
@@ -37,7 +39,7 @@ class Ledger:
         )
 
     def __contains__(self, item: int) -> bool:
-        return bool(self._seen[item])
+        return 0 <= item < self.total and bool(self._seen[item])
 
     def accept(self, item: int) -> bool:
         """Enter a delivery; False if the item was there already.
@@ -48,7 +50,7 @@ class Ledger:
             If there is no such item: something that was never sent has arrived.
         """
         if not 0 <= item < self.total:
-            raise IndexError(f"Item {item} was delivered, but only 0 to {self.total - 1} exist.")
+            raise IndexError(f"Item {item} was delivered; there are {self.total}, from 0.")
         if self._seen[item]:
             self.duplicates += 1
             return False

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import multiprocessing
 import os
 from collections.abc import Mapping
 from typing import Any
@@ -49,7 +50,8 @@ def local_cluster(
     """Start a Dask cluster on this machine, divided into GPU, LIDAR and OTHER.
 
     Scheduler, workers and dashboard listen on the loopback interface only. Each partition's
-    workers are processes with a nanny, which restarts them when they die.
+    workers are processes with a nanny, which restarts them when they die. They import the
+    script that starts them: there, call this under ``if __name__ == "__main__":``.
 
     Parameters
     ----------
@@ -75,18 +77,19 @@ def local_cluster(
     Raises
     ------
     PoolError
-        If a number is below 1.
+        If a number is below 1, or the workers do not start.
     """
+    _refuse_in_import()
     defaults = default_workers(usable_cores(), len(visible_gpus()))
     counts = {
         "GPU": defaults["GPU"] if gpu_workers is None else gpu_workers,
         "OTHER": defaults["OTHER"] if other_workers is None else other_workers,
     }
-    for name, count in (*counts.items(), ("LIDAR", lidar_slots)):
-        if count < 1:
-            raise PoolError(f"Partition {name!r} is given {count} workers; it needs at least 1.")
+    _check_count("gpu_workers", counts["GPU"])
+    _check_count("other_workers", counts["OTHER"])
+    _check_count("lidar_slots", lidar_slots)
     # One thread for each worker's numerical libraries: the processes share the cores.
-    env = {name: "1" for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
+    env = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
     env |= environment or {}
 
     def spec(partition: str, slots: int) -> dict[str, Any]:
@@ -114,4 +117,22 @@ def local_cluster(
             "dashboard_address": f"{host}:{dashboard_port}" if dashboard else None,
         },
     }
-    return SpecCluster(workers=workers, scheduler=scheduler, silence_logs=logging.ERROR)
+    try:
+        return SpecCluster(workers=workers, scheduler=scheduler, silence_logs=logging.ERROR)
+    except RuntimeError as error:
+        raise PoolError(
+            f"The workers did not start ({error.__cause__ or error}). Each imports the script "
+            "that starts the cluster: do that under `if __name__ == '__main__':` in it."
+        ) from error
+
+
+def _check_count(name: str, count: int) -> None:
+    if not isinstance(count, int) or count < 1:
+        raise PoolError(f"{name} is {count!r}; give a whole number, 1 or more.")
+
+
+def _refuse_in_import() -> None:
+    """End a worker that has come here by importing the script which is starting it."""
+    # What multiprocessing itself goes by; its error, a page from each worker, hides ours.
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        raise SystemExit(1)

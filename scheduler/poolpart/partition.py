@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
+import inspect
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
-from distributed import Client, Future, as_completed
+from distributed import Client, Future, wait
 
+from .backoff import Backoff
+from .errors import PoolError
 from .worker_info import WorkerInfo
+
+# `Client.submit` keeps these for itself; a function that has one of them would not get it.
+_OPTIONS_OF_SUBMIT = frozenset(
+    parameter.name
+    for parameter in inspect.signature(Client.submit).parameters.values()
+    if parameter.kind is inspect.Parameter.KEYWORD_ONLY
+    or parameter.default is not inspect.Parameter.empty
+)
 
 
 class Partition:
@@ -41,19 +53,42 @@ class Partition:
     @property
     def slots(self) -> int:
         """Tasks that the partition runs at a time."""
-        return int(sum(worker.resources[self.name] for worker in self.workers))
+        return _slots(self.workers, self.name)
 
     def __len__(self) -> int:
         return len(self.workers)
 
     def __repr__(self) -> str:
-        names = [worker.name for worker in self.workers]
+        if self.client.status != "running":
+            return f"<Partition {self.name!r}: its client is {self.client.status}>"
+        workers = self.workers
+        names = [worker.name for worker in workers]
         shown = ", ".join(names[:4]) + (", …" if len(names) > 4 else "")
         note = f"; {self.note}" if self.note else ""
         return (
             f"<Partition {self.name!r}: {len(names)} worker{'s' * (len(names) != 1)} "
-            f"({shown}), {self.slots} slots{note}>"
+            f"({shown}), {_slots(workers, self.name)} slots{note}>"
         )
+
+    def wait(self, n_workers: int = 1, timeout_s: float | None = None) -> None:
+        """Wait until the partition has so many workers.
+
+        Dask itself waits silently, and for ever, with a task that no worker may take.
+
+        Raises
+        ------
+        PoolError
+            If it has fewer after so many seconds.
+        """
+        deadline = time.monotonic() + (float("inf") if timeout_s is None else timeout_s)
+        pause = Backoff(0.01, 0.2)
+        while (there := len(self)) < n_workers:
+            if time.monotonic() >= deadline:
+                raise PoolError(
+                    f"Partition {self.name!r} has {there} of {n_workers} workers after "
+                    f'{timeout_s} s: start some with dask worker … --resources "{self.name}=1"'
+                )
+            pause.sleep()
 
     def submit(
         self,
@@ -62,6 +97,7 @@ class Partition:
         *args: Any,
         key: str | None = None,
         priority: int = 0,
+        worker: str | None = None,
         **kwargs: Any,
     ) -> Future:
         """Submit one task to these workers.
@@ -69,16 +105,30 @@ class Partition:
         Parameters
         ----------
         function, args, kwargs
-            What to call.
+            What to call. Arguments named `key`, `priority` or like another option of
+            `Client.submit` are not passed on by name: give them by position, or bind them
+            with `functools.partial`.
         key
             The task's key; by default a new one, so that equal calls run each by itself.
         priority
             Higher runs first.
+        worker
+            Address of the one member to run on; if it leaves, the task waits for ever.
 
         Returns
         -------
         Future
+
+        Raises
+        ------
+        TypeError
+            If a keyword is an option of `Client.submit`.
         """
+        if taken := sorted(_OPTIONS_OF_SUBMIT & kwargs.keys()):
+            raise TypeError(
+                f"{', '.join(taken)}: Client.submit has options of this name, so that "
+                f"{function} would not get it; bind it with functools.partial."
+            )
         return self.client.submit(
             function,
             *args,
@@ -86,6 +136,7 @@ class Partition:
             pure=False,
             priority=priority,
             resources={self.name: 1},
+            workers=None if worker is None else [worker],
             **kwargs,
         )
 
@@ -121,29 +172,56 @@ class Partition:
         ordered
             Results in the order of the items, or else as they come.
 
-        Yields
+        Returns
+        -------
+        iterator
+            Results. An error of a task is raised by it. Whoever stops early lets go of the
+            tasks under way: those that have not started never do.
+
+        Raises
         ------
-        object
-            Results. An error of a task is raised here.
+        ValueError
+            If the window is below 1.
         """
-        window = window or max(2, 2 * self.slots)
-        source = iter(items)
-        if ordered:
-            waiting: deque[Future] = deque()
-            for item in source:
-                waiting.append(self.submit(function, item))
-                if len(waiting) >= window:
-                    yield waiting.popleft().result()
-            while waiting:
-                yield waiting.popleft().result()
-            return
-        running = as_completed([], loop=self.client.loop)
-        for item in source:
-            running.add(self.submit(function, item))
-            if running.count() >= window:
-                yield next(running).result()
-        for future in running:
-            yield future.result()
+        if window is None:
+            window = max(2, 2 * self.slots)
+        if window < 1:
+            raise ValueError(f"A window of {window} tasks is too small; give 1 or more.")
+        futures = (self.submit(function, item) for item in items)
+        return _in_order(futures, window) if ordered else _as_they_come(futures, window)
+
+
+def _in_order(futures: Iterator[Future], window: int) -> Iterator[Any]:
+    waiting: deque[Future] = deque()
+    for future in futures:
+        waiting.append(future)
+        if len(waiting) >= window:
+            yield waiting.popleft().result()
+    while waiting:
+        yield waiting.popleft().result()
+
+
+def _as_they_come(futures: Iterator[Future], window: int) -> Iterator[Any]:
+    # Not with `as_completed`: what it watches stays wanted when its user has stopped.
+    running: set[Future] = set()
+    for future in futures:
+        running.add(future)
+        if len(running) >= window:
+            yield _pop_finished(running).result()
+    while running:
+        yield _pop_finished(running).result()
+
+
+def _pop_finished(running: set[Future]) -> Future:
+    done = next((future for future in running if future.done()), None)
+    if done is None:
+        done = next(iter(wait(running, return_when="FIRST_COMPLETED").done))
+    running.remove(done)
+    return done
+
+
+def _slots(workers: Iterable[WorkerInfo], name: str) -> int:
+    return int(sum(worker.resources[name] for worker in workers))
 
 
 def _by_name(worker: WorkerInfo) -> tuple[int, str]:

@@ -13,28 +13,22 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Iterator
+from typing import Any, TypeVar
 
 from distributed import Client, Queue, Variable, get_client
 
 from .backoff import Backoff
 from .errors import PipeClosed, PipeFailed
+from .pipe_parts import AttachedQueue, PipeState, change_pipe, forget_pipes, open_pipe
+
+T = TypeVar("T")
+
+_NOTHING = object()  # where None is an item
 
 _STATE_MAX_AGE_S = 0.05  # how long a pipe may go on before it sees that it was closed or failed
-
-
-@dataclass(frozen=True)
-class _State:
-    """What a pipe's Variable holds."""
-
-    closed: bool = False
-    failure: str = ""
-    advice: int = 1
-
-    def wire(self) -> dict[str, Any]:
-        return {"closed": self.closed, "failure": self.failure, "advice": self.advice}
+_NO_SUCH_PIPE_S = 0.05  # how long the scheduler may look for a Variable; it is there or it is not
+_UNKNOWN_FUTURE_S = 10.0  # how long the scheduler may wait to hear of a future that is put
 
 
 class Pipe:
@@ -43,19 +37,27 @@ class Pipe:
     One `distributed.Queue` carries the items and one `distributed.Variable` the state, both
     under the pipe's name. Whoever makes the pipe calls `create`, hands it (it is small when
     pickled) to the tasks on both ends, and calls `delete` in the end. Any number of
-    producers and consumers may share it.
+    producers and consumers may share it, in any process and thread; threads may share the
+    object itself.
 
-    A consumer takes all that is queued, up to `capacity` items, in one request and hands it
-    out one by one, so at most ``capacity * (1 + consumers)`` items are under way. Items
-    taken by a consumer that dies are lost with it: whoever needs each item exactly once
-    keeps a `Ledger` and puts what is missing again.
+    Once `fail` was called, every `put` and `get` raises `PipeFailed`, within a second also
+    those that wait. A pipe that does not exist, or was deleted, raises it as well. When the
+    scheduler has died they raise OSError, after Dask's ``distributed.comm.timeouts.connect``.
+
+    A consumer takes all that is queued, some `capacity` items, in one request; `get` and
+    iteration hand them out one by one. At most ``capacity * (1 + consumers)`` items are
+    under way. Where items are slow and consumers several, choose a small capacity, so that
+    none sits on work while another idles. Items taken by a consumer that dies are lost with
+    it: whoever needs each item exactly once keeps a `Ledger` and puts what is missing again.
 
     Parameters
     ----------
     name
         Unique on the cluster; put something random in it.
     capacity
-        Items that may be queued; `put` waits while there are as many.
+        Items that may be queued; `put` waits while there are as many. Of several producers
+        that see the last free place at the same moment each puts its item, so that ``p`` of
+        them can queue ``capacity + p - 1``.
     client
         The client to use. By default, on a worker, the worker's own.
 
@@ -64,7 +66,7 @@ class Pipe:
     >>> from distributed import Client
     >>> client = Client(processes=False, dashboard_address=None)
     >>> pipe = Pipe("numbers-1f3a", capacity=3, client=client).create()
-    >>> pipe.put([1, 2]); pipe.put("three"); pipe.close()
+    >>> pipe.put((1, 2)); pipe.put("three"); pipe.close()
     >>> list(pipe)
     [(1, 2), 'three']
     >>> pipe.delete(); client.close()
@@ -75,9 +77,8 @@ class Pipe:
             raise ValueError(f"The capacity of pipe {name!r} is {capacity}; it must be at least 1.")
         self.name, self.capacity = name, capacity
         self._client = client
-        self._attached: tuple[Queue, Variable] | None = None
         self._taken: deque[Any] = deque()
-        self._state = _State()
+        self._state = PipeState()
         self._state_read_at = float("-inf")
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -89,36 +90,59 @@ class Pipe:
 
     # -- the two parts on the scheduler ------------------------------------------------
 
-    def _parts(self) -> tuple[Queue, Variable]:
-        if self._attached is None:
-            client = self._client or get_client()
-            # A client of its own in both: without it they would look for one again, and on a
-            # worker thread that has seceded they would find another.
-            self._attached = (
-                Queue(self.name, client=client, maxsize=self.capacity),
-                Variable(self.name, client=client),
-            )
-        return self._attached
+    @property
+    def client(self) -> Client:
+        """The client that is used."""
+        # Kept: a worker's thread that has seceded would find another one each time.
+        if self._client is None:
+            self._client = get_client()
+        return self._client
+
+    @property
+    def _queue(self) -> Queue:
+        return AttachedQueue(self.name, client=self.client)
 
     def create(self) -> Pipe:
-        """Open the pipe on the scheduler; returns itself."""
-        self._write_state(_State())
+        """Open the pipe on the scheduler; returns itself.
+
+        Raises
+        ------
+        ValueError
+            If the cluster has a queue or a variable of that name.
+        """
+        if not open_pipe(self.client, self.name):
+            raise ValueError(
+                f"The cluster has a queue or variable {self.name!r}: give the pipe another "
+                "name, or delete what is left of an earlier one."
+            )
         return self
 
     def delete(self) -> None:
-        """Forget the pipe on the scheduler, with what is still in it."""
-        forget_pipes(self._client or get_client(), [self.name])
+        """Forget the pipe on the scheduler, with what is still in it; no error if it is gone."""
+        forget_pipes(self.client, [self.name])
 
-    def _write_state(self, state: _State) -> None:
-        self._parts()[1].set(state.wire())
+    def _missing(self) -> PipeFailed:
+        return PipeFailed(f"Pipe {self.name!r} does not exist: never created, or deleted.")
+
+    def _ask(self, question: Callable[..., T], *args: Any, **kwargs: Any) -> T:
+        try:
+            return question(*args, **kwargs)
+        except KeyError:  # the scheduler looked for the queue
+            raise self._missing() from None
+
+    def _change_state(self, **changes: Any) -> None:
+        state = change_pipe(self.client, self.name, **changes)
+        if state is None:
+            raise self._missing()
         self._state, self._state_read_at = state, time.monotonic()
 
-    def _read_state(self, max_age_s: float = _STATE_MAX_AGE_S) -> _State:
-        if time.monotonic() - self._state_read_at >= max_age_s:
+    def _read_state(self) -> PipeState:
+        if time.monotonic() - self._state_read_at >= _STATE_MAX_AGE_S:
+            variable = Variable(self.name, client=self.client)
             try:
-                self._state = _State(**self._parts()[1].get(timeout=10))
+                self._state = PipeState(**variable.get(timeout=_NO_SUCH_PIPE_S))
             except TimeoutError:
-                raise PipeFailed(f"Pipe {self.name!r} does not exist (any more).") from None
+                raise self._missing() from None
             self._state_read_at = time.monotonic()
         if self._state.failure:
             raise PipeFailed(self._state.failure)
@@ -129,15 +153,22 @@ class Pipe:
     @property
     def depth(self) -> int:
         """Items queued now."""
-        return int(self._parts()[0].qsize())
+        return int(self._ask(self._queue.qsize))
 
     def close(self) -> None:
-        """No more items will be put; consumers take what is left, then end."""
-        self._write_state(_State(True, self._state.failure, self._state.advice))
+        """No more items will be put; consumers take what is left, then end.
+
+        Call it when all producers have done: a `put` of another one at the same moment may
+        still succeed, with nobody left to take the item.
+        """
+        self._change_state(closed=True)
 
     def fail(self, reason: str) -> None:
-        """Make every `put` and `get`, at both ends, raise `PipeFailed` with this reason."""
-        self._write_state(_State(True, reason, self._state.advice))
+        """Make every `put` and `get`, at both ends, raise `PipeFailed` with this reason.
+
+        The first reason stays.
+        """
+        self._change_state(failure=reason or "no reason was given")
 
     # -- producers ---------------------------------------------------------------------
 
@@ -148,9 +179,8 @@ class Pipe:
 
     def advise(self, amount: int) -> None:
         """Tell producers how much to put into one item."""
-        if amount != self._state.advice:
-            state = self._read_state(0)
-            self._write_state(_State(state.closed, state.failure, amount))
+        if amount != self._read_state().advice:
+            self._change_state(advice=amount)
 
     def put(self, item: Any, timeout_s: float | None = None) -> None:
         """Add an item; waits while the pipe is full.
@@ -159,7 +189,8 @@ class Pipe:
         ----------
         item
             What msgpack can carry (numbers, strings, bytes, lists, dicts), or a Future.
-            It travels through the scheduler: keep it small.
+            It travels through the scheduler: keep it small. Between processes lists turn
+            into tuples.
         timeout_s
             Longest wait in seconds.
 
@@ -171,29 +202,50 @@ class Pipe:
             If it was failed, with the reason.
         TimeoutError
             If it stayed full for so long.
+        ValueError
+            If the item is a future of which the scheduler knows nothing.
         """
-        queue, _ = self._parts()
         deadline = _deadline(timeout_s)
         pause = Backoff()
         while True:
             if self._read_state().closed:
                 raise PipeClosed(f"Pipe {self.name!r} is closed; nothing can be put into it.")
-            # Two producers may both see room for one; the second then waits inside the
-            # scheduler until there is, which is harmless for a put.
-            if queue.qsize() < self.capacity:
-                queue.put(item)
+            # The queue itself has no limit. In one that has, the second of two producers that
+            # see room for one would wait inside the scheduler: deaf to `fail`, for ever if
+            # the pipe is deleted, and putting its item after its own death if it is killed.
+            if self.depth < self.capacity:
+                self._put_now(item)
                 return
             if time.monotonic() > deadline:
                 raise TimeoutError(f"Pipe {self.name!r} stayed full for {timeout_s} s.")
             pause.sleep()
 
+    def _put_now(self, item: Any) -> None:
+        try:
+            # The time-out is for a future's task to become known; nothing else waits here.
+            self._ask(self._queue.put, item, timeout=_UNKNOWN_FUTURE_S)
+        except TimeoutError:
+            raise ValueError(
+                f"{item!r} cannot be put into pipe {self.name!r}: the scheduler does not know "
+                "its task, because it was cancelled or belongs to another cluster."
+            ) from None
+
     # -- consumers ---------------------------------------------------------------------
 
     def poll(self) -> list[Any]:
-        """Everything that is queued now, possibly nothing; never waits."""
-        taken = [*self._taken, *self._parts()[0].get(batch=True)]
-        self._taken.clear()
-        return taken
+        """Everything that is queued now, possibly nothing; never waits, ignores `fail`."""
+        queued = self._ask(self._queue.get, batch=True)
+        taken = []
+        while (item := self._next_taken(_NOTHING)) is not _NOTHING:
+            taken.append(item)
+        return [*taken, *queued]
+
+    def _next_taken(self, default: Any) -> Any:
+        # One operation, not a look and then a step: threads may share this object.
+        try:
+            return self._taken.popleft()
+        except IndexError:
+            return default
 
     def get_all(self, timeout_s: float | None = None) -> list[Any]:
         """Everything that is queued, as soon as there is anything.
@@ -221,10 +273,13 @@ class Pipe:
             pause.sleep()
 
     def get(self, timeout_s: float | None = None) -> Any:
-        """The next item; waits for one, and raises as `get_all` does."""
-        if not self._taken:
-            self._taken.extend(self.get_all(timeout_s))
-        return self._taken.popleft()
+        """Take the next item; waits for one, and raises as `get_all` does."""
+        self._read_state()
+        item = self._next_taken(_NOTHING)
+        if item is _NOTHING:
+            item, *more = self.get_all(timeout_s)
+            self._taken.extend(more)
+        return item
 
     def __iter__(self) -> Iterator[Any]:
         """Items until the pipe is closed and empty."""
@@ -238,23 +293,3 @@ class Pipe:
 
 def _deadline(timeout_s: float | None) -> float:
     return float("inf") if timeout_s is None else time.monotonic() + timeout_s
-
-
-def forget_pipes(client: Client, names: list[str]) -> None:
-    """Remove the queues and variables of these pipes from the scheduler.
-
-    Each construction of a Queue counts as a reference and those of killed workers are never
-    given back, so `Queue.close` alone would leave the queue behind; this releases it until
-    it is gone.
-    """
-    client.run_on_scheduler(_forget_on_scheduler, names=names)
-
-
-async def _forget_on_scheduler(names: list[str], dask_scheduler: Any = None) -> None:
-    queues = dask_scheduler.extensions["queues"]
-    variables = dask_scheduler.extensions["variables"]
-    for name in names:
-        while name in queues.queues:
-            queues.release(name=name, client="poolpart")
-        if name in variables.variables:
-            await variables.delete(name=name, client="poolpart")

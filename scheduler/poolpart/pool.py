@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 
 from distributed import Client
 
+from .declare import declare
 from .errors import PoolError
 from .partition import Partition
-from .probe import declare_resource, probe_worker
-from .restarts import KeepResources
+from .probe import probe_worker
+from .selection import check_request, choose
 from .worker_info import WorkerInfo
 
 logger = logging.getLogger(__name__)
@@ -80,11 +82,9 @@ class Pool:
     def __repr__(self) -> str:
         hosts = {worker.host for worker in self.workers}
         gpus = {gpu for worker in self.workers for gpu in worker.gpus}
-        declared = Counter(name for worker in self.workers for name in worker.resources)
+        declared = Counter(name for worker in self.workers for name in worker.partitions)
         parts = "".join(f", {name} {count}" for name, count in sorted(declared.items()))
-        return (
-            f"<Pool of {len(self)} workers on {len(hosts)} hosts with {len(gpus)} GPUs{parts}>"
-        )
+        return f"<Pool of {len(self)} workers on {len(hosts)} hosts with {len(gpus)} GPUs{parts}>"
 
     @property
     def names(self) -> list[str]:
@@ -92,11 +92,11 @@ class Pool:
         return [worker.name for worker in self.workers]
 
     def partitions(self) -> dict[str, Partition]:
-        """The partitions that the workers declare, by name."""
-        names = sorted({name for worker in self.workers for name in worker.resources})
+        """Find the partitions that the workers declare, by name."""
+        names = sorted({name for worker in self.workers for name in worker.partitions})
         return {name: Partition(name, self.client) for name in names}
 
-    def require(self, slots: Mapping[str, int], purpose: Mapping[str, str]) -> None:
+    def require(self, slots: Mapping[str, int], purpose: Mapping[str, str] | None = None) -> None:
         """Check that partitions have enough slots before anything is submitted.
 
         Dask itself would wait, silently and for ever, for a resource that nobody declares.
@@ -106,7 +106,7 @@ class Pool:
         slots
             Slots needed, by partition.
         purpose
-            What they are needed for, by partition; shown in the error.
+            What they are needed for, by partition, where it is worth saying; shown in the error.
 
         Raises
         ------
@@ -114,7 +114,7 @@ class Pool:
             If a partition has fewer, or a worker declares two of the partitions.
         """
         for worker in self.workers:
-            if len(several := [name for name in slots if worker.resources.get(name)]) > 1:
+            if len(several := [name for name in slots if name in worker.partitions]) > 1:
                 raise PoolError(
                     f"Worker {worker.name} declares {' and '.join(several)}: give each worker "
                     "one of them, since a task of one holds up those of the other."
@@ -122,10 +122,11 @@ class Pool:
         for name, needed in slots.items():
             there = int(sum(worker.resources.get(name, 0) for worker in self.workers))
             if there < needed:
+                reason = f" ({purpose[name]})" if purpose and name in purpose else ""
                 raise PoolError(
-                    f"Partition {name!r} has {there} of the {needed} slots needed "
-                    f"({purpose[name]}): start workers with --resources \"{name}=1\" "
-                    f'or one with --nthreads {needed} --resources "{name}={needed}".'
+                    f"Partition {name!r} has {there} of the {needed} slots needed{reason}: "
+                    f'start workers with --resources "{name}=1" or one with --nthreads {needed} '
+                    f'--resources "{name}={needed}".'
                 )
 
     # -- dividing ----------------------------------------------------------------------
@@ -143,17 +144,19 @@ class Pool:
         """Take workers out of this pool under a name.
 
         Give exactly one selector. The chosen workers declare the Dask resource `name`, and
-        declare it again when their nanny restarts them.
+        declare it again when their nanny restarts them. Tasks that wait for the resource
+        already are sent to them. What counts is the cluster as it is now: a worker that has
+        left, or that another partition has taken since this pool was made, is not chosen.
 
         Parameters
         ----------
         name
             Name of the partition and of the resource.
         max_workers_per_gpu
-            On each host, so many workers for each GPU. Where the pool has no GPU at all, the
+            At most so many workers for each GPU. Where the pool has no GPU at all, the
             partition falls back to so many CPU workers a host; its `note` says so.
         max_workers_per_host
-            So many workers of each host.
+            At most so many workers of each host.
         n_workers
             So many workers, wherever they are.
         workers
@@ -170,7 +173,7 @@ class Pool:
         ------
         PoolError
             If the selectors are not exactly one, a worker is not in this pool or belongs to
-            another partition, or there are too few.
+            another partition, there are too few, or other workers have this partition.
         """
         given = {
             "max_workers_per_gpu": max_workers_per_gpu,
@@ -178,84 +181,41 @@ class Pool:
             "n_workers": n_workers,
             "workers": workers,
         }
-        chosen_by = [key for key, value in given.items() if value is not None]
-        if len(chosen_by) != 1:
-            raise PoolError(
-                f"Give exactly one of {', '.join(given)} to partition {name!r}, "
-                f"not {' and '.join(chosen_by) or 'none'}."
-            )
-        for key in chosen_by[:1]:
-            value = given[key]
-            if isinstance(value, int) and value < 1:
-                raise PoolError(f"{key} is {value}; a partition needs at least 1 worker.")
-
-        # A worker that declares something else is another partition's.
-        free = [w for w in self.workers if not set(w.resources) - {name}]
-        note = ""
-        if workers is not None:
-            chosen = self._named(name, workers, free)
-        elif n_workers is not None:
-            chosen = free[:n_workers]
-            if len(chosen) < n_workers:
-                raise PoolError(
-                    f"Partition {name!r} asks for {n_workers} workers; the pool has "
-                    f"{len(free)} that belong to no partition."
-                )
-        elif max_workers_per_host is not None:
-            chosen = _per_host(free, dict.fromkeys(_hosts(free), max_workers_per_host))
-        else:
-            assert max_workers_per_gpu is not None
-            gpus = {h: len({g for w in free if w.host == h for g in w.gpus}) for h in _hosts(free)}
-            if any(gpus.values()):
-                free = [w for w in free if w.gpus]
-                chosen = _per_host(free, {h: n * max_workers_per_gpu for h, n in gpus.items()})
-            else:
-                note = "no GPU in the pool: CPU workers instead"
-                logger.warning("Partition %r: %s", name, note)
-                chosen = _per_host(free, dict.fromkeys(_hosts(free), max_workers_per_gpu))
-        if not chosen:
-            raise PoolError(
-                f"No worker is left for partition {name!r}: all {len(self)} of this pool "
-                "belong to others. Start more workers."
-            )
-        self._declare(name, chosen, slots)
-        rest = Pool(self.client, [w for w in self.workers if w not in chosen])
+        check_request(name, given, slots)
+        cluster = self._cluster_now()
+        mine = [cluster[worker.name] for worker in self.workers if worker.name in cluster]
+        chosen, note = choose(
+            name,
+            mine,
+            max_workers_per_gpu=max_workers_per_gpu,
+            max_workers_per_host=max_workers_per_host,
+            n_workers=n_workers,
+            workers=workers,
+        )
+        if note:
+            logger.warning("Partition %r: %s", name, note)
+        names = {worker.name for worker in chosen}
+        _check_sole(name, [worker for worker in cluster.values() if worker.name not in names])
+        declare(
+            self.client,
+            name,
+            {worker.name: slots or worker.nthreads for worker in chosen},
+            [worker.address for worker in chosen],
+        )
+        rest = Pool(self.client, [worker for worker in mine if worker.name not in names])
         return Partition(name, self.client, note), rest
 
-    def _named(
-        self, name: str, workers: Sequence[str], free: Sequence[WorkerInfo]
-    ) -> list[WorkerInfo]:
-        by_name = {key: w for w in self.workers for key in (w.name, w.address)}
-        if unknown := [str(w) for w in workers if str(w) not in by_name]:
-            raise PoolError(
-                f"Partition {name!r}: {', '.join(unknown)} not in this pool, which has "
-                f"{', '.join(self.names) or 'no workers'}."
-            )
-        chosen = list(dict.fromkeys(by_name[str(w)].name for w in workers))
-        for worker in self.workers:
-            if worker.name in chosen and worker not in free:
-                raise PoolError(
-                    f"Worker {worker.name} already declares {', '.join(worker.resources)}; a "
-                    "worker belongs to one partition."
-                )
-        return [w for w in self.workers if w.name in chosen]
+    def _cluster_now(self) -> dict[str, WorkerInfo]:
+        """Every worker of the cluster by name; the GPUs of those in this pool are known."""
+        gpus = {worker.name: worker.gpus for worker in self.workers}
+        identities = self.client.scheduler_info(n_workers=-1)["workers"]
+        workers = (WorkerInfo.from_identity(a, i) for a, i in identities.items())
+        return {w.name: replace(w, gpus=gpus.get(w.name, ())) for w in workers}
 
-    def _declare(self, name: str, chosen: Sequence[WorkerInfo], slots: int | None) -> None:
-        wanted = {worker.name: slots or worker.nthreads for worker in chosen}
-        # First the nannies: a worker that dies right after would come back without.
-        self.client.register_plugin(KeepResources(name, wanted))
-        self.client.run(
-            declare_resource, wanted, name, workers=[worker.address for worker in chosen]
+
+def _check_sole(name: str, others: Iterable[WorkerInfo]) -> None:
+    if members := [worker.name for worker in others if name in worker.partitions]:
+        raise PoolError(
+            f"There is a partition {name!r} already, with {', '.join(members)}, which this "
+            f"call does not choose: give another name, or use Pool.partitions()[{name!r}]."
         )
-
-
-def _hosts(workers: Sequence[WorkerInfo]) -> list[str]:
-    return list(dict.fromkeys(worker.host for worker in workers))
-
-
-def _per_host(workers: Sequence[WorkerInfo], limit: Mapping[str, int]) -> list[WorkerInfo]:
-    return [
-        worker
-        for host in _hosts(workers)
-        for worker in [w for w in workers if w.host == host][: limit[host]]
-    ]

@@ -21,8 +21,9 @@ class KeepResources(NannyPlugin):
         self.resource, self.slots = resource, slots
 
     def setup(self, nanny: Any) -> None:
-        """Called on each nanny, now and when one joins."""
-        slots = self.slots.get(str(nanny.name))
+        """Change what the nanny starts its worker with; called on each, now and when one joins."""
+        # A worker that was given no name goes by its address, which its nanny knows.
+        slots = self.slots.get(str(nanny.name), self.slots.get(nanny.worker_address))
         if slots is not None:
             nanny.resources = {**(nanny.resources or {}), self.resource: slots}
             # A nanny that has started a worker keeps what it started it with, and uses that.

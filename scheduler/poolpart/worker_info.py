@@ -35,6 +35,11 @@ class WorkerInfo:
     gpus: tuple[str, ...] = ()
     resources: Mapping[str, float] = field(default_factory=dict)
 
+    @property
+    def partitions(self) -> frozenset[str]:
+        """The partitions that it belongs to: the resources of which it has a slot."""
+        return frozenset(name for name, slots in self.resources.items() if slots)
+
     @classmethod
     def from_identity(
         cls, address: str, identity: Mapping[str, Any], gpus: tuple[str, ...] = ()
@@ -57,7 +62,8 @@ def assign_devices(workers: Iterable[WorkerInfo]) -> dict[str, int]:
     Workers of one host spread over its devices. Each takes the first device in its own list
     that the fewest others have: dask-cuda rotates `CUDA_VISIBLE_DEVICES` from worker to
     worker so that number 0 is another device in each, whereas workers from a plain
-    `dask worker` all list the same devices in the same order.
+    `dask worker` all list the same devices in the same order. Those with the fewest to
+    choose from choose first.
 
     Returns
     -------
@@ -72,7 +78,7 @@ def assign_devices(workers: Iterable[WorkerInfo]) -> dict[str, int]:
     """
     users: dict[str, int] = {}  # {device UUID: workers that have it}; UUIDs differ between hosts
     chosen: dict[str, int] = {}
-    for worker in workers:
+    for worker in sorted(workers, key=lambda worker: len(worker.gpus)):
         if worker.gpus:
             ordinal = min(range(len(worker.gpus)), key=lambda i: users.get(worker.gpus[i], 0))
             chosen[worker.name] = ordinal

@@ -1,0 +1,103 @@
+"""The two parts of a pipe on the scheduler: a Queue of items and a Variable with its state.
+
+Changes of the state run on the scheduler, in its event loop, one at a time. If each side
+read the Variable, changed it and wrote it back, a `close` could undo a `fail` of the same
+moment; and a write after the pipe was deleted would bring half of it back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from distributed import Client, Queue
+
+from .errors import PoolError
+
+
+@dataclass(frozen=True)
+class PipeState:
+    """What a pipe's Variable holds."""
+
+    closed: bool = False
+    failure: str = ""  # the reason, empty while there is none
+    advice: int = 1
+
+
+class AttachedQueue(Queue):
+    """A Queue that exists already.
+
+    Constructing a `Queue` creates it where it does not exist and counts as a reference, which
+    a killed worker never gives back: a consumer that starts late would revive the queue of
+    a pipe that was deleted. This one does neither.
+    """
+
+    def _maybe_start(self) -> None:
+        """Do not create the queue."""
+
+
+def open_pipe(client: Client, name: str) -> bool:
+    """Make both parts; False if there is a pipe of that name."""
+    return bool(_on_scheduler(client, _open, name=name, state=asdict(PipeState())))
+
+
+def change_pipe(client: Client, name: str, **changes: Any) -> PipeState | None:
+    """Change fields of the state; returns what it is now, or None if there is no such pipe."""
+    state = _on_scheduler(client, _change, name=name, changes=changes)
+    return None if state is None else PipeState(**state)
+
+
+def forget_pipes(client: Client, names: Sequence[str]) -> None:
+    """Remove these pipes from the scheduler, with what is in them; those unknown are skipped."""
+    _on_scheduler(client, _forget, names=list(names))
+
+
+def _on_scheduler(client: Client, function: Callable[..., Any], **kwargs: Any) -> Any:
+    try:
+        return client.run_on_scheduler(function, **kwargs)
+    except ModuleNotFoundError as error:
+        raise PoolError(
+            f"The scheduler at {client.scheduler.address} has no module {error.name!r}: start "
+            "it in the environment that is used here."
+        ) from error
+
+
+async def _open(name: str, state: dict[str, Any], dask_scheduler: Any = None) -> bool:
+    queues = dask_scheduler.extensions["queues"]
+    variables = dask_scheduler.extensions["variables"]
+    if name in queues.queues or name in variables.variables:
+        return False
+    # Without `maxsize`: see `Pipe.put`.
+    queues.create(name=name)
+    await variables.set(name=name, data=state)
+    return True
+
+
+async def _change(
+    name: str, changes: dict[str, Any], dask_scheduler: Any = None
+) -> dict[str, Any] | None:
+    variables = dask_scheduler.extensions["variables"]
+    if name not in variables.variables:
+        return None
+    state: dict[str, Any] = {**variables.variables[name]["value"]}
+    if state["failure"]:  # the first reason is the cause, later ones are its consequences
+        changes = {key: value for key, value in changes.items() if key != "failure"}
+    state |= changes
+    await variables.set(name=name, data=state)
+    return state
+
+
+async def _forget(names: list[str], dask_scheduler: Any = None) -> None:
+    queues = dask_scheduler.extensions["queues"]
+    variables = dask_scheduler.extensions["variables"]
+    for name in names:
+        while name in queues.queues:
+            queues.release(name=name, client="poolpart")
+        for counted in [counted for counted in queues.future_refcount if counted[0] == name]:
+            del queues.future_refcount[counted]
+        # Futures that were taken by a consumer which died before it could say so.
+        if f"queue-{name}" in dask_scheduler.clients:
+            dask_scheduler.remove_client(f"queue-{name}")
+        if name in variables.variables:
+            await variables.delete(name=name, client="poolpart")

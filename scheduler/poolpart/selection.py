@@ -1,0 +1,132 @@
+"""Which workers a partition takes; pure functions of what is known of them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+
+from .errors import PoolError
+from .worker_info import WorkerInfo
+
+NO_GPU = "no GPU in the pool: CPU workers instead"
+
+
+Selectors = Mapping[str, int | Sequence[str] | None]
+
+
+def check_request(partition: str, selectors: Selectors, slots: int | None) -> None:
+    """Check what is asked of `Pool.partition`; PoolError unless it makes sense."""
+    if not partition:
+        raise PoolError("The name of the partition is empty; give one.")
+    if slots is not None and slots < 1:
+        raise PoolError(f"slots is {slots}; a worker needs at least 1 to take tasks.")
+    given = {key: value for key, value in selectors.items() if value is not None}
+    if len(given) != 1:
+        raise PoolError(
+            f"Give exactly one of {', '.join(selectors)} to partition {partition!r}, "
+            f"not {' and '.join(given) or 'none'}."
+        )
+    for key, value in given.items():
+        if key == "workers":
+            if isinstance(value, str) or not value:
+                raise PoolError(
+                    f"workers is {value!r}; give a list of names or addresses, 1 or more."
+                )
+        elif not isinstance(value, int) or value < 1:
+            raise PoolError(f"{key} is {value!r}; give a whole number, 1 or more.")
+
+
+def choose(
+    partition: str,
+    pool: Sequence[WorkerInfo],
+    *,
+    max_workers_per_gpu: int | None = None,
+    max_workers_per_host: int | None = None,
+    n_workers: int | None = None,
+    workers: Sequence[str] | None = None,
+) -> tuple[list[WorkerInfo], str]:
+    """Choose workers of a pool by the one selector that is given.
+
+    Returns
+    -------
+    chosen, note
+        The workers, and what a user should know of the choice; empty for nothing.
+
+    Raises
+    ------
+    PoolError
+        If there are too few, or one that was named cannot be had.
+    """
+    if workers is not None:
+        return by_name(partition, pool, workers), ""
+    # Members come first, so that the same call, again, makes the same partition.
+    free = [worker for worker in pool if worker.partitions == {partition}]
+    free += [worker for worker in pool if not worker.partitions]
+    if n_workers is not None:
+        return by_count(partition, free, n_workers), ""
+    if not free:
+        raise PoolError(
+            f"No worker is left for partition {partition!r}: all {len(pool)} of this pool "
+            "belong to others. Start more workers."
+        )
+    if max_workers_per_host is not None:
+        return by_host(free, max_workers_per_host), ""
+    if max_workers_per_gpu is not None:
+        return by_gpu(free, max_workers_per_gpu)
+    raise PoolError(f"Partition {partition!r} was given no selector.")
+
+
+def by_name(partition: str, pool: Sequence[WorkerInfo], wanted: Sequence[str]) -> list[WorkerInfo]:
+    """Take these workers, by name or address."""
+    known = {key: worker for worker in pool for key in (worker.name, worker.address)}
+    if unknown := [str(name) for name in wanted if str(name) not in known]:
+        raise PoolError(
+            f"Partition {partition!r}: {', '.join(unknown)} not in this pool, which has "
+            f"{', '.join(worker.name for worker in pool) or 'no workers'}."
+        )
+    names = {known[str(name)].name for name in wanted}
+    chosen = [worker for worker in pool if worker.name in names]
+    for worker in chosen:
+        if others := sorted(worker.partitions - {partition}):
+            raise PoolError(
+                f"Worker {worker.name} already declares {', '.join(others)}; a worker belongs "
+                "to one partition."
+            )
+    return chosen
+
+
+def by_count(partition: str, free: Sequence[WorkerInfo], n_workers: int) -> list[WorkerInfo]:
+    """Take so many workers."""
+    if len(free) < n_workers:
+        raise PoolError(
+            f"Partition {partition!r} asks for {n_workers} workers; the pool has {len(free)} "
+            "that belong to no other partition."
+        )
+    return list(free[:n_workers])
+
+
+def by_host(free: Sequence[WorkerInfo], most: int) -> list[WorkerInfo]:
+    """Take at most so many workers of each host."""
+    taken: Counter[str] = Counter()
+    chosen = []
+    for worker in free:
+        if taken[worker.host] < most:
+            taken[worker.host] += 1
+            chosen.append(worker)
+    return chosen
+
+
+def by_gpu(free: Sequence[WorkerInfo], most: int) -> tuple[list[WorkerInfo], str]:
+    """Take at most so many workers for each GPU; a note says if there was none to go by."""
+    if not any(worker.gpus for worker in free):
+        return by_host(free, most), NO_GPU
+    taken: Counter[str] = Counter()  # {GPU: workers chosen for it}
+    chosen = []
+    # Those that see the fewest GPUs first: the others have a choice.
+    for worker in sorted(free, key=lambda worker: len(worker.gpus)):
+        if worker.gpus:
+            gpu = min(worker.gpus, key=lambda gpu: taken[gpu])
+            if taken[gpu] < most:
+                taken[gpu] += 1
+                chosen.append(worker)
+    return chosen, ""
