@@ -31,7 +31,7 @@ class Found:
     triangle
         int32 (k,): row of `faces`.
     u, v
-        float64 (k,): weights of the second and third corner.
+        float64 (k,): weights of the second and third corner; empty when not asked for.
     """
 
     ray: NDArray[np.intp]
@@ -63,15 +63,15 @@ class Backend(ABC):
         self._mesh = mesh
 
     @abstractmethod
-    def closest(self, rays: Rays) -> Found:
-        """Closest hits of at most `chunk` rays."""
+    def closest(self, rays: Rays, weights: bool) -> Found:
+        """Closest hits of at most `chunk` rays; `weights` tells whether u and v are wanted."""
 
     def cast(self, rays: Rays) -> Hits:
         """Closest hit of every ray."""
         n = len(rays)
         hits = Hits(np.full(n, np.inf), np.full(n, -1, np.int32), np.zeros(n), np.zeros(n))
         for start in range(0, n, self.chunk):
-            found = self.closest(rays.part(start, start + self.chunk))
+            found = self.closest(rays.part(start, start + self.chunk), weights=True)
             row = start + found.ray
             hits.distance[row] = found.t / self._mesh.scale
             hits.triangle[row] = found.triangle
@@ -85,7 +85,7 @@ class Backend(ABC):
         distance: list[NDArray[np.float64]] = [np.zeros(0)]
         triangle: list[NDArray[np.int32]] = [np.zeros(0, np.int32)]
         for start in range(0, len(rays), self.chunk):
-            found = self.closest(rays.part(start, start + self.chunk))
+            found = self.closest(rays.part(start, start + self.chunk), weights=False)
             ray.append(found.ray + start)
             distance.append(found.t / self._mesh.scale)
             triangle.append(found.triangle)

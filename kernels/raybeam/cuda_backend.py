@@ -53,6 +53,7 @@ class CudaBackend(Backend):
             _check_memory(cupy, layout.nbytes)
             tables = (layout.nodes, layout.triangles, layout.corners, layout.faces, layout.frame)
             self._scene = tuple(cupy.asarray(table) for table in tables)
+            self._corners, self._faces, self._frame = self._scene[2:]
             stack = -(-max(layout.stack, 1) // _STACK_STEP) * _STACK_STEP
             self._module = _module(cupy, self._device.id, stack)
         # {pattern: its directions on the device}
@@ -65,27 +66,21 @@ class CudaBackend(Backend):
 
         return cupy
 
-    def closest(self, rays: Rays) -> Found:
+    def closest(self, rays: Rays, weights: bool) -> Found:
         """See `Backend.closest`."""
         cp = self._cupy
         with self._device:
-            table = self._upload(rays)
-            ray, t, place = self._cast(table, rays)
-            u, v = cp.empty(len(ray)), cp.empty(len(ray))
-            corners, faces, frame = self._scene[2:]
-            ray = ray.astype(np.int64)
-            hits = (corners, frame, *table, ray, place, np.int64(len(ray)), u, v)
-            self._launch("weigh_table", len(ray), hits)
-            return Found(ray.get(), t.get(), faces[place].get(), u.get(), v.get())
-
-    def returns(self, rays: Rays) -> Returns:
-        """See `Backend.returns`."""
-        parts = []
-        with self._device:
-            for start in range(0, len(rays), self.chunk):
-                part = rays.part(start, start + self.chunk)
-                parts.append(self._to_host(start, *self._cast(self._upload(part), part)))
-        return _joined(parts)
+            stride = np.int32(0 if len(rays.origins) == 1 else 3)
+            table = (cp.asarray(rays.origins), stride, cp.asarray(rays.directions))
+            limits = (np.float64(t * self._mesh.scale) for t in (rays.t_min, rays.t_max))
+            count = np.int64(len(rays))
+            ray, t, place = self._hits("cast_table", len(rays), (*table, count, *limits))
+            u = v = cp.empty(0)
+            if weights:
+                u, v = cp.empty(len(ray)), cp.empty(len(ray))
+                hits = (ray, place, np.int64(len(ray)), u, v)
+                self._launch("weigh_table", len(ray), (self._corners, self._frame, *table, *hits))
+            return Found(ray.get(), t.get(), self._faces[place].get(), u.get(), v.get())
 
     def scan(
         self,
@@ -97,7 +92,9 @@ class CudaBackend(Backend):
     ) -> Returns:
         """See `Backend.scan`; the rays are made on the device."""
         cp = self._cupy
-        parts = []
+        ray = [np.zeros(0, np.int64)]
+        distance = [np.zeros(0)]
+        triangle = [np.zeros(0, np.int32)]
         turn = np.eye(3) if rotation is None else rotation
         with self._device:
             if pattern not in self._patterns:
@@ -108,19 +105,11 @@ class CudaBackend(Backend):
             for start in range(0, len(directions), self.chunk):
                 part = directions[start : start + self.chunk]
                 rays = (pose, np.int32(rotation is not None), part, np.int64(len(part)), *limits)
-                parts.append(self._to_host(start, *self._hits("cast_pattern", len(part), rays)))
-        return _joined(parts)
-
-    def _upload(self, rays: Rays) -> tuple[Any, ...]:
-        """Origins, their stride and directions, as the kernels take them."""
-        cp = self._cupy
-        stride = np.int32(0 if len(rays.origins) == 1 else 3)
-        return cp.asarray(rays.origins), stride, cp.asarray(rays.directions)
-
-    def _cast(self, table: tuple[Any, ...], rays: Rays) -> tuple[Any, Any, Any]:
-        scale = self._mesh.scale
-        limits = (np.float64(rays.t_min * scale), np.float64(rays.t_max * scale))
-        return self._hits("cast_table", len(rays), (*table, np.int64(len(rays)), *limits))
+                hit, t, place = self._hits("cast_pattern", len(part), rays)
+                ray.append(hit.get() + start)
+                distance.append(t.get() / self._mesh.scale)
+                triangle.append(self._faces[place].get())
+        return Returns(np.concatenate(ray), np.concatenate(distance), np.concatenate(triangle))
 
     def _hits(self, kernel: str, n: int, rays: tuple[Any, ...]) -> tuple[Any, Any, Any]:
         """Run a cast and keep the hits: ray, local distance, place; on the device."""
@@ -128,12 +117,8 @@ class CudaBackend(Backend):
         t, place = cp.empty(n), cp.empty(n, np.int32)
         self._launch(kernel, n, (*self._scene, *rays, t, place))
         # Compacted by a scan in ray order, not by atomics: the same bytes on every run.
-        ray = cp.flatnonzero(place >= 0)
+        ray = cp.flatnonzero(place >= 0)  # int64, as weigh_table takes it
         return ray, t[ray], place[ray]
-
-    def _to_host(self, start: int, ray: Any, t: Any, place: Any) -> Returns:
-        rows = ray.astype(np.int32).get().astype(np.int64) + start  # half the bytes on the way
-        return Returns(rows, t.get() / self._mesh.scale, self._scene[3][place].get())
 
     def _launch(self, kernel: str, n: int, arguments: tuple[Any, ...]) -> None:
         if n:
@@ -176,13 +161,3 @@ def _check_memory(cupy: Any, need: int) -> None:
             f"The mesh needs {(need + work) / 2**20:.0f} MiB on the CUDA device and "
             f"{free / 2**20:.0f} MiB are free: use a smaller mesh or backend 'embree'."
         )
-
-
-def _joined(parts: list[Returns]) -> Returns:
-    if not parts:
-        return Returns(np.zeros(0, np.int64), np.zeros(0), np.zeros(0, np.int32))
-    return Returns(
-        np.concatenate([part.ray for part in parts]),
-        np.concatenate([part.distance for part in parts]),
-        np.concatenate([part.triangle for part in parts]),
-    )

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import importlib.util
 import threading
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from . import triangle as exact
 from .backend import Backend, Found
 from .clip import clip
 from .mesh import LocalMesh
 from .rays import Rays
+from .refine import Refiner
 from .tree import PAD
 
 _MISS = 0xFFFFFFFF
@@ -21,6 +22,19 @@ _MISS = 0xFFFFFFFF
 # Embree decides in float32: a start this much farther on, in local units, is surely beyond a
 # surface that refinement put just before the start.
 _NUDGE = 2.0**-20
+
+
+@dataclass(frozen=True)
+class _Pairs:
+    """Hits: number of the ray, local distance, row of the mesh's corners; (k,) each."""
+
+    ray: NDArray[np.intp]
+    t: NDArray[np.float64]
+    place: NDArray[np.intp]
+
+    def only(self, rows: NDArray[Any]) -> _Pairs:
+        """Return some of the hits."""
+        return _Pairs(self.ray[rows], self.t[rows], self.place[rows])
 
 
 class EmbreeBackend(Backend):
@@ -61,69 +75,76 @@ class EmbreeBackend(Backend):
             rows = np.arange(len(points), dtype=np.uint32).reshape(-1, 3)
             self._scene = open3d.t.geometry.RaycastingScene(nthreads=self._threads)
             self._scene.add_triangles(self._tensor(points), self._tensor(rows))
+        self._refine = Refiner(mesh)
         low, high = mesh.box
         self._low, self._high = low - PAD, high + PAD
         self._local = threading.local()  # threads of one worker may cast at the same time
 
-    def closest(self, rays: Rays) -> Found:
+    def closest(self, rays: Rays, weights: bool) -> Found:
         """See `Backend.closest`."""
-        origins = self._mesh.to_local(rays.origins)
+        origins, directions = self._mesh.to_local(rays.origins), rays.directions
         t_min, t_max = rays.t_min * self._mesh.scale, rays.t_max * self._mesh.scale
-        found = self._cast(origins, rays.directions, 0.0)
-        early = found.t < t_min
+        hits = self._cast(origins, directions, 0.0)
+        early = hits.t < t_min
         if early.any():
-            found = self._beyond(found, early, origins, rays.directions, t_min)
-        return _only(found, found.t <= t_max)
+            hits = self._beyond(hits, early, origins, directions, t_min)
+        if t_max < np.inf:
+            hits = hits.only(hits.t <= t_max)
+        u = v = np.zeros(0)
+        if weights:
+            at = _of(origins, hits.ray)
+            u, v = self._refine.weights(at, directions[hits.ray], hits.place)
+        return Found(hits.ray, hits.t, self._mesh.index[hits.place], u, v)
 
     def _beyond(
         self,
-        found: Found,
+        hits: _Pairs,
         early: NDArray[np.bool_],
         origins: NDArray[np.float64],
         directions: NDArray[np.float64],
         t_min: float,
-    ) -> Found:
+    ) -> _Pairs:
         """Replace hits before `t_min` by the next ones behind it."""
-        parts = [_only(found, ~early)]
-        ray = found.ray[early]
+        parts = [hits.only(~early)]
+        ray = hits.ray[early]
         for start in (t_min, t_min + _NUDGE, t_min + 4 * _NUDGE):
-            at = origins if len(origins) == 1 else origins[ray]
-            again = self._cast(at, directions[ray], start)
-            again = Found(ray[again.ray], again.t, again.triangle, again.u, again.v)
-            parts.append(_only(again, again.t >= t_min))
+            again = self._cast(_of(origins, ray), directions[ray], start)
+            again = _Pairs(ray[again.ray], again.t, again.place)
+            parts.append(again.only(again.t >= t_min))
             ray = again.ray[again.t < t_min]
             if not len(ray):
                 break
-        joined = Found(
-            *(
-                np.concatenate([getattr(part, name) for part in parts])
-                for name in ("ray", "t", "triangle", "u", "v")
-            )
+        joined = _Pairs(
+            np.concatenate([part.ray for part in parts]),
+            np.concatenate([part.t for part in parts]),
+            np.concatenate([part.place for part in parts]),
         )
-        return _only(joined, np.argsort(joined.ray))
+        return joined.only(np.argsort(joined.ray))
 
     def _cast(
         self, origins: NDArray[np.float64], directions: NDArray[np.float64], start: float
-    ) -> Found:
+    ) -> _Pairs:
         """Closest hits at or behind `start`, up to float32 rounding; lengths are local."""
         n = len(directions)
         if self._scene is None or not n:
-            return _only(_NOTHING, slice(0))
+            return _Pairs(np.zeros(0, np.intp), np.zeros(0), np.zeros(0, np.intp))
         buffer = self._rows(n)
         buffer[:, 3:] = directions
-        inside = ((origins >= self._low) & (origins <= self._high)).all()
-        if inside and start == 0:
+        begin = np.zeros(1)
+        if start == 0 and ((origins >= self._low) & (origins <= self._high)).all():
             buffer[:, :3] = origins
         else:
             # Start at the scene's box: then float32 rounds by the scene's size, not by the way.
             entry, _ = clip(self._low, self._high, origins, directions)
-            buffer[:, :3] = origins + np.maximum(entry, start)[:, None] * directions
+            begin = np.maximum(entry, start)
+            buffer[:, :3] = origins + begin[:, None] * directions
         answer = self._scene.cast_rays(self._tensor(buffer), nthreads=self._threads)
         face = answer["primitive_ids"].numpy()
         ray = np.flatnonzero(face != _MISS)
-        weights = answer["primitive_uvs"].numpy()[ray].astype(np.float64)
-        at = np.broadcast_to(origins, directions.shape)[ray]
-        return self._refine(ray, at, directions[ray], face[ray].astype(np.intp), weights)
+        rough = answer["t_hit"].numpy()[ray] + _of(begin, ray)
+        place = face[ray].astype(np.intp)
+        t = self._refine.distance(_of(origins, ray), directions[ray], place, rough)
+        return _Pairs(ray, t, place)
 
     def _rows(self, n: int) -> NDArray[np.float32]:
         """Room for n rays; kept, since fresh pages cost a quarter of what the cast does."""
@@ -132,40 +153,7 @@ class EmbreeBackend(Backend):
             kept = self._local.rows = np.empty((n, 6), np.float32)
         return kept[:n]
 
-    def _refine(
-        self,
-        ray: NDArray[np.intp],
-        origins: NDArray[np.float64],
-        directions: NDArray[np.float64],
-        place: NDArray[np.intp],
-        weights: NDArray[np.float64],
-    ) -> Found:
-        """Distance and weights of known hits in float64."""
-        corners = self._mesh.corners
-        a, b, c, det, t = exact.intersect(
-            exact.shear(origins, directions), np.arange(len(ray)), corners, place
-        )
-        with np.errstate(divide="ignore", invalid="ignore"):
-            u, v = b / det, c / det
-        out = np.flatnonzero(~exact.inside(a, b, c, det))
-        if len(out):
-            # The ray passes just outside the triangle, and where it also grazes, the plane may
-            # be far away: take the point that Embree means.
-            one, two = weights[out].clip(0, 1).T
-            two = np.minimum(two, 1 - one)
-            three = corners[place[out]]
-            point = (
-                (1 - one - two)[:, None] * three[:, 0]
-                + one[:, None] * three[:, 1]
-                + two[:, None] * three[:, 2]
-            )
-            u[out], v[out] = one, two
-            t[out] = ((point - origins[out]) * directions[out]).sum(axis=1)
-        return Found(ray, t, self._mesh.index[place], u, v)
 
-
-_NOTHING = Found(np.zeros(0, np.intp), np.zeros(0), np.zeros(0, np.int32), np.zeros(0), np.zeros(0))
-
-
-def _only(found: Found, rows: Any) -> Found:
-    return Found(found.ray[rows], found.t[rows], found.triangle[rows], found.u[rows], found.v[rows])
+def _of(values: NDArray[np.float64], rows: NDArray[np.intp]) -> NDArray[np.float64]:
+    """Rows of what is either one for all or one a ray."""
+    return values if len(values) == 1 else values[rows]

@@ -33,7 +33,7 @@ class NumpyBackend(Backend):
         super().__init__(mesh, threads, device)
         self._walker = Walker(mesh, build_tree(mesh.corners, _WIDTH, _LEAF_SIZE))
 
-    def closest(self, rays: Rays) -> Found:
+    def closest(self, rays: Rays, weights: bool) -> Found:
         """See `Backend.closest`."""
         origins = np.broadcast_to(self._mesh.to_local(rays.origins), rays.directions.shape)
         scale = self._mesh.scale

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
 from benchmarks import cuda_kernel
+
 from raybeam import RayCaster, available_backends
 
 
