@@ -23,7 +23,7 @@ class Swarm:
     has met itself and the best its group has met, with their distance in each coordinate as
     the standard deviation: where both agree it searches closely, where they differ widely.
     Against inertia and constriction (Shi and Eberhart 1998, Clerc and Kennedy 2002) it finds
-    paths as good, in scenes of 6 to 25 discs, for half the arithmetic, and has no parameters.
+    paths as good, in scenes of 6 to 25 discs, with two thirds of the arithmetic.
 
     Discs can be passed on either side, and a swarm with one common best settles early for one
     choice of sides. Groups, that start spread more and less widely about the straight line,
