@@ -1,0 +1,90 @@
+"""Listing CUDA devices: without a driver, with one that works, with ones that do not."""
+
+import asyncio
+import logging
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+from poolpart import probe
+
+FAKE = """
+#include <string.h>
+#include <stdlib.h>
+int cuInit(unsigned flags) { BODY return 0; }
+int cuDeviceGetCount(int *count) { *count = 2; return 0; }
+int UUID(unsigned char *uuid, int device) { memset(uuid, 16 + device, 16); return ERROR; }
+"""
+
+
+@pytest.fixture
+def fake_driver(tmp_path, monkeypatch):
+    """Install a driver whose cuInit does what is given; needs a C compiler."""
+    compiler = shutil.which("cc") or shutil.which("gcc")
+    if compiler is None:
+        pytest.skip("no C compiler to make a driver with")
+
+    def install(body="", uuid="cuDeviceGetUuid", error="0"):
+        source, library = tmp_path / "fake.c", tmp_path / "libfake.so"
+        source.write_text(FAKE)
+        defines = [f"-DBODY={body}", f"-DUUID={uuid}", f"-DERROR={error}"]
+        command = [compiler, "-w", "-shared", "-fPIC", *defines, "-o", library, source]
+        subprocess.run(command, check=True)
+        monkeypatch.setattr(probe, "_DRIVER", str(library))
+
+    return install
+
+
+def test_no_driver(monkeypatch, caplog):
+    monkeypatch.setattr(probe, "_DRIVER", "libno-such-driver.so.1")
+    assert probe.visible_gpus() == ()
+    assert not caplog.records
+
+
+@pytest.mark.parametrize("function", ["cuDeviceGetUuid", "cuDeviceGetUuid_v2"])
+def test_devices_are_known_by_their_uuid(fake_driver, function):
+    fake_driver(uuid=function)
+    assert probe.visible_gpus() == ("10" * 16, "11" * 16)
+
+
+def test_a_driver_without_devices(fake_driver, caplog):
+    fake_driver(body="return 100;")
+    assert probe.visible_gpus() == ()
+    assert not caplog.records
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [({"body": "abort();"}, "SIGABRT"), ({"error": "999"}, "of device 0 gives error 999")],
+)
+def test_a_broken_driver_counts_as_none_and_is_reported(fake_driver, caplog, options, said):
+    fake_driver(**options)
+    with caplog.at_level(logging.WARNING, "poolpart"):
+        assert probe.visible_gpus() == ()
+    assert "No GPU is used, listing them failed" in caplog.text
+    assert said in caplog.text
+
+
+def test_a_driver_that_never_answers(monkeypatch, caplog):
+    def run(command, **options):
+        raise subprocess.TimeoutExpired(command[:1], options["timeout"])
+
+    monkeypatch.setattr(probe, "_DRIVER", None)  # the process itself: always there
+    monkeypatch.setattr(probe.subprocess, "run", run)
+    assert probe.visible_gpus() == ()
+    assert "timed out after 60 seconds" in caplog.text
+
+
+def test_the_process_that_asks_is_not_the_worker(monkeypatch):
+    asked = []
+
+    def run(command, **options):
+        asked.append(command)
+        return subprocess.CompletedProcess(command, 0, "aa\nbb\n", "")
+
+    monkeypatch.setattr(probe, "_DRIVER", None)
+    monkeypatch.setattr(probe.subprocess, "run", run)
+    assert asyncio.run(probe.probe_worker()) == {"gpus": ("aa", "bb")}
+    assert asked[0][0] == sys.executable
