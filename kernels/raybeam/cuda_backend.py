@@ -40,7 +40,14 @@ class CudaBackend(Backend):
             count = cupy.cuda.runtime.getDeviceCount()
         except cupy.cuda.runtime.CUDARuntimeError as error:
             return f"CuPy finds no CUDA device ({error})"
-        return "" if count else "there is no CUDA device"
+        if not count:
+            return "there is no CUDA device"
+        try:
+            cupy.cuda.nvrtc.getVersion()
+        except RuntimeError as error:
+            said = str(error).partition("\n")[0]
+            return f"CuPy finds no compiler ({said}): pip install 'cupy-cuda13x[ctk]', or 12x"
+        return ""
 
     def __init__(
         self, mesh: LocalMesh, threads: int | None = None, device: int | None = None

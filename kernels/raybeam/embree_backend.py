@@ -143,7 +143,7 @@ class EmbreeBackend(Backend):
         ray = np.flatnonzero(face != _MISS)
         rough = answer["t_hit"].numpy()[ray] + _of(begin, ray)
         place = face[ray].astype(np.intp)
-        t = self._refine.distance(_of(origins, ray), directions[ray], place, rough)
+        t = self._refine.distance(_of(origins, ray), directions.take(ray, axis=0), place, rough)
         return _Pairs(ray, t, place)
 
     def _rows(self, n: int) -> NDArray[np.float32]:
@@ -156,4 +156,4 @@ class EmbreeBackend(Backend):
 
 def _of(values: NDArray[np.float64], rows: NDArray[np.intp]) -> NDArray[np.float64]:
     """Rows of what is either one for all or one a ray."""
-    return values if len(values) == 1 else values[rows]
+    return values if len(values) == 1 else values.take(rows, axis=0)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -105,3 +107,28 @@ def test_mesh_that_does_not_fit_the_device(source_backend, monkeypatch):
     monkeypatch.setattr(runtime, "memGetInfo", lambda: (200 << 20, 1 << 30))
     with pytest.raises(MemoryError, match=r"needs 256 MiB .* and 200 MiB are free"):
         source_backend(local_mesh(*MESH))
+
+
+class CudaError(RuntimeError):
+    pass
+
+
+def refuse(message):
+    raise CudaError(message)
+
+
+@pytest.mark.parametrize(
+    ("devices", "version", "words"),
+    [
+        (lambda: refuse("driver too old"), lambda: (13, 0), "no CUDA device .driver too old"),
+        (lambda: 0, lambda: (13, 0), "there is no CUDA device"),
+        (lambda: 1, lambda: refuse("no libnvrtc\nat all"), r"no compiler .no libnvrtc.: pip"),
+        (lambda: 2, lambda: (13, 0), "^$"),
+    ],
+)
+def test_what_cuda_lacks(monkeypatch, devices, version, words):
+    runtime = SimpleNamespace(getDeviceCount=devices, CUDARuntimeError=CudaError)
+    cuda = SimpleNamespace(runtime=runtime, nvrtc=SimpleNamespace(getVersion=version))
+    monkeypatch.setitem(sys.modules, "cupy", SimpleNamespace(cuda=cuda))
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: name)
+    assert re.search(words, CudaBackend.missing())

@@ -1,0 +1,15 @@
+"""The examples in docstrings say what happens."""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+
+import pytest
+
+
+@pytest.mark.parametrize("name", ["caster", "registry"])
+def test_examples(name):
+    done = doctest.testmod(importlib.import_module(f"raybeam.{name}"))
+    assert done.attempted > 0
+    assert done.failed == 0
