@@ -18,6 +18,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,13 +26,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from raybeam import Pattern, RayCaster, available_backends
-from raybeam.cuda_backend import CudaBackend
+from raybeam.cuda_backend import CudaBackend, options, source
 from raybeam.mesh import local_mesh
 
 Mesh = tuple[NDArray[np.float64], NDArray[np.int64]]
 Float = NDArray[np.float64]
 
 _BLOCK = 128
+_VARIANTS = (1, 6, 8, 10)  # blocks on a multiprocessor that a thread's registers must allow
 _SAMPLE = 2000  # rays compared with the numpy backend
 
 # Moeller and Trumbore in float against all triangles, without a tree.
@@ -191,6 +193,14 @@ class Bench:
         table_times = milliseconds(
             cupy, lambda: get("cast_table")(grid, (_BLOCK,), table), self.repeats
         )
+        variants = {}
+        for blocks in _VARIANTS:
+            variant = self.variant(blocks)
+            variants[f"blocks {blocks}"] = {
+                "registers": int(variant.num_regs),
+                "local_bytes": int(variant.local_size_bytes),
+                **milliseconds(cupy, partial(variant, grid, (_BLOCK,), pattern), self.repeats),
+            }
         kept = Pattern(directions)
         whole = wall_milliseconds(
             lambda: self.engine.scan(kept, (0, n), self.origin[None], None, (0.0, np.inf)),
@@ -201,11 +211,17 @@ class Bench:
             "hit_share": float((place >= 0).mean()),
             "cast_pattern_ms": pattern_times,
             "cast_table_ms": table_times,
+            "variants_ms": variants,
             "scan_to_host_ms": whole,
             "cast_pattern_mrays_s": n / pattern_times["median"] / 1e3,
             "cast_table_mrays_s": n / table_times["median"] / 1e3,
             "scan_to_host_mrays_s": n / whole / 1e3,
         }
+
+    def variant(self, blocks: int) -> Any:
+        """Compile cast_pattern so that `blocks` blocks fit on a multiprocessor."""
+        flags = (*options(self.engine._stack), f"-DBLOCKS={blocks}")
+        return self.cupy.RawModule(code=source(), options=flags).get_function("cast_pattern")
 
     def brute_force(self, directions: Float) -> dict[str, float]:
         """Time of every ray against every triangle, on so many rays that it takes a moment."""
@@ -223,14 +239,43 @@ class Bench:
         return {"rays": n, "ms": took["median"], "mrays_s": n / took["median"] / 1e3}
 
     def check(self, directions: Float) -> dict[str, int]:
-        """Rays of a sample whose distance or triangle differs from the numpy backend's."""
-        step = max(1, len(directions) // _SAMPLE)
-        sample = np.ascontiguousarray(directions[::step])
-        want = RayCaster(*self.mesh, backend="numpy").cast(self.origin, sample)
+        """Count rays of a sample that differ from the numpy backend's in any bit."""
+        sample = np.ascontiguousarray(directions[:: max(1, len(directions) // _SAMPLE)])
+        reference = RayCaster(*self.mesh, backend="numpy")
+        want = reference.cast(self.origin, sample)
         got = RayCaster(*self.mesh, backend="cuda").cast(self.origin, sample)
         names = ("distance", "triangle", "u", "v")
         wrong = {name: int((getattr(got, name) != getattr(want, name)).sum()) for name in names}
+        turn, _ = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))
+        scan = self.engine.scan(
+            Pattern(sample), (0, len(sample)), self.origin[None], turn, (0.0, np.inf)
+        )
+        turned = reference.scan(Pattern(sample), self.origin, turn)
+        wrong["scan"] = len(sample)
+        if np.array_equal(scan.ray, turned.ray):
+            wrong["scan"] = int((scan.distance != turned.distance).sum())
         return {"sample": len(sample), "hits": int(want.hit.sum()), **wrong}
+
+
+def leaks(rays: int) -> dict[str, int]:
+    """Count rays from inside a closed object, at its edges and corners, that hit nothing."""
+    vertices, faces = six_objects()
+    faces = faces[: len(faces) // 6]
+    vertices = vertices[: faces.max() + 1] + 5e5
+    caster = RayCaster(vertices, faces, backend="cuda")
+    inside = np.array([-20, -20, 1.5]) + 5e5
+    rng = np.random.default_rng(2)
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    escaped = done = 0
+    while done < rays:
+        count = min(1 << 20, rays - done)
+        ends = vertices[edges[rng.integers(len(edges), size=count)]]
+        part = np.clip(rng.uniform(-0.5, 1.5, (count, 1)), 0, 1)  # half of them at corners
+        origins = inside + 0.1 * rng.uniform(-1, 1, (count, 3))
+        directions = ends[:, 0] * (1 - part) + ends[:, 1] * part - origins
+        escaped += count - len(caster.returns(origins, directions))
+        done += count
+    return {"rays": done, "escaped": escaped}
 
 
 def attributes(module: Any) -> dict[str, dict[str, int]]:
@@ -245,7 +290,9 @@ def attributes(module: Any) -> dict[str, dict[str, int]]:
     return out
 
 
-def measure(cupy: Any, rays: int, triangles: list[int], repeats: int) -> dict[str, Any]:
+def measure(
+    cupy: Any, rays: int, triangles: list[int], repeats: int, leak_rays: int
+) -> dict[str, Any]:
     """All scenes, coherent and shuffled rays."""
     scenes: dict[str, tuple[Mesh, Float]] = {"six objects": (six_objects(), np.array([0, 0, 2.0]))}
     for count in triangles:
@@ -275,6 +322,7 @@ def measure(cupy: Any, rays: int, triangles: list[int], repeats: int) -> dict[st
         "numpy": np.__version__,
         "python": platform.python_version(),
         "kernels": attributes(bench.engine._module),
+        "leaks": leaks(leak_rays),
         "scenes": results,
     }
 
@@ -292,34 +340,40 @@ def show(row: dict[str, Any]) -> None:
             f"  scan to host {part['scan_to_host_mrays_s']:7.1f}"
             f"  hits {100 * part['hit_share']:.1f} %"
         )
+        for name, times in part["variants_ms"].items():
+            rate = part["rays"] / times["median"] / 1e3
+            print(f"    {name}: {rate:9.1f} Mray/s, {times['registers']} registers")
     print(f"  brute force: {row['brute_force']['mrays_s']:.3f} Mray/s")
     print(f"  differences from numpy: {row['differences']}")
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run from the command line; 1 when the device's answers differ, 2 without a device."""
+    """Run from the command line; 1 when the device's answers are wrong, 2 without a device."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--rays", type=int, default=1 << 22)
     parser.add_argument("--triangles", type=int, nargs="*", default=[100_000, 1_000_000])
     parser.add_argument("--repeats", type=int, default=21)
+    parser.add_argument("--leak-rays", type=int, default=10_000_000)
     parser.add_argument("--json", type=Path, help="write the results here")
-    options = parser.parse_args(arguments)
+    chosen = parser.parse_args(arguments)
     reason = available_backends()["cuda"]
     if reason:
         print(f"Nothing was measured: {reason}.", file=sys.stderr)
         return 2
     import cupy
 
-    results = measure(cupy, options.rays, options.triangles, options.repeats)
-    if options.json:
-        options.json.write_text(json.dumps(results, indent=1) + "\n")
+    results = measure(cupy, chosen.rays, chosen.triangles, chosen.repeats, chosen.leak_rays)
+    if chosen.json:
+        chosen.json.write_text(json.dumps(results, indent=1) + "\n")
     differ = any(
         row["differences"][name]
         for row in results["scenes"]
-        for name in ("distance", "triangle", "u", "v")
+        for name in ("distance", "triangle", "u", "v", "scan")
     )
+    print(f"{results['device']}, CuPy {results['cupy']}; kernels: {results['kernels']}")
+    print(f"rays at seams: {results['leaks']}")
     print("differences from numpy: " + ("yes" if differ else "none"))
-    return int(differ)
+    return int(differ or results["leaks"]["escaped"] > 0)
 
 
 if __name__ == "__main__":

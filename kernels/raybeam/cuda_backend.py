@@ -61,8 +61,9 @@ class CudaBackend(Backend):
             tables = (layout.nodes, layout.triangles, layout.corners, layout.faces, layout.frame)
             self._scene = tuple(cupy.asarray(table) for table in tables)
             self._corners, self._faces, self._frame = self._scene[2:]
-            stack = -(-max(layout.stack, 1) // _STACK_STEP) * _STACK_STEP
-            self._module = _module(cupy, self._device.id, stack)
+            # In steps, so that scenes share what is compiled.
+            self._stack = -(-max(layout.stack, 1) // _STACK_STEP) * _STACK_STEP
+            self._module = _module(cupy, self._device.id, self._stack)
         # {pattern: its directions on the device}
         self._patterns: WeakKeyDictionary[Pattern, Any] = WeakKeyDictionary()
 

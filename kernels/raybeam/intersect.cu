@@ -2,7 +2,8 @@
 //
 // Compiled by NVRTC, which has no standard headers, so there are none here; the tests compile the
 // same text for the CPU. One thread a ray, blocks of 128 threads, a grid of one dimension.
-// STACK (a number) is defined on the command line: places for nodes that wait their turn.
+// STACK (a number) is defined on the command line: places for nodes that wait their turn. BLOCKS
+// may be: blocks that must find room on a multiprocessor, which bounds the registers of a thread.
 //
 // All lengths are local: coordinates within [-1, 1], see mesh.py. layout.py makes the tables:
 //   nodes      8 float4 (one 128-byte line) a node: low x, y, z of four children, then high x, y,
@@ -24,6 +25,10 @@
 // Comparisons are written so that one with NaN is false, and false means "no hit".
 
 typedef long long Count;
+
+#ifndef BLOCKS
+#define BLOCKS 1
+#endif
 
 #define LEAF_BITS 3
 #define DONE ((int)0x80000000)
@@ -353,7 +358,7 @@ __device__ __forceinline__ Best closest(
 
 // Closest hits of rays from memory: local distance and place in the tables; -1 for a miss, whose
 // distance is not written.
-extern "C" __global__ void __launch_bounds__(128) cast_table(
+extern "C" __global__ void __launch_bounds__(128, BLOCKS) cast_table(
     const float4* __restrict__ nodes, const float4* __restrict__ triangles,
     const double* __restrict__ corners, const int* __restrict__ faces,
     const double* __restrict__ frame,
@@ -371,7 +376,7 @@ extern "C" __global__ void __launch_bounds__(128) cast_table(
 }
 
 // Closest hits of a pattern from one pose; the rest as in cast_table.
-extern "C" __global__ void __launch_bounds__(128) cast_pattern(
+extern "C" __global__ void __launch_bounds__(128, BLOCKS) cast_pattern(
     const float4* __restrict__ nodes, const float4* __restrict__ triangles,
     const double* __restrict__ corners, const int* __restrict__ faces,
     const double* __restrict__ frame,
