@@ -14,16 +14,16 @@ from pathlib import Path
 
 import numpy as np
 from distributed import Client
-from poolpart import local_cluster, placement_violations
 
 from lidarpool import Result, Scene, Sensor, Survey, simulate
 from lidarpool.mesh import Mesh
+from poolpart import local_cluster, placement_violations
 
 STAGES = ("generate", "intersect", "sort", "collect")
 
 
 def cube() -> Scene:
-    """A cube of 2 m, twelve triangles, around the sensor."""
+    """Make a cube of 2 m, twelve triangles, around the sensor."""
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     faces = [t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]

@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 from distributed import Client
-from poolpart import local_cluster
 
 from lidarpool import Cloud
+from poolpart import local_cluster
 
 
 @pytest.fixture(scope="module")

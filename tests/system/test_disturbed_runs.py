@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from distributed import Client
-from poolpart import placement_violations
 
 import lidarpool.scan.pump
 from lidarpool import Frame, LidarpoolError, Scene, Sensor, Survey, simulate
+from poolpart import placement_violations
 
 # Enough scans that the run is still under way when something happens to it.
 SURVEY = Survey(
@@ -48,9 +48,7 @@ def test_frames_come_in_order_and_every_scan_once(client, undisturbed, same_clou
 
 @pytest.mark.parametrize("partition", ["GPU", "LIDAR"])
 @pytest.mark.parametrize("at_scan", [0, 200, 650])
-def test_a_killed_worker_changes_nothing(
-    client, undisturbed, same_cloud, kill, partition, at_scan
-):
+def test_a_killed_worker_changes_nothing(client, undisturbed, same_cloud, kill, partition, at_scan):
     seen = []
 
     def on_frame(frame: Frame) -> None:

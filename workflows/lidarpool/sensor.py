@@ -66,21 +66,31 @@ class Sensor:
         for name, good, allowed in checks:
             if not good:
                 raise LidarpoolError(f"{name} is {getattr(self, name)}; it must be {allowed}.")
-        if self.rays_per_revolution * self.step_deg < 360:
+        if self._azimuths_per_step < 1:
             raise LidarpoolError(
                 f"step_deg {self.step_deg} is less than one azimuth "
                 f"({360 / self.rays_per_revolution:g} degrees), so some scans would be empty: "
                 "make step_deg or rays_per_revolution larger."
             )
 
+    @cached_property
+    def _azimuths_per_step(self) -> Fraction:
+        """How many azimuths the head passes in a time step, exactly.
+
+        Neither 0.1 nor 360/7 degrees is itself in binary. The nearest fraction with a
+        denominator of at most a million is what was meant, for decimals and for parts of a
+        turn; with it, the sectors of a revolution hold each azimuth once.
+        """
+        step = Fraction(self.step_deg).limit_denominator(1_000_000)
+        return step * self.rays_per_revolution / 360
+
     def sector(self, step: int) -> tuple[int, int]:
         """Azimuths fired in time step `step`: first, and one past the last.
 
-        Successive sectors meet without gap or overlap, whatever the numbers: the bounds are
-        worked out in exact fractions, since 0.1 degrees is not 0.1 in binary. After one
-        revolution the numbers go on past `rays_per_revolution`.
+        Successive sectors meet without gap or overlap, whatever the numbers. After one
+        revolution the azimuths go on past `rays_per_revolution`.
         """
-        per_step = Fraction(str(self.step_deg)) * self.rays_per_revolution / 360
+        per_step = self._azimuths_per_step
         return math.ceil(step * per_step), math.ceil((step + 1) * per_step)
 
     @cached_property

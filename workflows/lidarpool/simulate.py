@@ -11,6 +11,7 @@ import numpy as np
 from distributed import Client
 from distributed.comm.core import CommClosedError
 from numpy.typing import NDArray
+
 from poolpart import (
     Backoff,
     Partition,
@@ -272,7 +273,9 @@ class _Run:
         self.hits += frame.hits
         every = max(1, 4 * self.survey.scan_count // SAMPLE_RAYS)
         if frame.scan % every == 0 and len(frame.samples):
-            starts = np.broadcast_to(np.float32(frame.pose.position), frame.samples.shape)
+            starts = np.broadcast_to(
+                np.asarray(frame.pose.position, np.float32), frame.samples.shape
+            )
             self.samples.append(np.stack([starts, frame.samples], axis=1))
 
     def _progress(self, survey: SurveyPump, trials: TrialPump | None, seconds: float) -> Progress:

@@ -130,7 +130,7 @@ class Survey:
         return len(self.poses) * self.sensor.sector(self.steps - 1)[1] * self.sensor.layers
 
     def scan(self, index: int) -> ScanSpec:
-        """Description of scan `index`: pose `index // steps`, time step `index % steps`."""
+        """Describe scan `index`: pose `index // steps`, time step `index % steps`."""
         pose, step = divmod(index, self.steps)
         return ScanSpec(index, self.poses[pose], self.sensor.sector(step))
 

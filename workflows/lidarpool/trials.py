@@ -5,6 +5,7 @@ from __future__ import annotations
 import uuid
 
 from distributed import Client, Future
+
 from poolpart import Partition, TaskRecord, recorded
 
 from .errors import LidarpoolError

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+
 from poolpart import Ledger
 
 from ..cloud import Cloud
@@ -38,7 +39,7 @@ class CloudBuilder:
         return new
 
     def merge(self, precision_m: float, origin: NDArray[np.float64]) -> Cloud:
-        """The whole cloud, positions in float64.
+        """Put the whole cloud together, positions in float64.
 
         Parameters
         ----------

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import groupby
 
 import numpy as np
 from numpy.typing import NDArray
+
 from poolpart import Recorder, TaskRecord
 from raybeam import Returns
 
@@ -59,23 +59,20 @@ def intersect(setup: SurveySetup, wire: Sequence[Sequence[float]]) -> Batch:
 
 
 def frames_of(batch: Batch) -> tuple[tuple[Frame, ...], TaskRecord]:
-    """The frames of a batch with its record: a key of its own, so that stage 3 fetches no hits."""
+    """Take out the frames: a key of their own, so that stage 3 fetches no hits with them."""
     return batch.frames, batch.record
 
 
 def _same_pose(specs: Sequence[ScanSpec]) -> Iterator[tuple[Pose, list[ScanSpec]]]:
-    """Runs of scans from one pose whose azimuths follow on: they are cast in one go."""
-
-    def start_of_run(numbered: tuple[int, ScanSpec]) -> tuple[Pose, int]:
-        index, spec = numbered
-        nonlocal run
-        if index and specs[index - 1].azimuths[1] != spec.azimuths[0]:
-            run += 1
-        return spec.pose, run
-
-    run = 0
-    for (pose, _), group in groupby(enumerate(specs), start_of_run):
-        yield pose, [spec for _, spec in group]
+    """Find runs of scans from one pose whose azimuths follow on: they are cast in one go."""
+    run: list[ScanSpec] = []
+    for spec in specs:
+        if run and (spec.pose != run[-1].pose or spec.azimuths[0] != run[-1].azimuths[1]):
+            yield run[0].pose, run
+            run = []
+        run.append(spec)
+    if run:
+        yield run[0].pose, run
 
 
 def _by_scan(

@@ -17,15 +17,16 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from distributed import Client, Future
+
 from poolpart import Ledger, Partition, Pipe, TaskRecord, forget_pipes
 
 from ..errors import LidarpoolError
 from ..survey import Survey
-from .casting import frames_of, intersect
 from .builder import CloudBuilder
-from .messages import Delivery, Frame, FrameRun, Hello, Part
+from .casting import frames_of, intersect
+from .messages import Delivery, Frame, FrameRun, Hello
 from .setup import SurveySetup
-from .stage_names import COLLECT, GENERATE, GPU, INTERSECT, LIDAR, PARTITION_OF, SORT
+from .stage_names import COLLECT, GENERATE, GPU, INTERSECT, LIDAR, SORT
 from .stages import collect, generate, sort_frames
 
 BATCH_SECONDS = 0.05  # casting time that makes a batch worth its overhead
@@ -108,7 +109,9 @@ class SurveyPump:
             stage: pipe(stage, self._under_way_most + queue_capacity) for stage in (SORT, COLLECT)
         }
         self._deliveries = pipe("deliveries", DELIVERY_CAPACITY)
-        self._setup = partitions[GPU].submit(_make_setup, *setup.__reduce__()[1], key=self._key("scene"))
+        self._setup = partitions[GPU].submit(
+            _make_setup, *setup.__reduce__()[1], key=self._key("scene")
+        )
         self._stages = self._start_stages()
         self._prepared: dict[str, Future] = {}  # {address of a GPU worker: task that readies it}
         self._prepare_workers()
@@ -194,7 +197,9 @@ class SurveyPump:
         _raise_if_failed(self._setup, "preparing the scene on the GPU workers")
         for item in self._under_way:
             for future in (item.batch, item.frames):
-                _raise_if_failed(future, f"stage {INTERSECT}, scans {item.scans[0]} to {item.scans[-1]}")
+                _raise_if_failed(
+                    future, f"stage {INTERSECT}, scans {item.scans[0]} to {item.scans[-1]}"
+                )
 
     def _take_scans(self) -> bool:
         """Submit a stage-2 task for each item of stage 1, as far as the credit goes."""
@@ -282,7 +287,7 @@ class SurveyPump:
     # -- sending again -----------------------------------------------------------------
 
     def _greet(self, stage: str) -> None:
-        """A consumer has started. Once each is expected; more means that one had died."""
+        """Note that a consumer has started; one time more than there are means that one had died."""
         self._greeted[stage] += 1
         if self._greeted[stage] > self._consumers[stage]:
             self._send_again(stage)

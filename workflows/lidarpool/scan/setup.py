@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from distributed import get_worker
 from numpy.typing import NDArray
+
 from raybeam import Pattern, RayCaster, Returns
 
 from ..scene import Scene
@@ -99,8 +100,10 @@ class SurveySetup:
         )
 
 
-def ray_directions(sensor: Sensor, spec: ScanSpec, rays: NDArray[np.integer]) -> NDArray[np.float64]:
-    """Unit directions of some rays of a scan in the scene's axes: (len(rays), 3)."""
+def ray_directions(
+    sensor: Sensor, spec: ScanSpec, rays: NDArray[np.integer]
+) -> NDArray[np.float64]:
+    """Look up unit directions of some rays of a scan in the scene's axes: (len(rays), 3)."""
     azimuth, ring = np.divmod(rays.astype(np.int64), sensor.layers)
     azimuth += spec.azimuths[0]
     azimuth %= sensor.rays_per_revolution

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from distributed import Client, get_client, secede
+
 from poolpart import Backoff, Pipe, PipeClosed, PipeFailed, Recorder, TaskRecord
 from poolpart.fetch import fetch_available
 
@@ -112,7 +113,7 @@ def points_of(sensor: Sensor, spec: ScanSpec, hits: np.ndarray, precision_m: flo
 
 
 def _arrivals(inlet: Pipe) -> Iterator[tuple[int, list[Any]]]:
-    """What comes through a pipe of the driver: (base, results), until the pipe is closed.
+    """Fetch what a pipe of the driver names: (base, results), until the pipe is closed.
 
     The items carry keys, not futures: the driver holds the futures until the scans have
     arrived. `base` is the first scan that had not reached the driver when the item was put.

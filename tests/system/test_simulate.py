@@ -1,0 +1,149 @@
+"""What a survey gives, against what it must give by geometry."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from distributed import Client, Scheduler, SpecCluster, Worker
+
+from lidarpool import LidarpoolError, Planning, Pose, Scene, Sensor, Survey, simulate
+from lidarpool.mesh import Mesh
+
+
+@pytest.fixture(scope="module")
+def client():
+    """A cluster in this process: LIDAR has one thread and four slots."""
+    kinds = {"GPU": (1, 1), "LIDAR": (1, 4), "OTHER": (1, 1)}
+    workers = {
+        name: {
+            "cls": Worker,
+            "options": {"nthreads": threads, "resources": {name: slots}, "dashboard_address": ":0"},
+        }
+        for name, (threads, slots) in kinds.items()
+    }
+    scheduler = {"cls": Scheduler, "options": {"host": "127.0.0.1", "port": 0, "dashboard": False}}
+    with SpecCluster(workers=workers, scheduler=scheduler) as cluster, Client(cluster) as client:
+        yield client
+
+
+def room(offset=(0.0, 0.0, 0.0)) -> Scene:
+    """A closed room of 10 by 8 by 6 metres around the offset, each side an object."""
+    low, high = np.array([-5.0, -4.0, -3.0]), np.array([5.0, 4.0, 3.0])
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+    corners = low + corners * (high - low) + offset
+    quads = {
+        "west": (0, 1, 3, 2),
+        "east": (4, 6, 7, 5),
+        "south": (0, 4, 5, 1),
+        "north": (2, 3, 7, 6),
+        "floor": (0, 2, 6, 4),
+        "ceiling": (1, 5, 7, 3),
+    }
+    return Scene.from_meshes(
+        Mesh(name, corners, np.array([[a, b, c], [a, c, d]]))
+        for name, (a, b, c, d) in quads.items()
+    )
+
+
+SENSOR = Sensor(rays_per_revolution=90, layers=8, vertical_fov_deg=80, step_deg=7)
+
+
+def test_every_ray_from_within_a_closed_room_hits_its_sides(client):
+    survey = Survey(SENSOR, poses=[(1, 1, 0), (-2, 0.5, 1)], steps=60, keep_every=1)
+    result = simulate(room(), survey, client=client)
+    cloud = result.cloud
+    assert result.hits == result.rays == survey.ray_count == len(cloud)
+    inside = np.abs(cloud.positions) <= [5.005, 4.005, 3.005]
+    assert inside.all()
+    axis, side = {0: (0, -5), 1: (0, 5), 2: (1, -4), 3: (1, 4), 4: (2, -3), 5: (2, 3)}, cloud.object
+    for number, (k, value) in axis.items():
+        assert np.abs(cloud.positions[side == number, k] - value).max() <= 0.005 + 1e-9
+    # 60 steps of 7 degrees are more than one revolution, so sectors wrap around.
+    rays = np.concatenate(
+        [np.arange(spec.ray_count(SENSOR)) % SENSOR.layers for spec in survey.scans()]
+    )
+    assert np.array_equal(cloud.ring, rays)
+
+
+def test_keep_every_takes_every_nth_hit_of_each_scan(client):
+    poses = [(1, 1, 0)]
+    full = simulate(room(), Survey(SENSOR, poses, 10, keep_every=1), client=client).cloud
+    thin = simulate(room(), Survey(SENSOR, poses, 10, keep_every=7), client=client).cloud
+    for scan in range(10):
+        assert np.array_equal(
+            thin.positions[thin.scan == scan], full.positions[full.scan == scan][::7]
+        )
+
+
+def test_a_turned_sensor_sees_the_turned_directions(client):
+    """In a sphere-like room a yaw of one azimuth step moves the points by one azimuth."""
+    azimuth = 360 / SENSOR.rays_per_revolution
+    sensor = Sensor(rays_per_revolution=90, layers=8, vertical_fov_deg=80, step_deg=360)
+    straight, turned = (
+        simulate(
+            room(), Survey(sensor, [Pose((1, 1, 0), yaw)], 1, keep_every=1), client=client
+        ).cloud.positions.reshape(90, 8, 3)
+        for yaw in (0, azimuth)
+    )
+    assert np.abs(np.roll(straight, -1, axis=0) - turned).max() <= 0.01 + 1e-9
+
+
+def test_ranges_bound_what_is_seen(client):
+    sensor = Sensor(
+        rays_per_revolution=90, layers=8, vertical_fov_deg=80, step_deg=7, max_range_m=4.5
+    )
+    cloud = simulate(room(), Survey(sensor, [(0, 0, 0)], 52, keep_every=1), client=client).cloud
+    assert 0 < len(cloud) < 90 * 8
+    assert np.linalg.norm(cloud.positions, axis=1).max() <= 4.51
+
+
+def test_a_survey_that_sees_nothing_gives_an_empty_cloud(client):
+    result = simulate(room(), Survey(SENSOR, [(100, 100, 100)], 5), client=client)
+    assert result.hits == len(result.cloud) == 0
+    assert result.hit_counts.sum() == 0
+    assert result.sample_rays.shape == (0, 2, 3)
+
+
+def test_far_from_zero_the_cloud_is_in_world_coordinates(client):
+    near = Survey(SENSOR, [(1, 1, 0)], 10, keep_every=1)
+    there = np.array([500_000.25, 4_000_000.5, 100.0])
+    scene = room(there)
+    local = tuple(there + np.array([1, 1, 0]) - scene.origin)
+    here = simulate(room(), near, client=client).cloud
+    far = simulate(scene, Survey(SENSOR, [local], 10, keep_every=1), client=client).cloud
+    assert np.array_equal(far.ring, here.ring)
+    assert np.abs(far.positions - there - here.positions).max() <= 0.0101
+
+
+@pytest.mark.parametrize("capacity", [1, 3])
+def test_the_queue_capacity_changes_nothing_in_the_cloud(client, capacity):
+    survey = Survey(SENSOR, [(1, 1, 0)], 40)
+    usual = simulate(room(), survey, client=client).cloud
+    narrow = simulate(room(), survey, client=client, queue_capacity=capacity, collectors=1).cloud
+    assert np.array_equal(usual.positions, narrow.positions)
+
+
+def test_planning_runs_beside_the_survey(client):
+    planning = Planning((25, 25), (-30, -20), [(0, 0)], 2.0, trials=5, particles=50, iterations=20)
+    progress = []
+    result = simulate(
+        room(), Survey(SENSOR, [(0, 0, 0)], 5), planning, client=client, on_progress=progress.append
+    )
+    assert [trial.trial for trial in result.trials] == list(range(5))
+    assert result.plan.collision_free
+    assert progress[-1].trials_done == 5
+    assert progress[-1].collected == progress[-1].framed == progress[-1].generated == 5
+    again = simulate(room(), Survey(SENSOR, [(0, 0, 0)], 5), planning, client=client)
+    assert np.array_equal(again.plan.path, result.plan.path)
+
+
+def test_a_precision_too_fine_for_the_scene_is_refused(client):
+    with pytest.raises(LidarpoolError, match="precision_m 1e-06 is too fine"):
+        simulate(
+            room((3000.0, 0, 0)), Survey(SENSOR, [(0, 0, 0)], 5, precision_m=1e-6), client=client
+        )
+
+
+def test_too_few_slots_are_told_before_anything_runs(client):
+    with pytest.raises(LidarpoolError, match="Partition 'LIDAR' has 4 of the 7 slots"):
+        simulate(room(), Survey(SENSOR, [(0, 0, 0)], 5), client=client, collectors=5)
