@@ -6,10 +6,12 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from distributed import Client
+
 from poolpart import Pool, PoolError, WorkerInfo
-from raybeam import BackendUnavailable, available_backends
+from raybeam import available_backends
 
 from ._version import __version__
+from .complaints import did_you_mean
 from .errors import LidarpoolError
 from .scan import COLLECT, GENERATE, GPU, LIDAR, OTHER, SORT
 from .scene import Scene
@@ -85,8 +87,7 @@ def common_backend(client: Client, wanted: str, workers: Sequence[WorkerInfo]) -
     names = list(next(iter(answers.values())))
     if wanted == "auto":
         return next(n for n in names if not any(reasons[n] for reasons in answers.values()))
-    if wanted not in names:
-        raise LidarpoolError(f"There is no backend {wanted!r}: use auto, {', '.join(names)}.")
+    check_backend_name(wanted)
     for address, reasons in answers.items():
         if reasons[wanted]:
             raise LidarpoolError(
@@ -96,16 +97,22 @@ def common_backend(client: Client, wanted: str, workers: Sequence[WorkerInfo]) -
     return wanted
 
 
+def check_backend_name(wanted: str) -> None:
+    """Refuse a backend that there is nowhere."""
+    names = ("auto", *available_backends())
+    if wanted not in names:
+        hint = did_you_mean(wanted, names) or f" There are {', '.join(names)}."
+        raise LidarpoolError(f"There is no backend {wanted!r}.{hint}")
+
+
 def check_backend_here(wanted: str) -> None:
     """Refuse a backend that this machine lacks, before a local cluster is started for it."""
-    reasons = available_backends()
-    if wanted != "auto" and wanted not in reasons:
-        raise LidarpoolError(f"There is no backend {wanted!r}: use auto, {', '.join(reasons)}.")
-    if reasons.get(wanted):
-        raise LidarpoolError(str(BackendUnavailable(
-            f"Backend {wanted!r} cannot be used here: {reasons[wanted]}. "
-            "Backend 'auto' takes what works."
-        )))
+    check_backend_name(wanted)
+    reason = available_backends().get(wanted)
+    if reason:
+        raise LidarpoolError(
+            f"Backend {wanted!r} cannot be used here: {reason}. Backend 'auto' takes what works."
+        )
 
 
 def check_precision(scene: Scene, survey: Survey) -> None:

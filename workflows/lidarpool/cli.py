@@ -3,27 +3,31 @@
 from __future__ import annotations
 
 import logging
-import signal
+import math
+import os
 import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import click
 from distributed import Client
-from poolpart import Pool, PoolError
+
+from poolpart import Pool, PoolError, local_cluster
 from raybeam import available_backends
 
 from ._version import __version__
+from .checks import check_backend_here, check_backend_name, check_precision
 from .complaints import did_you_mean
 from .errors import LidarpoolError
-from .output import prepare_folder, write_result
-from .plan import Planning
+from .interrupts import INTERRUPTED, children_spared, deferred_interrupts, interrupt_on_signals
 from .report import versions
 from .scenario import Scenario
 from .scene import Scene
 from .simulate import Result, simulate
 from .survey import Survey
-from .terminal import shown_progress
+from .terminal import shown_progress, shown_status
 
 CONNECT_TIMEOUT_S = 10
 
@@ -61,7 +65,7 @@ def cli() -> None:
 @_out
 @_quiet
 def demo(out: Path, quiet: bool) -> None:
-    """Run the default survey and path planning on a cluster on this machine.
+    r"""Run the default survey and path planning on a cluster on this machine.
 
     \b
     Examples:
@@ -83,9 +87,14 @@ def demo(out: Path, quiet: bool) -> None:
 @click.option("--no-plan", is_flag=True, help="Leave the path planning out.")
 @_quiet
 def run(
-    scenario: Path, out: Path, scheduler: str | None, backend: str | None, no_plan: bool, quiet: bool
+    scenario: Path,
+    out: Path,
+    scheduler: str | None,
+    backend: str | None,
+    no_plan: bool,
+    quiet: bool,
 ) -> None:
-    """Run a survey from a scenario file, or of a mesh file from its middle.
+    r"""Run a survey from a scenario file, or of a mesh file from its middle.
 
     \b
     Examples:
@@ -103,35 +112,37 @@ def _run(
     no_plan: bool = False,
     quiet: bool = False,
 ) -> None:
+    # Matplotlib is a third of the time that --help would take.
+    from .output import result_folder, write_result
+
+    backend = backend or scenario.pool.backend
+    (check_backend_name if scheduler else check_backend_here)(backend)
     scene = scenario.build_scene()
     survey = scenario.survey(scene)
     planning = None if no_plan else scenario.plan(scene)
-    prepare_folder(out)
-    client = _connect(scheduler) if scheduler else None
-    try:
-        with shown_progress(quiet) as show:
+    check_precision(scene, survey)
+    pool = scenario.pool
+    with result_folder(out):
+        with (
+            _connected(scheduler) if scheduler else _local_client(scenario, quiet) as client,
+            shown_progress(quiet) as show,
+        ):
             result = simulate(
                 scene,
                 survey,
                 planning,
                 client=client,
-                backend=backend or scenario.pool.backend,
+                backend=backend,
                 on_progress=show,
-                queue_capacity=scenario.pool.queue_capacity,
-                collectors=scenario.pool.collectors,
-                gpu_workers=scenario.pool.gpu,
-                other_workers=scenario.pool.other,
+                queue_capacity=pool.queue_capacity,
+                collectors=pool.collectors,
             )
-    finally:
-        if client is not None:
-            client.close()
-    write_result(out, result, scene, survey, planning)
-    _tell(out, result, scene, survey, planning)
+        with shown_status("writing the cloud, the pictures and the report", quiet):
+            report = write_result(out, result, scene, survey, planning)
+    _tell(out, result, scene, survey, report["files"])
 
 
-def _tell(
-    out: Path, result: Result, scene: Scene, survey: Survey, planning: Planning | None
-) -> None:
+def _tell(out: Path, result: Result, scene: Scene, survey: Survey, files: list[str]) -> None:
     for note in result.notes:
         click.echo(f"note: {note}")
     click.echo(
@@ -139,20 +150,26 @@ def _tell(
         f"{len(scene.names):,} objects, {len(result.cloud):,} points in the cloud "
         f"({result.backend}, {result.survey_seconds:.1f} s)"
     )
-    if result.plan is not None and planning is not None:
+    if result.plan is not None:
         plan = result.plan
-        free = "free of collisions" if plan.collision_free else "NOT free of collisions"
-        click.echo(
-            f"path of {plan.length:.2f} m, {free}, shortest possible {plan.shortest_possible:.2f} m "
-            f"({plan.trials} trials, {result.planning_seconds:.1f} s)"
+        found = (
+            f"path of {plan.length:.2f} m, free of collisions"
+            if plan.collision_free
+            else "no path free of collisions was found"
         )
-    click.echo(f"results in {out}: open cloud.ply in any point-cloud viewer, the .png, report.json")
+        possible = (
+            f"the shortest possible is {plan.shortest_possible:.2f} m"
+            if math.isfinite(plan.shortest_possible)
+            else "none is possible, the obstacles leave no way"
+        )
+        click.echo(f"{found}; {possible} ({plan.trials} trials, {result.planning_seconds:.1f} s)")
+    click.echo(f"results in {click.format_filename(out)}: {', '.join(files)}")
 
 
 @cli.command()
 @click.option("--scheduler", metavar="ADDRESS", help="Also show the workers of this cluster.")
 def info(scheduler: str | None) -> None:
-    """Show versions, ray-casting backends, GPUs and the workers by partition.
+    r"""Show versions, ray-casting backends, GPUs and the workers by partition.
 
     \b
     Examples:
@@ -166,13 +183,8 @@ def info(scheduler: str | None) -> None:
         click.echo(f"  {name:<12} {reason or 'ready'}")
     if scheduler is None:
         return
-    client = _connect(scheduler)
-    try:
+    with _connected(scheduler) as client:
         pool = Pool.from_client(client)
-    except PoolError as error:
-        raise LidarpoolError(str(error)) from error
-    finally:
-        client.close()
     click.echo(f"{pool!r}")
     for worker in sorted(pool, key=lambda worker: (sorted(worker.resources), worker.name)):
         held = ", ".join(f"{name}={slots:g}" for name, slots in sorted(worker.resources.items()))
@@ -182,35 +194,61 @@ def info(scheduler: str | None) -> None:
         )
 
 
-def _connect(scheduler: str) -> Client:
+@contextmanager
+def _connected(scheduler: str) -> Iterator[Client]:
+    """Client of a cluster that is running already."""
     try:
-        return Client(scheduler, timeout=CONNECT_TIMEOUT_S, set_as_default=False)
-    except (OSError, ValueError, RuntimeError) as error:
+        client = Client(scheduler, timeout=CONNECT_TIMEOUT_S, set_as_default=False)
+    except (OSError, ValueError, RuntimeError, TypeError, ImportError) as error:
         raise LidarpoolError(
             f"No Dask scheduler answers at {scheduler!r} ({type(error).__name__}): start one with "
             "dask scheduler, and give its address as tcp://host:8786."
         ) from error
+    with client:
+        yield client
 
 
-def _interrupt(*_: Any) -> NoReturn:
-    raise KeyboardInterrupt
+@contextmanager
+def _local_client(scenario: Scenario, quiet: bool) -> Iterator[Client]:
+    """Client of a cluster on this machine that lasts as long as the body."""
+    with ExitStack() as stack:
+        # Half a cluster cannot be stopped in good order: an interrupt has to wait until it is up.
+        with (
+            shown_status("starting the workers", quiet),
+            deferred_interrupts(),
+            children_spared(),
+        ):
+            cluster = local_cluster(
+                gpu_workers=scenario.pool.gpu,
+                lidar_slots=2 + scenario.pool.collectors,
+                other_workers=scenario.pool.other,
+            )
+            stack.callback(cluster.close)
+            client = stack.enter_context(Client(cluster, set_as_default=False))
+        yield client
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:
     """Run the command and exit: 0 done, 2 for what the user can put right, 130 interrupted."""
-    signal.signal(signal.SIGTERM, _interrupt)  # what a job manager sends; end as after Ctrl-C
+    interrupt_on_signals()
     for name in ("distributed", "poolpart"):  # their warnings are told in the result's notes
-        logging.getLogger(name).setLevel(logging.ERROR)
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
     try:
         cli.main(args=arguments, prog_name="lidarpool", standalone_mode=False)
-    except LidarpoolError as error:
+        sys.stdout.flush()
+    except (LidarpoolError, PoolError) as error:
         _die(str(error), 2)
     except click.UsageError as error:
         _die(error.format_message(), 2)
     except (KeyboardInterrupt, click.Abort):
-        _die("interrupted; everything was stopped, and the output folder is as it was.", 130)
+        _die(
+            "interrupted; everything was stopped, and the output folder is as it was.", INTERRUPTED
+        )
     except MemoryError:
         _die("not enough memory: take a smaller scene, fewer scans or a larger keep_every.", 2)
+    except BrokenPipeError:  # whoever read the output has enough of it, as `head` may
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     sys.exit(0)
 
 

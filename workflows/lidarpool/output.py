@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import secrets
 import shutil
+import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from .errors import LidarpoolError
+from .interrupts import deferred_interrupts
 from .plan import Planning
 from .ply import write_cloud
 from .report import make_report
@@ -21,33 +26,46 @@ from .simulate import Result
 from .survey import Survey
 from .view import draw_cloud, draw_intensity, draw_path, draw_scene, take_shot
 
+if sys.platform != "win32":
+    import fcntl
+
 ROOM_BYTES = 32 << 20  # what pictures and report may take; the cloud is checked when it is known
 
+REPORT = "report.json"
+FILES = ("cloud.ply", "scene.png", "intensity.png", "cloud.png", "path.png", REPORT)
 
-def prepare_folder(folder: Path) -> None:
-    """Make sure, before anything runs, that a result can be written there.
+# Folders within the output folder: a result being made, and one that is whole and on its way
+# into place. A run that was killed leaves one behind; the next run removes or finishes it.
+_WRITING, _COMPLETE = ".writing-", ".complete-"
+
+
+@contextmanager
+def result_folder(folder: Path) -> Iterator[None]:
+    """Claim a folder for a result: made if it is not there, writable, ours alone.
+
+    If the body ends without a result, folders that were made for it are removed again.
 
     Raises
     ------
     LidarpoolError
-        If it is a file, cannot be made or written to, or its disk is nearly full.
+        If it is a file, cannot be made or written to, another run uses it, or its disk is
+        nearly full.
     """
-    if folder.exists() and not folder.is_dir():
-        raise LidarpoolError(f"{folder} is a file: give a folder for the results with --out.")
+    made = [path for path in (folder, *folder.parents) if not path.exists()]  # innermost first
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-        free = shutil.disk_usage(folder).free
-    except OSError as error:
-        raise LidarpoolError(
-            f"Cannot write to the folder {folder} ({error.strerror}): give another with --out."
-        ) from error
-    if free < ROOM_BYTES:
-        raise LidarpoolError(
-            f"The disk of {folder} has {free / 1e6:.1f} MB free and a result needs at least "
-            f"{ROOM_BYTES / 1e6:.0f} MB: make room, or give another folder with --out."
-        )
+        lock = _claim(folder)
+        try:
+            _clear_up(folder)
+            _check_room(folder)
+            yield
+        finally:
+            os.close(lock)
+    finally:
+        for path in made:
+            if path.exists():
+                if any(path.iterdir()):
+                    break
+                path.rmdir()
 
 
 def write_result(
@@ -56,60 +74,153 @@ def write_result(
     """Write cloud, pictures and report, and return the report.
 
     They are made in a temporary folder within `folder` and moved into place together once
-    all are there, so that an earlier result stays whole if one cannot be written.
+    all are there and on the disk, so that an earlier result stays whole if one cannot be
+    written. A picture that an earlier run made and this one does not is removed.
 
     Raises
     ------
     LidarpoolError
         If a file cannot be written.
     """
-    makers: dict[str, Callable[[Path], object]] = {
-        "cloud.ply": lambda path: write_cloud(
-            path,
-            result.cloud.positions,
-            result.cloud.scan,
-            result.cloud.ring,
-            result.cloud.object,
-            precision_m=survey.precision_m,
-        ),
-        **_pictures(result, scene, survey, planning),
-    }
-    names = [*makers, "report.json"]
-    report = make_report(result, scene, survey, planning, names)
-    makers["report.json"] = lambda path: path.write_text(
-        json.dumps(report, indent=1, allow_nan=False) + "\n", encoding="utf-8"
-    )
+    makers = _makers(result, scene, survey, planning)
+    report = make_report(result, scene, survey, planning, [*makers, REPORT])
+    text = json.dumps(report, indent=1, allow_nan=False) + "\n"
+    makers[REPORT] = lambda path: path.write_text(text, encoding="utf-8")
+    staged = folder / f"{_WRITING}{secrets.token_hex(4)}"
     try:
-        with tempfile.TemporaryDirectory(prefix=".writing-", dir=folder) as made:
+        try:
+            staged.mkdir()
             for name, make in makers.items():
-                make(Path(made, name))
-            for name in makers:
-                os.replace(Path(made, name), folder / name)  # noqa: PTH105 - atomic by contract
-        if planning is None:  # a path of an earlier run would pass for this one's
-            (folder / "path.png").unlink(missing_ok=True)
+                make(staged / name)
+                _flush(staged / name)
+            with deferred_interrupts():
+                whole = staged.rename(folder / f"{_COMPLETE}{secrets.token_hex(4)}")
+                _publish(whole, folder)
+        finally:
+            shutil.rmtree(staged, ignore_errors=True)  # it is gone already if all went well
+    except LidarpoolError as error:  # names the file; its temporary folder is nobody's business
+        raise LidarpoolError(str(error).replace(str(staged), str(folder))) from error
     except OSError as error:
         raise LidarpoolError(
             f"The result cannot be written to {folder} ({error.strerror or error}): make room or "
-            "give another folder with --out. What was there before is as it was."
+            "give another folder with --out."
         ) from error
     return report
 
 
-def _pictures(
+def _makers(
     result: Result, scene: Scene, survey: Survey, planning: Planning | None
 ) -> dict[str, Callable[[Path], object]]:
+    """Functions that write each file but the report."""
     poses = np.array([pose.position for pose in survey.poses]) + scene.origin
     shot = take_shot(scene, poses)
+    cloud = result.cloud
     makers: dict[str, Callable[[Path], object]] = {
+        "cloud.ply": lambda path: write_cloud(
+            path,
+            cloud.positions,
+            cloud.scan,
+            cloud.ring,
+            cloud.object,
+            precision_m=survey.precision_m,
+        ),
         "scene.png": lambda path: draw_scene(path, scene, poses, shot=shot),
         "intensity.png": lambda path: draw_intensity(
             path, scene, result.hit_counts, poses, result.sample_rays + scene.origin, shot=shot
         ),
-        "cloud.png": lambda path: draw_cloud(
-            path, result.cloud.positions, poses, scene=scene, shot=shot
-        ),
+        "cloud.png": lambda path: draw_cloud(path, cloud.positions, poses, scene=scene, shot=shot),
     }
     if planning is not None and result.plan is not None:
         plan = result.plan
         makers["path.png"] = lambda path: draw_path(path, planning, plan, result.trials)
     return makers
+
+
+def _publish(whole: Path, folder: Path) -> None:
+    """Move a whole result into place; called again after a crash, it does the rest.
+
+    The report goes last: as long as it is in `whole`, it says what belongs to the result.
+    """
+    files = json.loads((whole / REPORT).read_text(encoding="utf-8"))["files"]
+    for name in FILES:
+        if name not in files:  # a path of an earlier run would pass for this one's
+            (folder / name).unlink(missing_ok=True)
+        elif (whole / name).exists():
+            (whole / name).replace(folder / name)
+    whole.rmdir()
+    _flush(folder)
+
+
+def _claim(folder: Path) -> int:
+    """Make a folder if need be and lock it; returns the handle that holds the lock."""
+    if folder.exists() and not folder.is_dir():
+        raise LidarpoolError(f"{folder} is a file: give a folder for the results with --out.")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder) as file:
+            return _lock(folder, file.fileno())
+    except BlockingIOError as error:
+        raise LidarpoolError(
+            f"Another run is using the folder {folder}: wait for it, or give another with --out."
+        ) from error
+    except OSError as error:
+        raise LidarpoolError(
+            f"Cannot write to the folder {folder} ({error.strerror}): give another with --out."
+        ) from error
+
+
+def _lock(folder: Path, spare: int) -> int:
+    """Lock a folder until the handle that is returned is closed, or this process ends."""
+    if sys.platform == "win32":  # has no locks on folders
+        return os.dup(spare)
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP):  # a network disk without locks
+            os.close(handle)
+            raise
+    return handle
+
+
+def _clear_up(folder: Path) -> None:
+    """Finish or remove what a killed run left, and refuse folders where files are to go."""
+    for name in FILES:
+        if (folder / name).is_dir():
+            raise LidarpoolError(
+                f"{folder / name} is a folder, and a result has a file of that name: "
+                "give another folder with --out."
+            )
+    try:
+        for whole in folder.glob(f"{_COMPLETE}*"):
+            if (whole / REPORT).exists():
+                _publish(whole, folder)
+            else:
+                whole.rmdir()
+        for staged in folder.glob(f"{_WRITING}*"):
+            shutil.rmtree(staged)
+    except OSError as error:
+        raise LidarpoolError(
+            f"{folder} holds what a killed run left, and it cannot be cleared up ({error}): "
+            f"remove its {_WRITING}* and {_COMPLETE}*, or give another folder with --out."
+        ) from error
+
+
+def _check_room(folder: Path) -> None:
+    free = shutil.disk_usage(folder).free
+    if free < ROOM_BYTES:
+        raise LidarpoolError(
+            f"The disk of {folder} has {free / 1e6:.1f} MB free and a result needs at least "
+            f"{ROOM_BYTES / 1e6:.0f} MB: make room, or give another folder with --out."
+        )
+
+
+def _flush(path: Path) -> None:
+    """Wait until the file or folder is on the disk."""
+    if sys.platform == "win32" and path.is_dir():
+        return  # Windows has no handle of a folder to flush
+    handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -10,18 +10,30 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import numpy as np
+
 from poolpart import TaskRecord, placement_violations
 
 from ._version import __version__
 from .plan import Planning
-from .scan import INTERSECT
+from .scan import COLLECT, GENERATE, INTERSECT, SORT
 from .scene import Scene
 from .simulate import Result
 from .survey import Survey
 from .trials import TRIAL
 
-_PACKAGES = ("numpy", "dask", "distributed", "trimesh", "open3d-cpu", "open3d", "matplotlib")
-_PACKAGES += ("cupy-cuda12x", "cupy-cuda13x")
+_ORDER = (GENERATE, INTERSECT, SORT, COLLECT, TRIAL)  # in which stages are listed
+
+_PACKAGES = (
+    "numpy",
+    "dask",
+    "distributed",
+    "trimesh",
+    "open3d-cpu",
+    "open3d",
+    "matplotlib",
+    "cupy-cuda12x",
+    "cupy-cuda13x",
+)
 
 
 def versions() -> dict[str, str]:
@@ -98,7 +110,7 @@ def _points_by_object(result: Result, scene: Scene) -> dict[str, int]:
 
 def _stages(records: Iterable[TaskRecord]) -> dict[str, dict[str, Any]]:
     """For each stage: tasks, items, seconds of work, and the span from first start to last stop."""
-    stages: dict[str, list[TaskRecord]] = {}
+    stages: dict[str, list[TaskRecord]] = {stage: [] for stage in _ORDER}
     for record in records:
         stages.setdefault(record.stage, []).append(record)
     return {
@@ -111,6 +123,7 @@ def _stages(records: Iterable[TaskRecord]) -> dict[str, dict[str, Any]]:
             "workers": sorted({record.worker for record in group}),
         }
         for stage, group in stages.items()
+        if group
     }
 
 
@@ -130,9 +143,7 @@ def overlap_seconds(records: Sequence[TaskRecord]) -> float:
         [(r.start, r.stop) for r in records if r.stage == stage] for stage in (INTERSECT, TRIAL)
     ]
     casting, planning = ([*_union(span)] for span in spans)
-    return sum(
-        max(0.0, min(a[1], b[1]) - max(a[0], b[0])) for a in casting for b in planning
-    )
+    return sum(max(0.0, min(a[1], b[1]) - max(a[0], b[0])) for a in casting for b in planning)
 
 
 def _union(spans: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:

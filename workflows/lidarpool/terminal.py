@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import sys
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from typing import TextIO
 
 from rich.console import Console
 from rich.progress import (
@@ -13,7 +15,6 @@ from rich.progress import (
     MofNCompleteColumn,
     TaskID,
     TextColumn,
-    TimeRemainingColumn,
 )
 from rich.progress import Progress as Bars
 from rich.progress import Task as Bar
@@ -21,16 +22,152 @@ from rich.text import Text
 
 from .progress import Progress
 
-PLAIN_EVERY_S = 2.0
+# Plain lines come as a tenth of the time has passed again, within these bounds: a survey of
+# hours should not fill a log.
+PLAIN_EVERY_S = (2.0, 60.0)
+WINDOW_S = 10.0  # that rates are taken over
 
-# Label, the count so far and the total of each line.
-_LINES: tuple[tuple[str, str, str], ...] = (
+# Label, the count so far and the total of each bar.
+_BARS: tuple[tuple[str, str, str], ...] = (
     ("1 generate", "generated", "scans"),
     ("2 intersect", "cast", "scans"),
     ("3 sort frames", "framed", "scans"),
     ("4 collect", "collected", "scans"),
     ("plan path", "trials_done", "trials"),
 )
+
+Show = Callable[[Progress], None]
+
+
+@contextmanager
+def shown_progress(quiet: bool = False) -> Iterator[Show]:
+    """Show progress on stderr while the body runs; gives the function to call with it.
+
+    Bars by stage with rates and time left on a terminal, else now and then a line for the
+    survey and one for the planning.
+    """
+    if quiet or sys.stderr is None:
+        yield lambda progress: None
+    elif (console := _terminal()) is not None:
+        with _bars(console) as show:
+            yield show
+    else:
+        yield PlainLines(sys.stderr)
+
+
+@contextmanager
+def shown_status(text: str, quiet: bool = False) -> Iterator[None]:
+    """Say on stderr what is going on while the body runs."""
+    if quiet or sys.stderr is None:
+        yield
+    elif (console := _terminal()) is not None:
+        with console.status(text):
+            yield
+    else:
+        _tell(sys.stderr, text)
+        yield
+
+
+def _terminal() -> Console | None:
+    """Console of a terminal that can move its cursor; None where lines are all there is."""
+    console = Console(stderr=True)
+    return console if console.is_terminal and not console.is_dumb_terminal else None
+
+
+class PlainLines:
+    """Progress as lines of text; call it with each `Progress`.
+
+    Parameters
+    ----------
+    stream
+        Where to write.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self.stream = stream
+        self._next = 0.0  # seconds since the start at which to tell again
+        self._survey, self._planning = _Pace(), _Pace()
+        self._done: set[str] = set()
+
+    def __call__(self, progress: Progress) -> None:
+        """Write what is new, if it is time or something has been completed."""
+        now = progress.seconds
+        self._survey.add(now, progress.collected)
+        self._planning.add(now, progress.trials_done)
+        due = now >= self._next
+        if due:
+            least, most = PLAIN_EVERY_S
+            self._next = now + min(max(least, now / 10), most)
+        self._line(
+            "survey",
+            due,
+            f"{progress.scans:,} scans, {progress.points:,} points in {now:.1f} s",
+            f"{progress.collected:,} of {progress.scans:,} scans (generated "
+            f"{progress.generated:,}, cast {progress.cast:,}, sorted {progress.framed:,})",
+            self._survey.told(progress.scans),
+            progress.collected == progress.framed == progress.scans,
+        )
+        if progress.trials:
+            self._line(
+                "plan",
+                due,
+                f"{progress.trials:,} trials in {now:.1f} s",
+                f"{progress.trials_done:,} of {progress.trials:,} trials",
+                self._planning.told(progress.trials),
+                progress.trials_done == progress.trials,
+            )
+
+    def _line(self, what: str, due: bool, whole: str, part: str, pace: str, done: bool) -> None:
+        if what in self._done or not (due or done):
+            return
+        if done:
+            self._done.add(what)
+        text = f"done: {whole}" if done else part + pace
+        _tell(self.stream, f"{what:<6}  {text}")
+
+
+class _Pace:
+    """Rate of a count over the last seconds, and the time that the rest of it takes."""
+
+    def __init__(self) -> None:
+        self._seen: deque[tuple[float, int]] = deque()
+
+    def add(self, seconds: float, count: int) -> None:
+        self._seen.append((seconds, count))
+        while len(self._seen) > 2 and self._seen[1][0] <= seconds - WINDOW_S:
+            self._seen.popleft()
+
+    @property
+    def rate(self) -> float:
+        """Items a second, 0 where nothing is known."""
+        (start, before), (stop, after) = self._seen[0], self._seen[-1]
+        return (after - before) / (stop - start) if stop > start else 0.0
+
+    def told(self, whole: int) -> str:
+        """Rate and time left as the end of a line; empty as long as nothing has come."""
+        if not self.rate:
+            return ""
+        left = (whole - self._seen[-1][1]) / self.rate
+        return f"  {in_words(self.rate)}/s  {time_in_words(left)} left"
+
+
+def in_words(rate: float) -> str:
+    """Rate with as many digits as say something: 0.25, 3.1, 52, 1,234."""
+    return f"{rate:,.0f}" if rate >= 10 else f"{rate:.2g}"
+
+
+def time_in_words(seconds: float) -> str:
+    """Time as somebody who waits would say it: 8 s, 3 min, 2 h 05 min."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 100 else f"{minutes // 60:,} h {minutes % 60:02} min"
+
+
+def _tell(stream: TextIO, line: str) -> None:
+    with suppress(BrokenPipeError):  # that nobody reads along any more is no reason to end a run
+        stream.write(f"{time.strftime('%H:%M:%S')}  {line}\n")
+        stream.flush()
 
 
 class _Rate(TextColumn):
@@ -41,39 +178,38 @@ class _Rate(TextColumn):
 
     def render(self, task: Bar) -> Text:
         speed = task.finished_speed or task.speed
-        return Text(f"{speed:,.0f}/s" if speed else "", style="progress.data.speed")
+        return Text(f"{in_words(speed)}/s" if speed else "", style="progress.data.speed")
+
+
+class _Left(TextColumn):
+    """Time left, or the time it took."""
+
+    def __init__(self) -> None:
+        super().__init__("")
+
+    def render(self, task: Bar) -> Text:
+        if task.finished:
+            return Text(f"in {task.finished_time or 0:.1f} s", style="progress.elapsed")
+        left = task.time_remaining
+        words = "" if left is None else f"{time_in_words(left)} left"
+        return Text(words, style="progress.remaining")
 
 
 @contextmanager
-def shown_progress(quiet: bool = False) -> Iterator[Callable[[Progress], None]]:
-    """Show progress on stderr while the body runs; gives the function to call with it.
-
-    Bars by stage with rates and time left on a terminal, else a line every two seconds.
-    """
-    if quiet:
-        yield lambda progress: None
-    elif sys.stderr.isatty():
-        with _bars() as show:
-            yield show
-    else:
-        yield _plain_lines()
-
-
-@contextmanager
-def _bars() -> Iterator[Callable[[Progress], None]]:
+def _bars(console: Console) -> Iterator[Show]:
     columns = (
-        TextColumn("{task.description:<14}"),
+        TextColumn("{task.description:<13}"),
         BarColumn(bar_width=None),
         MofNCompleteColumn(),
         TextColumn("{task.fields[unit]:<6}"),
         _Rate(),
-        TimeRemainingColumn(elapsed_when_finished=True),
+        _Left(),
     )
-    with Bars(*columns, console=Console(stderr=True)) as bars:
+    with Bars(*columns, console=console) as bars:
         lines: dict[str, TaskID] = {}
 
         def show(progress: Progress) -> None:
-            for label, done, total in _LINES:
+            for label, done, total in _BARS:
                 whole = getattr(progress, total)
                 if whole and label not in lines:
                     lines[label] = bars.add_task(label, total=whole, unit=total)
@@ -81,33 +217,3 @@ def _bars() -> Iterator[Callable[[Progress], None]]:
                     bars.update(lines[label], completed=getattr(progress, done))
 
         yield show
-
-
-def _plain_lines() -> Callable[[Progress], None]:
-    told = float("-inf")
-    finished = False
-
-    def show(progress: Progress) -> None:
-        nonlocal told, finished
-        now = time.monotonic()
-        over = progress.collected == progress.scans and progress.trials_done == progress.trials
-        if finished or (not over and now - told < PLAIN_EVERY_S):
-            return
-        told, finished = now, over
-        rate = progress.collected / progress.seconds if progress.seconds else 0.0
-        left = (progress.scans - progress.collected) / rate if rate else float("nan")
-        parts = [
-            time.strftime("%H:%M:%S"),
-            f"scans generated {progress.generated}, cast {progress.cast}, "
-            f"sorted {progress.framed}, collected {progress.collected} of {progress.scans}",
-            f"{progress.points:,} points",
-            f"{rate:,.0f} scans/s",
-        ]
-        if progress.trials:
-            parts.append(f"trials {progress.trials_done} of {progress.trials}")
-        if rate and not over:
-            parts.append(f"{left:.0f} s left for the survey")
-        sys.stderr.write("  ".join(parts) + "\n")
-        sys.stderr.flush()
-
-    return show
