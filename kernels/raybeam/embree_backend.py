@@ -137,7 +137,8 @@ class EmbreeBackend(Backend):
             # Start at the scene's box: then float32 rounds by the scene's size, not by the way.
             entry, _ = clip(self._low, self._high, origins, directions)
             begin = np.maximum(entry, start)
-            buffer[:, :3] = origins + begin[:, None] * directions
+            # From so far away that float64 cannot place the start, it stays near the scene.
+            buffer[:, :3] = np.clip(origins + begin[:, None] * directions, -2, 2)
         answer = self._scene.cast_rays(self._tensor(buffer), nthreads=self._threads)
         face = answer["primitive_ids"].numpy()
         ray = np.flatnonzero(face != _MISS)

@@ -172,6 +172,13 @@ __device__ __forceinline__ void clip(
     leave = fmin(leave, fmax(one, two));
 }
 
+// A coordinate of the walk's start. From so far away that double cannot place it, it stays near
+// the scene at least.
+__device__ __forceinline__ float start(double o, double d, double entry)
+{
+    return (float)fmin(fmax(o + entry * d, -2.0), 2.0);
+}
+
 __device__ __forceinline__ float reciprocal(float d)
 {
     return 1.0f / (fabsf(d) < (float)TINY ? (d < 0.0f ? -(float)TINY : (float)TINY) : d);
@@ -194,9 +201,9 @@ __device__ __forceinline__ bool begin(
         if (!(entry <= leave + SLACK)) return false;
     }
     w.entry = entry;
-    w.ox = (float)(ray.ox + entry * ray.dx);
-    w.oy = (float)(ray.oy + entry * ray.dy);
-    w.oz = (float)(ray.oz + entry * ray.dz);
+    w.ox = start(ray.ox, ray.dx, entry);
+    w.oy = start(ray.oy, ray.dy, entry);
+    w.oz = start(ray.oz, ray.dz, entry);
     w.dx = (float)ray.dx;
     w.dy = (float)ray.dy;
     w.dz = (float)ray.dz;

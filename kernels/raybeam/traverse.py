@@ -24,6 +24,7 @@ Single = NDArray[np.float32]
 Index = NDArray[np.intp]
 
 _BLOCK = 1 << 14  # pairs: the arrays of one step stay within a few hundred kilobytes
+_ACROSS = 4.0  # local units: more than the diagonal of any scene
 _SLACK = 2.0**-20  # on limits of distance in float32: far more than their rounding
 
 
@@ -166,7 +167,8 @@ class Walker:
 
 
 def _bundle(origins: Float, directions: Float, entry: Float, t_max: float) -> _Bundle:
-    start = (origins + entry[:, None] * directions).T.astype(np.float32)
+    # From so far away that float64 cannot place the start, it stays near the scene at least.
+    start = np.clip(origins + entry[:, None] * directions, -2, 2).T.astype(np.float32)
     along = directions.T.astype(np.float32)
     along = np.where(np.abs(along) < TINY, np.copysign(np.float32(TINY), along), along)
     inverse = np.float32(1) / along
@@ -182,4 +184,4 @@ def _bundle(origins: Float, directions: Float, entry: Float, t_max: float) -> _B
 
 def _limit(t: Float, entry: Float) -> Single:
     """Distances from `entry` in float32, never less than the exact ones."""
-    return ((t - entry) * (1 + _SLACK) + _SLACK).astype(np.float32)
+    return np.minimum((t - entry) * (1 + _SLACK) + _SLACK, _ACROSS).astype(np.float32)

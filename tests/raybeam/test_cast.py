@@ -256,6 +256,18 @@ def test_far_origins_lose_nothing(caster, shapes):
         np.testing.assert_allclose(np.linalg.norm(points, axis=1), 1, atol=0.01)
 
 
+@pytest.mark.parametrize("far", [1e20, 1e100, 1e200])
+def test_absurd_distances_do_no_harm(caster, shapes, far):
+    """Float64 cannot aim from there: any answer is as good, but no warning and no NaN."""
+    cube = caster(*shapes["cube"]())
+    axes = np.concatenate([np.eye(3), -np.eye(3), [[1, 1, 1]]])
+    away = cube.cast(far * axes, axes)
+    assert not away.hit.any()
+    towards = cube.cast(far * axes, -axes)
+    assert not np.isnan(towards.distance).any()
+    assert cube.cast([0, 0, 0], axes, 0, far).hit.all()
+
+
 @pytest.mark.parametrize("size", [1e-30, 1e-6, 1e6, 1e30])
 def test_any_unit_of_length(exact_caster, shapes, size):
     vertices, faces = shapes["vase"](20, 20)

@@ -13,7 +13,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 relaxed = settings(
-    deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    deadline=None,
+    max_examples=60,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 grid = st.integers(-8, 8)
 
@@ -71,10 +74,13 @@ def test_integer_triangles(exact_backend, corners, origins, data):
 @given(
     heights=hnp.arrays(np.int64, (6, 6), elements=st.integers(0, 5)),
     target=st.tuples(st.integers(0, 20), st.integers(0, 20)),
-    origin=st.tuples(st.integers(-9, 30), st.integers(-9, 30), st.integers(25, 40)),
+    origin=st.tuples(st.integers(-9, 30), st.integers(-9, 30), st.integers(100, 120)),
 )
 def test_rays_at_the_seams_of_any_terrain_hit(exact_backend, heights, target, origin):
-    """A height field has no holes: straight down, and at its corners from anywhere above."""
+    """A height field has no holes: straight down, and to its corners from above.
+
+    So high above that rays are steeper than any slope: where they graze, a miss would be right.
+    """
     line = 4 * np.arange(6)
     x, y = np.meshgrid(line, line, indexing="ij")
     vertices = np.stack([x, y, heights], axis=-1).reshape(-1, 3)
