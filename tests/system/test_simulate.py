@@ -17,11 +17,18 @@ def client():
     workers = {
         name: {
             "cls": Worker,
-            "options": {"nthreads": threads, "resources": {name: slots}, "dashboard_address": ":0"},
+            "options": {
+                "nthreads": threads,
+                "resources": {name: slots},
+                "dashboard_address": "127.0.0.1:0",
+            },
         }
         for name, (threads, slots) in kinds.items()
     }
-    scheduler = {"cls": Scheduler, "options": {"host": "127.0.0.1", "port": 0, "dashboard": False}}
+    scheduler = {
+        "cls": Scheduler,
+        "options": {"host": "127.0.0.1", "port": 0, "dashboard_address": "127.0.0.1:0"},
+    }
     with SpecCluster(workers=workers, scheduler=scheduler) as cluster, Client(cluster) as client:
         yield client
 

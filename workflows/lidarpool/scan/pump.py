@@ -287,7 +287,7 @@ class SurveyPump:
     # -- sending again -----------------------------------------------------------------
 
     def _greet(self, stage: str) -> None:
-        """Note that a consumer has started; one time more than there are means that one had died."""
+        """Note that a consumer has started; once more than there are means that one had died."""
         self._greeted[stage] += 1
         if self._greeted[stage] > self._consumers[stage]:
             self._send_again(stage)
