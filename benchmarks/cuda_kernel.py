@@ -33,7 +33,7 @@ Mesh = tuple[NDArray[np.float64], NDArray[np.int64]]
 Float = NDArray[np.float64]
 
 _BLOCK = 128
-_VARIANTS = (1, 6, 8, 10)  # blocks on a multiprocessor that a thread's registers must allow
+_VARIANTS = (4, 6, 8, 10)  # blocks on a multiprocessor that a thread's registers must allow
 _SAMPLE = 2000  # rays compared with the numpy backend
 
 # Moeller and Trumbore in float against all triangles, without a tree.

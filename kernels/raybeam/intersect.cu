@@ -26,8 +26,10 @@
 
 typedef long long Count;
 
-#ifndef BLOCKS
-#define BLOCKS 1
+#ifdef BLOCKS
+#define BOUNDS __launch_bounds__(128, BLOCKS)
+#else
+#define BOUNDS __launch_bounds__(128)
 #endif
 
 #define LEAF_BITS 3
@@ -365,7 +367,7 @@ __device__ __forceinline__ Best closest(
 
 // Closest hits of rays from memory: local distance and place in the tables; -1 for a miss, whose
 // distance is not written.
-extern "C" __global__ void __launch_bounds__(128, BLOCKS) cast_table(
+extern "C" __global__ void BOUNDS cast_table(
     const float4* __restrict__ nodes, const float4* __restrict__ triangles,
     const double* __restrict__ corners, const int* __restrict__ faces,
     const double* __restrict__ frame,
@@ -383,7 +385,7 @@ extern "C" __global__ void __launch_bounds__(128, BLOCKS) cast_table(
 }
 
 // Closest hits of a pattern from one pose; the rest as in cast_table.
-extern "C" __global__ void __launch_bounds__(128, BLOCKS) cast_pattern(
+extern "C" __global__ void BOUNDS cast_pattern(
     const float4* __restrict__ nodes, const float4* __restrict__ triangles,
     const double* __restrict__ corners, const int* __restrict__ faces,
     const double* __restrict__ frame,
@@ -401,7 +403,7 @@ extern "C" __global__ void __launch_bounds__(128, BLOCKS) cast_pattern(
 }
 
 // Weights of the second and third corner for hits of cast_table: hit k is ray[k] at place[k].
-extern "C" __global__ void __launch_bounds__(128) weigh_table(
+extern "C" __global__ void BOUNDS weigh_table(
     const double* __restrict__ corners, const double* __restrict__ frame,
     const double* __restrict__ origins, int origin_stride,
     const double* __restrict__ directions,
