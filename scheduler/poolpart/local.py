@@ -107,14 +107,14 @@ def local_cluster(
     workers = {f"GPU-{i}": spec("GPU", 1) for i in range(counts["GPU"])}
     workers |= {"LIDAR-0": spec("LIDAR", lidar_slots)}
     workers |= {f"OTHER-{i}": spec("OTHER", 1) for i in range(counts["OTHER"])}
-    dashboard = dashboard_port is not None
     scheduler = {
         "cls": Scheduler,
         "options": {
             "host": host,
             "port": 0,
-            "dashboard": dashboard,
-            "dashboard_address": f"{host}:{dashboard_port}" if dashboard else None,
+            "dashboard": dashboard_port is not None,
+            # Also without a dashboard there is an HTTP server, else on port 8787.
+            "dashboard_address": f"{host}:{dashboard_port or 0}",
         },
     }
     try:

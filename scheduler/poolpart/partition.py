@@ -193,23 +193,29 @@ class Partition:
 
 def _in_order(futures: Iterator[Future], window: int) -> Iterator[Any]:
     waiting: deque[Future] = deque()
-    for future in futures:
-        waiting.append(future)
-        if len(waiting) >= window:
+    try:
+        for future in futures:
+            waiting.append(future)
+            if len(waiting) >= window:
+                yield waiting.popleft().result()
+        while waiting:
             yield waiting.popleft().result()
-    while waiting:
-        yield waiting.popleft().result()
+    finally:
+        waiting.clear()  # whoever keeps an error keeps this frame: do not keep tasks with it
 
 
 def _as_they_come(futures: Iterator[Future], window: int) -> Iterator[Any]:
     # Not with `as_completed`: what it watches stays wanted when its user has stopped.
     running: set[Future] = set()
-    for future in futures:
-        running.add(future)
-        if len(running) >= window:
+    try:
+        for future in futures:
+            running.add(future)
+            if len(running) >= window:
+                yield _pop_finished(running).result()
+        while running:
             yield _pop_finished(running).result()
-    while running:
-        yield _pop_finished(running).result()
+    finally:
+        running.clear()
 
 
 def _pop_finished(running: set[Future]) -> Future:

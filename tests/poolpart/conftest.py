@@ -22,7 +22,11 @@ def thread_cluster(workers):
     }
     scheduler = {
         "cls": Scheduler,
-        "options": {"protocol": "inproc", "host": "127.0.0.1", "dashboard": False},
+        "options": {
+            "protocol": "inproc://",
+            "dashboard": False,
+            "dashboard_address": "127.0.0.1:0",
+        },
     }
     return SpecCluster(workers=spec, scheduler=scheduler, silence_logs=QUIET)
 
@@ -46,15 +50,16 @@ def _threads():
         "B-0": {"resources": {"B": 1}},
         "plain": {},
     }
-    with thread_cluster(workers) as cluster, Client(cluster) as client:
-        yield client
+    with thread_cluster(workers) as cluster:
+        yield cluster
 
 
 @pytest.fixture
 def client(_threads):
     """Client of a cluster of threads: A with two workers of two slots, B with one, one plain."""
-    yield _threads
-    wait_until(lambda: not _threads.cluster.scheduler.tasks)
+    with Client(_threads) as client:
+        yield client
+    wait_until(lambda: not _threads.scheduler.tasks)
 
 
 @pytest.fixture(scope="session")
@@ -72,7 +77,10 @@ def nannies():
     """Client of a cluster of two worker processes that belong to no partition."""
     options = {"nthreads": 1, "host": "127.0.0.1", "dashboard": False, "silence_logs": QUIET}
     spec = {name: {"cls": Nanny, "options": options} for name in (0, 1)}
-    scheduler = {"cls": Scheduler, "options": {"host": "127.0.0.1", "dashboard": False}}
+    scheduler = {
+        "cls": Scheduler,
+        "options": {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0", "dashboard": False},
+    }
     with (
         SpecCluster(workers=spec, scheduler=scheduler, silence_logs=QUIET) as cluster,
         Client(cluster) as client,

@@ -1,0 +1,160 @@
+"""The local cluster: what it listens on, and that it never leaves a process behind."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import psutil
+import pytest
+from distributed import Client
+from hypothesis import given
+from hypothesis import strategies as st
+
+from poolpart import Pool, PoolError, local_cluster
+from poolpart.local import default_workers, usable_cores
+
+SCRIPT = """
+import sys, time
+from distributed import Client
+from poolpart import Pool, local_cluster
+
+def main():
+    with local_cluster(gpu_workers=1, other_workers=1) as cluster, Client(cluster) as client:
+        pids = client.run(__import__("os").getpid)
+        print(*pids.values(), flush=True)
+        {body}
+
+{call}
+"""
+
+
+def script(tmp_path, body="pass", call='if __name__ == "__main__": main()'):
+    """Start a script that starts a cluster; returns its process."""
+    path = tmp_path / "script.py"
+    path.write_text(SCRIPT.format(body=body, call=call))
+    return subprocess.Popen(
+        [sys.executable, path], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+def gone(pids):
+    return not any(psutil.pid_exists(pid) and is_alive(pid) for pid in pids)
+
+
+def is_alive(pid):
+    try:
+        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
+
+
+def listening(processes):
+    """Addresses that the processes listen on, by process."""
+    return {
+        process.pid: {
+            connection.laddr.ip
+            for connection in process.net_connections("inet")
+            if connection.status == psutil.CONN_LISTEN
+        }
+        for process in processes
+    }
+
+
+def children():
+    return {process.pid for process in psutil.Process().children(recursive=True)}
+
+
+@given(cores=st.integers(1, 256), gpus=st.integers(0, 16))
+def test_every_machine_gets_workers_and_no_more_than_cores_and_gpus(cores, gpus):
+    workers = default_workers(cores, gpus)
+    assert workers["GPU"] == gpus or gpus == 0
+    assert all(count >= 1 for count in workers.values())
+    assert sum(workers.values()) <= max(2, cores, gpus + 1)
+
+
+def test_usable_cores_counts_those_of_this_process():
+    assert usable_cores() == len(os.sched_getaffinity(0))
+
+
+def test_three_partitions(processes):
+    parts = Pool.from_client(processes).partitions()
+    assert {name: (len(part), part.slots) for name, part in parts.items()} == {
+        "GPU": (1, 1),
+        "LIDAR": (1, 4),
+        "OTHER": (1, 1),
+    }
+
+
+def test_scheduler_nannies_workers_and_dashboard_listen_on_loopback_only(processes):
+    workers = [psutil.Process(pid) for pid in processes.run(os.getpid).values()]
+    # Scheduler, nannies and dashboard are in this process, with whatever else it has.
+    found = listening([psutil.Process(), *workers])
+    assert found == {pid: {"127.0.0.1"} for pid in found}
+    assert len(found) == 4
+    assert processes.cluster.scheduler.http_server.address == "127.0.0.1"
+    assert processes.dashboard_link.startswith("http://127.0.0.1:")
+
+
+def test_no_dashboard_environment_and_nothing_left_after_an_error():
+    before = children()
+    with (
+        pytest.raises(ZeroDivisionError),
+        local_cluster(
+            gpu_workers=2, other_workers=1, dashboard_port=None, environment={"SEEN": "yes"}
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        assert {name.split("-")[0] for name in cluster.workers} == {"GPU", "LIDAR", "OTHER"}
+        assert set(client.run(lambda: os.environ["SEEN"]).values()) == {"yes"}
+        assert set(client.run(lambda: os.environ["OMP_NUM_THREADS"]).values()) == {"1"}
+        assert cluster.scheduler.http_server.address == "127.0.0.1"
+        started = children() - before
+        assert len(started) >= 4
+        raise ZeroDivisionError
+    assert gone(started - {resource_tracker_pid()})
+
+
+def resource_tracker_pid():
+    """Process that multiprocessing starts once and keeps."""
+    from multiprocessing import resource_tracker
+
+    return resource_tracker._resource_tracker._pid
+
+
+@pytest.mark.parametrize("name", ["gpu_workers", "lidar_slots", "other_workers"])
+@pytest.mark.parametrize("count", [0, -1, float("nan"), 1.5])
+def test_counts_that_cannot_be(name, count):
+    before = children()
+    with pytest.raises(PoolError, match=f"{name} is {count}; give a whole number"):
+        local_cluster(**{name: count})
+    assert children() == before
+
+
+def test_no_worker_outlives_a_driver_that_is_killed(tmp_path, wait_until):
+    driver = script(tmp_path, body="time.sleep(600)")
+    pids = [int(pid) for pid in driver.stdout.readline().split()]
+    assert len(pids) == 3
+    assert not gone(pids)
+    driver.send_signal(signal.SIGKILL)
+    driver.communicate()
+    wait_until(lambda: gone(pids), timeout_s=20)
+
+
+def test_ctrl_c_ends_driver_and_workers(tmp_path, wait_until):
+    driver = script(tmp_path, body="time.sleep(600)")
+    pids = [int(pid) for pid in driver.stdout.readline().split()]
+    driver.send_signal(signal.SIGINT)
+    _, errors = driver.communicate(timeout=30)
+    assert errors.rstrip().endswith("KeyboardInterrupt")
+    wait_until(lambda: gone(pids), timeout_s=20)
+
+
+def test_a_script_without_a_main_guard_is_told_so(tmp_path):
+    driver = script(tmp_path, call="main()")
+    output, errors = driver.communicate(timeout=60)
+    assert (driver.returncode, output) == (1, "")
+    last = errors.rstrip().splitlines()[-1]
+    assert last.startswith("poolpart.errors.PoolError: The workers did not start (")
+    assert "under `if __name__ == '__main__':`" in last
+    assert "freeze_support" not in errors

@@ -1,0 +1,223 @@
+"""Pools on clusters: what they find, how they are divided, what they refuse."""
+
+import logging
+from dataclasses import replace
+
+import pytest
+from distributed import Client, LocalCluster, get_worker
+
+from poolpart import Partition, Pool, PoolError, probe
+
+PLAIN = {name: {} for name in ("a", "b", "c")}
+
+
+def here():
+    return str(get_worker().name)
+
+
+def declared(client):
+    """Resources by worker, as the scheduler knows them."""
+    workers = client.scheduler_info(n_workers=-1)["workers"].values()
+    return {str(worker["name"]): worker["resources"] for worker in workers}
+
+
+def test_what_a_pool_knows(start):
+    pool = Pool.from_client(start({"a": {"nthreads": 3}, "b": {"resources": {"GPU": 1}}}))
+    assert len(pool) == 2
+    assert {w.name: (w.nthreads, w.gpus, w.partitions) for w in pool} == {
+        "a": (3, (), frozenset()),
+        "b": (1, (), {"GPU"}),
+    }
+    assert sorted(pool.names) == ["a", "b"]
+    assert repr(pool) == "<Pool of 2 workers on 1 hosts with 0 GPUs, GPU 1>"
+
+
+def test_a_cluster_without_workers(start):
+    with pytest.raises(PoolError, match="has no workers: start some with dask worker"):
+        Pool.from_client(start({}))
+
+
+def test_a_worker_that_cannot_answer(start, monkeypatch):
+    def broken():
+        raise OSError("no such thing")
+
+    monkeypatch.setattr(probe, "visible_gpus", broken)
+    with pytest.raises(PoolError, match=r"Worker a at .* \(OSError: no such thing\)"):
+        Pool.from_client(start({"a": {}}))
+
+
+def test_more_workers_than_dask_lists_by_default(start):
+    assert len(Pool.from_client(start({f"w{i}": {} for i in range(12)}))) == 12
+
+
+def test_a_cluster_from_the_command_line_is_divided_already(start):
+    workers = {"g": {"resources": {"GPU": 1}}, "l": {"resources": {"LIDAR": 4}}, "free": {}}
+    parts = Pool.from_client(start(workers)).partitions()
+    assert {name: (len(part), part.slots) for name, part in parts.items()} == {
+        "GPU": (1, 1),
+        "LIDAR": (1, 4),
+    }
+    assert parts["LIDAR"].submit(here).result() == "l"
+
+
+def test_dividing_the_remainder_again(start):
+    client = start({name: {"nthreads": 2} for name in "abcd"})
+    one, rest = Pool.from_client(client).partition("ONE", n_workers=1)
+    two, rest = rest.partition("TWO", n_workers=2, slots=5)
+    three, rest = rest.partition("THREE", workers=rest.names)
+    assert (len(one), len(two), len(three), len(rest)) == (1, 2, 1, 0)
+    assert (one.slots, two.slots, three.slots) == (2, 10, 2)
+    for part in (one, two, three):
+        ran = {future.result() for future in [part.submit(here) for _ in range(40)]}
+        assert ran <= {worker.name for worker in part.workers}
+    assert {len(resources) for resources in declared(client).values()} == {1}
+    with pytest.raises(PoolError, match="has 0 that belong to no other"):
+        rest.partition("FOUR", n_workers=1)
+
+
+def test_workers_by_name_and_by_address(start):
+    pool = Pool.from_client(start(PLAIN))
+    address = next(worker.address for worker in pool if worker.name == "b")
+    part, rest = pool.partition("P", workers=["c", address])
+    assert [worker.name for worker in part.workers] == ["b", "c"]
+    assert rest.names == ["a"]
+
+
+def test_workers_that_local_cluster_numbers():
+    with (
+        LocalCluster(
+            n_workers=3, processes=False, threads_per_worker=1, dashboard_address="127.0.0.1:0"
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        part, rest = Pool.from_client(client).partition("P", workers=[0, "2"])
+        assert [worker.name for worker in part.workers] == ["0", "2"]
+        assert rest.names == ["1"]
+        assert part.submit(here).result() in ("0", "2")
+
+
+def test_a_refused_request_changes_nothing(start):
+    client = start(PLAIN | {"other": {"resources": {"O": 1}}})
+    pool = Pool.from_client(client)
+    for arguments in (
+        {},
+        {"n_workers": 1, "max_workers_per_host": 1},
+        {"n_workers": 4},
+        {"n_workers": 0},
+        {"workers": ["a", "nobody"]},
+        {"workers": ["other"]},
+        {"n_workers": 1, "slots": 0},
+    ):
+        with pytest.raises(PoolError):
+            pool.partition("P", **arguments)
+    assert declared(client) == {"a": {}, "b": {}, "c": {}, "other": {"O": 1}}
+
+
+def test_a_pool_that_is_divided_twice_does_not_give_one_worker_to_two(start):
+    client = start(PLAIN)
+    pool = Pool.from_client(client)
+    pool.partition("P", n_workers=2)
+    _, rest = pool.partition("Q", n_workers=1)
+    assert sorted(map(list, declared(client).values())) == [["P"], ["P"], ["Q"]]
+    assert len(rest) == 2  # P's, which this pool still counts as its own
+    with pytest.raises(PoolError, match="already declares P"):
+        pool.partition("R", workers=rest.names)
+
+
+def test_the_same_call_again_gives_the_same_partition(start):
+    client = start(PLAIN)
+    part, _ = Pool.from_client(client).partition("P", workers=["c"])
+    again, rest = Pool.from_client(client).partition("P", n_workers=1)
+    assert [w.name for w in again.workers] == [w.name for w in part.workers] == ["c"]
+    assert sorted(rest.names) == ["a", "b"]
+
+
+def test_one_name_for_two_partitions(start):
+    client = start(PLAIN)
+    _, rest = Pool.from_client(client).partition("P", workers=["a"])
+    with pytest.raises(PoolError, match=r"a partition 'P' already, with a, which .* not choose"):
+        rest.partition("P", n_workers=1)
+    assert declared(client) == {"a": {"P": 1}, "b": {}, "c": {}}
+
+
+def test_a_worker_that_has_left_is_not_chosen(start, wait_until):
+    client = start(PLAIN)
+    pool = Pool.from_client(client)
+    client.retire_workers([worker.address for worker in pool if worker.name == "a"])
+    wait_until(lambda: len(declared(client)) == 2)
+    part, rest = pool.partition("P", n_workers=2)
+    assert ([w.name for w in part.workers], rest.names) == (["b", "c"], [])
+    with pytest.raises(PoolError, match="a not in this pool, which has"):
+        pool.partition("Q", workers=["a"])
+
+
+def test_tasks_that_wait_for_a_partition_run_once_it_is_made(start, wait_until):
+    client = start(PLAIN)
+    waiting = [Partition("P", client).submit(here) for _ in range(5)]
+    scheduler = client.cluster.scheduler
+    wait_until(lambda: len(scheduler.unrunnable) == 5)
+    part, _ = Pool.from_client(client).partition("P", workers=["b"])
+    assert client.gather(waiting) == ["b"] * 5
+    assert len(part) == 1
+
+
+def test_workers_that_join_later_with_the_resource_belong(start, wait_until):
+    client = start({"a": {"resources": {"P": 1}}, "b": {}})
+    part = Pool.from_client(client).partitions()["P"]
+    options = client.cluster.worker_spec["a"]
+    client.cluster.worker_spec["late"] = options
+    client.sync(client.cluster._correct_state)
+    part.wait(2, timeout_s=20)
+    assert [worker.name for worker in part.workers] == ["a", "late"]
+
+
+# -- GPUs ------------------------------------------------------------------------------
+
+
+def test_one_worker_for_each_gpu_of_a_host(start, monkeypatch):
+    monkeypatch.setattr(probe, "visible_gpus", lambda: ("x", "y"))
+    pool = Pool.from_client(start({name: {} for name in "abcde"}))
+    assert repr(pool) == "<Pool of 5 workers on 1 hosts with 2 GPUs>"
+    gpu, rest = pool.partition("GPU", max_workers_per_gpu=1)
+    assert (len(gpu), len(rest), gpu.note) == (2, 3, "")
+    assert {worker.gpus for worker in rest} == {("x", "y")}
+
+
+def test_two_hosts_of_different_size(start):
+    pool = Pool.from_client(start({name: {} for name in "abcde"}))
+    views = {"a": ("h1", ("x",)), "b": ("h1", ("x",)), "c": ("h2", ("u", "v"))}
+    views |= {"d": ("h2", ("u", "v")), "e": ("h2", ("u", "v"))}
+    workers = [replace(w, host=views[w.name][0], gpus=views[w.name][1]) for w in pool]
+    gpu, rest = Pool(pool.client, workers).partition("GPU", max_workers_per_gpu=1)
+    chosen = {worker.name for worker in gpu.workers}
+    assert (len(chosen & {"a", "b"}), len(chosen & {"c", "d", "e"})) == (1, 2)
+    assert len(rest) == 2
+
+
+def test_without_gpus_the_fall_back_is_seen(start, caplog):
+    pool = Pool.from_client(start(PLAIN))
+    with caplog.at_level(logging.WARNING, "poolpart"):
+        gpu, _ = pool.partition("GPU", max_workers_per_gpu=1)
+    assert gpu.note == "no GPU in the pool: CPU workers instead"
+    assert gpu.note in repr(gpu)
+    assert f"Partition 'GPU': {gpu.note}" in caplog.text
+    assert len(gpu) == 1
+
+
+# -- require ---------------------------------------------------------------------------
+
+
+def test_slots_that_are_missing_are_named_with_their_purpose(start):
+    pool = Pool.from_client(start({"l": {"resources": {"LIDAR": 2}}}))
+    pool.require({"LIDAR": 2})
+    with pytest.raises(PoolError, match=r"'LIDAR' has 2 of the 4 slots needed \(four stages\): "):
+        pool.require({"LIDAR": 4}, {"LIDAR": "four stages"})
+    with pytest.raises(PoolError, match="'GPU' has 0 of the 1 slots needed: start workers"):
+        pool.require({"GPU": 1}, {"LIDAR": "four stages"})
+
+
+def test_a_worker_in_two_partitions(start):
+    pool = Pool.from_client(start({"w": {"resources": {"GPU": 1, "LIDAR": 4}}}))
+    pool.require({"GPU": 1})
+    with pytest.raises(PoolError, match="Worker w declares GPU and LIDAR: give each worker one"):
+        pool.require({"GPU": 1, "LIDAR": 1})
