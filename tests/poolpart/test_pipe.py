@@ -1,0 +1,421 @@
+"""Pipes between threads of one process: order, bound, end, failure, deletion."""
+
+import pickle
+import threading
+import time
+from collections import deque
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from poolpart import Partition, Pipe, PipeClosed, PipeFailed, forget_pipes
+from poolpart import pipe as pipe_module
+
+LONG_S = 30.0  # for what happens at once, or the test fails
+
+
+def again(pipe):
+    """Make another object for the same pipe, which has seen nothing of it yet."""
+    return Pipe(pipe.name, pipe.capacity, pipe.client)
+
+
+def known(client):
+    """What the scheduler knows of queues, variables, tasks and clients."""
+
+    def look(dask_scheduler):
+        queues = dask_scheduler.extensions["queues"]
+        return (
+            sorted(queues.queues),
+            sorted(queues.client_refcount),
+            sorted(queues.future_refcount),
+            sorted(dask_scheduler.extensions["variables"].variables),
+            sorted(dask_scheduler.tasks),
+            sorted(dask_scheduler.clients),
+        )
+
+    return client.run_on_scheduler(look)
+
+
+def consume(pipe):
+    return list(pipe)
+
+
+def produce(pipe, items):
+    for item in items:
+        pipe.put(item)
+
+
+def add_one(x):
+    return x + 1
+
+
+@pytest.fixture
+def pool():
+    with ThreadPoolExecutor(16) as pool:
+        yield pool
+
+
+# -- order and bound -------------------------------------------------------------------
+
+
+def test_items_come_in_the_order_they_were_put(client, make_pipe, pool):
+    pipe = make_pipe(client, capacity=4)
+    consumer = pool.submit(consume, again(pipe))
+    produce(pipe, range(100))
+    pipe.close()
+    assert consumer.result(LONG_S) == list(range(100))
+
+
+OPERATIONS = st.lists(
+    st.one_of(
+        st.tuples(st.just("put"), st.none() | st.integers() | st.text(max_size=5)),
+        st.tuples(st.sampled_from(["get", "poll", "get_all"]), st.none()),
+    ),
+    max_size=30,
+)
+
+
+@given(operations=OPERATIONS, capacity=st.integers(1, 4))
+@settings(deadline=None, max_examples=40)
+def test_behaves_as_a_bounded_queue(_threads_client, operations, capacity):
+    pipe = Pipe("model", capacity, _threads_client).create()
+    producer, queued, taken = again(pipe), deque(), deque()
+    try:
+        for operation, item in operations:
+            if operation == "put" and len(queued) == capacity:
+                with pytest.raises(TimeoutError, match="stayed full for 0 s"):
+                    producer.put(item, timeout_s=0)
+            elif operation == "put":
+                producer.put(item)
+                queued.append(item)
+            elif operation == "get" and (taken or queued):
+                if not taken:
+                    taken.extend(queued)
+                    queued.clear()
+                assert pipe.get(timeout_s=0) == taken.popleft()
+            elif operation == "poll" or taken or queued:
+                assert getattr(pipe, operation)() == [*taken, *queued]
+                taken.clear()
+                queued.clear()
+            else:
+                with pytest.raises(TimeoutError, match="Nothing came .* for 0 s"):
+                    getattr(pipe, operation)(timeout_s=0)
+            assert producer.depth == len(queued)
+    finally:
+        pipe.delete()
+
+
+@pytest.fixture(scope="module")
+def _threads_client(_threads):
+    from distributed import Client
+
+    with Client(_threads) as client:
+        yield client
+
+
+def test_a_single_producer_never_goes_beyond_the_capacity(client, make_pipe, pool):
+    pipe = make_pipe(client, capacity=3)
+    producer = pool.submit(produce, again(pipe), range(60))
+    received, depths = [], []
+    while len(received) < 60:
+        depths.append(pipe.depth)
+        received += pipe.poll()
+    producer.result(LONG_S)
+    assert received == list(range(60))
+    assert max(depths) <= 3
+
+
+def test_a_producer_waits_while_the_pipe_is_full(client, make_pipe, pool, wait_until):
+    pipe = make_pipe(client, capacity=2)
+    producer = pool.submit(produce, again(pipe), range(5))
+    wait_until(lambda: pipe.depth == 2)
+    with pytest.raises(TimeoutError, match=r"stayed full for 0.05 s"):
+        pipe.put("no room", timeout_s=0.05)
+    assert not producer.done()
+    assert [pipe.get(LONG_S) for _ in range(5)] == list(range(5))
+    producer.result(LONG_S)
+    assert pipe.poll() == []
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_several_producers_and_consumers_lose_and_double_nothing(client, make_pipe, pool, shared):
+    pipe = make_pipe(client, capacity=5)
+    depths, finished = [], threading.Event()
+
+    def watch():
+        while not finished.is_set():
+            depths.append(pipe.depth)
+
+    watcher = pool.submit(watch)
+    ends = [pipe if shared else again(pipe) for _ in range(8)]
+    consumers = [pool.submit(consume, end) for end in ends[:4]]
+    producers = [
+        pool.submit(produce, end, [(number, item) for item in range(40)])
+        for number, end in enumerate(ends[4:])
+    ]
+    for producer in producers:
+        producer.result(LONG_S)
+    pipe.close()
+    received = [consumer.result(LONG_S) for consumer in consumers]
+    finished.set()
+    watcher.result(LONG_S)
+    assert sorted(sum(received, [])) == [(n, i) for n in range(4) for i in range(40)]
+    assert max(depths) <= 5 + 4 - 1
+
+
+@pytest.mark.parametrize("capacity", [0, -1])
+def test_a_capacity_below_one(capacity):
+    with pytest.raises(ValueError, match=f"capacity of pipe 'p' is {capacity}"):
+        Pipe("p", capacity)
+
+
+# -- the end ---------------------------------------------------------------------------
+
+
+def test_consumers_drain_a_closed_pipe_and_end(client, make_pipe):
+    pipe = make_pipe(client)
+    pipe.put(1)
+    pipe.put(2)
+    pipe.close()
+    pipe.close()
+    end = again(pipe)
+    assert end.get() == 1
+    assert list(end) == [2]
+    with pytest.raises(PipeClosed, match="is closed and empty"):
+        end.get()
+    with pytest.raises(PipeClosed, match="is closed and empty"):
+        end.get_all()
+    assert end.poll() == []
+
+
+def test_nothing_can_be_put_into_a_closed_pipe(client, make_pipe):
+    pipe = make_pipe(client)
+    pipe.close()
+    for end in (pipe, again(pipe)):
+        with pytest.raises(PipeClosed, match="is closed; nothing can be put"):
+            end.put(1)
+    assert pipe.depth == 0
+
+
+def test_closing_wakes_those_that_wait(client, make_pipe, pool):
+    pipe = make_pipe(client, capacity=1)
+    consumers = [pool.submit(consume, again(pipe)) for _ in range(3)]
+    time.sleep(0.05)  # let them wait
+    pipe.close()
+    assert [consumer.result(LONG_S) for consumer in consumers] == [[], [], []]
+
+
+# -- failure ---------------------------------------------------------------------------
+
+
+def test_failing_wakes_both_ends_with_the_reason(client, make_pipe, pool, wait_until):
+    empty, full = make_pipe(client), make_pipe(client, capacity=1)
+    full.put("x")
+    waiting = [pool.submit(again(empty).get), pool.submit(again(empty).get_all)]
+    waiting += [pool.submit(again(full).put, number) for number in range(3)]
+    time.sleep(0.05)
+    assert not any(future.done() for future in waiting)
+    empty.fail("the disk is full")
+    full.fail("the disk is full")
+    for future in waiting:
+        with pytest.raises(PipeFailed, match="^the disk is full$"):
+            future.result(LONG_S)
+
+
+def test_a_consumer_stops_at_a_failure_even_with_items_in_hand(client, make_pipe, monkeypatch):
+    monkeypatch.setattr(pipe_module, "_STATE_MAX_AGE_S", 0.0)
+    pipe = make_pipe(client)
+    for item in range(3):
+        pipe.put(item)
+    end = again(pipe)
+    assert end.get() == 0
+    pipe.fail("no")
+    with pytest.raises(PipeFailed, match="no"):
+        end.get()
+
+
+def test_the_first_reason_stays(client, make_pipe):
+    pipe = make_pipe(client)
+    pipe.fail("cause")
+    pipe.fail("consequence")
+    with pytest.raises(PipeFailed, match="^cause$"):
+        again(pipe).get()
+
+
+def test_closing_does_not_undo_a_failure_that_was_not_seen(client, make_pipe):
+    pipe = make_pipe(client)
+    late = again(pipe)
+    late.put(1)  # has read the state
+    pipe.fail("broken")
+    late.close()
+    with pytest.raises(PipeFailed, match="broken"):
+        again(pipe).get()
+
+
+def test_advice_does_not_undo_a_closing_that_was_not_seen(client, make_pipe):
+    pipe = make_pipe(client)
+    adviser = again(pipe)
+    assert adviser.advice == 1
+    pipe.close()
+    adviser.advise(7)
+    assert again(pipe).advice == 7
+    with pytest.raises(PipeClosed):
+        again(pipe).get()
+
+
+def test_advice_can_return_to_what_it_was(client, make_pipe):
+    pipe = make_pipe(client)
+    pipe.advise(5)
+    again(pipe).advise(1)
+    assert again(pipe).advice == 1
+
+
+def test_failing_without_a_reason_fails_all_the_same(client, make_pipe):
+    pipe = make_pipe(client)
+    pipe.fail("")
+    with pytest.raises(PipeFailed, match="no reason was given"):
+        again(pipe).put(1)
+
+
+def test_changes_at_the_same_moment_all_count(client, make_pipe, pool):
+    for _ in range(10):
+        pipe = make_pipe(client)
+        changes = [
+            pool.submit(again(pipe).close),
+            pool.submit(again(pipe).advise, 9),
+            pool.submit(again(pipe).fail, "why"),
+        ]
+        for change in changes:
+            try:
+                change.result(LONG_S)
+            except PipeFailed:  # the advice came after
+                assert change is changes[1]
+        with pytest.raises(PipeFailed, match="why"):
+            again(pipe).get()
+
+
+# -- items -----------------------------------------------------------------------------
+
+
+def test_futures_are_items(client, make_pipe, pool, wait_until):
+    part, before = Partition("A", client), known(client)
+    pipe = make_pipe(client, capacity=4)
+
+    def send():
+        for number in range(8):
+            pipe.put(part.submit(add_one, number))
+        pipe.close()
+
+    sender = pool.submit(send)
+    assert [future.result(LONG_S) for future in again(pipe)] == list(range(1, 9))
+    sender.result(LONG_S)
+    pipe.delete()
+    wait_until(lambda: known(client) == before)
+
+
+def test_a_future_that_failed_raises_at_the_consumer(client, make_pipe):
+    pipe = make_pipe(client)
+    future = Partition("A", client).submit(add_one, "x")
+    pipe.put(future)
+    with pytest.raises(TypeError):
+        pipe.get(LONG_S).result(LONG_S)
+
+
+def test_a_future_that_was_cancelled_is_refused(client, make_pipe, monkeypatch, wait_until):
+    monkeypatch.setattr(pipe_module, "_UNKNOWN_FUTURE_S", 0.05)
+    pipe = make_pipe(client)
+    future = Partition("A", client).submit(add_one, 1)
+    future.cancel()
+    wait_until(lambda: not client.cluster.scheduler.tasks)
+    with pytest.raises(ValueError, match="the scheduler does not know its task"):
+        pipe.put(future)
+
+
+def test_a_pickled_pipe_is_small_and_the_same(client, make_pipe):
+    pipe = make_pipe(client, capacity=7)
+    data = pickle.dumps(pipe)
+    assert len(data) < 200
+    copy = pickle.loads(data)
+    assert (copy.name, copy.capacity) == (pipe.name, 7)
+
+
+def test_tasks_use_the_client_of_their_worker(client, make_pipe):
+    pipe = make_pipe(client, capacity=2)
+    consumer = Partition("B", client).submit(consume, pipe)
+    producers = [Partition("A", client).submit(produce, pipe, [n] * 10) for n in range(3)]
+    for producer in producers:
+        producer.result(LONG_S)
+    pipe.close()
+    assert sorted(consumer.result(LONG_S)) == sorted([0, 1, 2] * 10)
+
+
+def test_repr(client, make_pipe):
+    pipe = make_pipe(client)
+    assert repr(pipe) == f"<Pipe {pipe.name!r} capacity 3, open>"
+    pipe.close()
+    assert repr(pipe) == f"<Pipe {pipe.name!r} capacity 3, closed>"
+    pipe.fail("broken")
+    assert repr(pipe) == f"<Pipe {pipe.name!r} capacity 3, broken>"
+
+
+# -- what is left ----------------------------------------------------------------------
+
+USES = {
+    "put": lambda pipe: pipe.put(1),
+    "get": lambda pipe: pipe.get(),
+    "get_all": lambda pipe: pipe.get_all(),
+    "poll": lambda pipe: pipe.poll(),
+    "depth": lambda pipe: pipe.depth,
+    "close": lambda pipe: pipe.close(),
+    "fail": lambda pipe: pipe.fail("x"),
+    "advise": lambda pipe: pipe.advise(5),
+    "iterate": list,
+}
+
+
+@pytest.mark.parametrize("use", USES.values(), ids=USES)
+@pytest.mark.parametrize("fresh", [True, False])
+def test_using_a_deleted_pipe_says_so_and_does_not_bring_it_back(client, make_pipe, use, fresh):
+    before = known(client)
+    pipe = make_pipe(client)
+    pipe.put(1)
+    pipe.delete()
+    with pytest.raises(PipeFailed, match="does not exist: never created, or deleted"):
+        use(again(pipe) if fresh else pipe)
+    assert known(client) == before
+
+
+def test_deleting_wakes_those_that_wait(client, make_pipe, pool):
+    empty, full = make_pipe(client), make_pipe(client, capacity=1)
+    full.put(1)
+    waiting = [pool.submit(again(empty).get)]
+    waiting += [pool.submit(again(full).put, number) for number in range(3)]
+    time.sleep(0.05)
+    forget_pipes(client, [empty.name, full.name])
+    for future in waiting:
+        with pytest.raises(PipeFailed, match="does not exist"):
+            future.result(LONG_S)
+
+
+def test_deleting_takes_items_futures_and_a_state_along(client, make_pipe, wait_until):
+    before = known(client)
+    pipe = make_pipe(client)
+    pipe.put("item")
+    pipe.put(Partition("A", client).submit(add_one, 1))
+    pipe.fail("state")
+    assert known(client) != before
+    pipe.delete()
+    pipe.delete()
+    wait_until(lambda: known(client) == before)
+
+
+def test_two_pipes_of_one_name(client, make_pipe):
+    pipe = make_pipe(client)
+    pipe.put("mine")
+    with pytest.raises(ValueError, match=f"has a queue or variable {pipe.name!r}"):
+        again(pipe).create()
+    assert pipe.get() == "mine"
+    pipe.delete()
+    assert again(pipe).create().depth == 0
