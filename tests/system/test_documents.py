@@ -1,0 +1,81 @@
+"""What the documents say is so: their code runs, and the files that they name exist."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lidarpool import write_cloud
+
+ROOT = Path(__file__).parents[2]
+DOCUMENTS = [ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md"))]
+
+
+def python_blocks() -> list[tuple[str, str]]:
+    return [
+        (f"{path.relative_to(ROOT)}:{text[: match.start()].count(chr(10)) + 2}", match[1])
+        for path in DOCUMENTS
+        for text in [path.read_text(encoding="utf-8")]
+        for match in re.finditer(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    ]
+
+
+@pytest.mark.parametrize(("where", "code"), python_blocks(), ids=lambda value: value[:40])
+def test_python_code_runs(tmp_path, where, code):
+    folder = tmp_path / "lidarpool-out"
+    folder.mkdir()
+    one = np.ones(1, np.int32)
+    write_cloud(folder / "cloud.ply", np.ones((1, 3), np.float32), one, one, one)
+    script = tmp_path / "example.py"
+    script.write_text(code, encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, script],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, f"{where}\n{done.stderr}"
+    # What a comment beside a print promises is what is printed.
+    for promised in re.findall(r"print\(.*\)  # (.*)", code):
+        assert promised in done.stdout
+
+
+def test_the_readme_shows_the_example_as_it_is():
+    example = (ROOT / "examples/survey.py").read_text(encoding="utf-8").split('"""', 2)[2].strip()
+    assert example in (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def test_scripts_of_the_readme_exist_as_make_targets_and_commands():
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    targets = re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.M)
+    used = set(re.findall(r"\bmake ([a-z]+)", text))
+    assert {"demo", "test"} <= used <= set(targets)
+
+
+@pytest.mark.parametrize("path", [ROOT / "README.md", ROOT / "ARCHITECTURE.md", *DOCUMENTS[1:]])
+def test_links_lead_somewhere(path):
+    text = path.read_text(encoding="utf-8")
+    for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", text):
+        if not target.startswith("https://"):
+            assert (path.parent / target).exists(), target
+
+
+def test_files_that_the_architecture_names_exist():
+    text = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
+    tree = {
+        str(p.relative_to(ROOT))
+        for d in ("kernels", "scheduler", "workflows")
+        for p in (ROOT / d).rglob("*")
+    }
+    named = set(re.findall(r"`([\w/.]+\.(?:py|cu|yaml))(?::[^`]*)?`", text)) - {"scenario.yaml"}
+    assert len(named) > 10
+    assert [
+        name for name in sorted(named) if not any(f"/{f}".endswith(f"/{name}") for f in tree)
+    ] == []
