@@ -1,5 +1,6 @@
 """Pipes between threads of one process: order, bound, end, failure, deletion."""
 
+import itertools
 import pickle
 import threading
 import time
@@ -7,6 +8,7 @@ from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
+from distributed import Client
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -100,7 +102,7 @@ def test_behaves_as_a_bounded_queue(_threads_client, operations, capacity):
                 taken.clear()
                 queued.clear()
             else:
-                with pytest.raises(TimeoutError, match="Nothing came .* for 0 s"):
+                with pytest.raises(TimeoutError, match=r"Nothing came .* for 0 s"):
                     getattr(pipe, operation)(timeout_s=0)
             assert producer.depth == len(queued)
     finally:
@@ -109,8 +111,6 @@ def test_behaves_as_a_bounded_queue(_threads_client, operations, capacity):
 
 @pytest.fixture(scope="module")
 def _threads_client(_threads):
-    from distributed import Client
-
     with Client(_threads) as client:
         yield client
 
@@ -161,7 +161,7 @@ def test_several_producers_and_consumers_lose_and_double_nothing(client, make_pi
     received = [consumer.result(LONG_S) for consumer in consumers]
     finished.set()
     watcher.result(LONG_S)
-    assert sorted(sum(received, [])) == [(n, i) for n in range(4) for i in range(40)]
+    assert sorted(itertools.chain(*received)) == [(n, i) for n in range(4) for i in range(40)]
     assert max(depths) <= 5 + 4 - 1
 
 
@@ -220,7 +220,7 @@ def test_failing_wakes_both_ends_with_the_reason(client, make_pipe, pool, wait_u
     empty.fail("the disk is full")
     full.fail("the disk is full")
     for future in waiting:
-        with pytest.raises(PipeFailed, match="^the disk is full$"):
+        with pytest.raises(PipeFailed, match=r"^the disk is full$"):
             future.result(LONG_S)
 
 
@@ -240,7 +240,7 @@ def test_the_first_reason_stays(client, make_pipe):
     pipe = make_pipe(client)
     pipe.fail("cause")
     pipe.fail("consequence")
-    with pytest.raises(PipeFailed, match="^cause$"):
+    with pytest.raises(PipeFailed, match=r"^cause$"):
         again(pipe).get()
 
 

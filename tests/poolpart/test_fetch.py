@@ -1,0 +1,52 @@
+"""Fetching what is there, without waiting for what is not."""
+
+import uuid
+
+import pytest
+from distributed import Event, wait
+
+from poolpart import Partition
+from poolpart.fetch import fetch_available
+
+
+def twice(x):
+    return 2 * x
+
+
+def wait_for(event):
+    return Event(event).wait(30)
+
+
+def test_only_what_is_finished_comes(client):
+    gate = Event(f"gate-{uuid.uuid4().hex}", client=client)
+    part = Partition("A", client)
+    done, pending = part.map(twice, range(5)), part.submit(wait_for, gate.name)
+    wait(done, timeout=30)
+    keys = [future.key for future in done]
+    fetched = fetch_available(client, [*keys, pending.key, "never-submitted"])
+    assert fetched == {key: 2 * number for number, key in enumerate(keys)}
+    assert fetch_available(client, []) == {}
+    gate.set()
+
+
+def test_it_takes_no_reference(client, wait_until):
+    future = Partition("A", client).submit(twice, 4)
+    wait([future], timeout=30)
+    key = future.key
+    assert fetch_available(client, [key]) == {key: 8}
+    del future
+    wait_until(lambda: key not in client.cluster.scheduler.tasks)
+    assert fetch_available(client, [key]) == {}
+
+
+@pytest.mark.parametrize("partition", ["A", "B"])
+def test_tasks_fetch_for_themselves(client, partition):
+    def fetch(keys):
+        from distributed import get_client
+
+        return fetch_available(get_client(), keys)
+
+    future = Partition("A", client).submit(twice, 3)
+    wait([future], timeout=30)
+    fetched = Partition(partition, client).submit(fetch, [future.key]).result(30)
+    assert fetched == {future.key: 6}

@@ -1,0 +1,133 @@
+"""Pipes between processes, one of which may be killed."""
+
+import itertools
+import os
+import signal
+import subprocess
+import sys
+import time
+import uuid
+
+import dask
+import pytest
+from distributed import Client, Queue
+
+from poolpart import Partition, Pipe, PipeFailed
+
+LONG_S = 60.0
+
+
+def consume(pipe):
+    return list(pipe)
+
+
+def produce(pipe, number, count):
+    for item in range(count):
+        pipe.put((number, item))
+
+
+def greet_and_get(greetings, pipe):
+    """Say that this consumer is there, then wait for an item."""
+    greetings.put(os.getpid())
+    return pipe.get()
+
+
+def greet_and_get_from_queue(greetings, name):
+    """Do the same with a bare Queue."""
+    queue = Queue(name)
+    greetings.put(os.getpid())
+    return queue.get()
+
+
+def kill_a_waiting_consumer(client, function, greetings, what):
+    """Start a consumer on OTHER, kill its worker while it waits, and let nobody run it again."""
+    other = Partition("OTHER", client)
+    consumer = other.submit(function, greetings, what, key=f"consumer-{uuid.uuid4().hex}")
+    pid = greetings.get(timeout_s=LONG_S)
+    time.sleep(0.1)  # let it begin to wait
+    consumer.cancel()
+    os.kill(pid, signal.SIGKILL)
+    assert other.submit(os.getpid).result(LONG_S) != pid  # the nanny has started another
+
+
+def test_items_from_and_to_several_processes(processes, make_pipe):
+    pipe = make_pipe(processes, capacity=5)
+    lidar, gpu, other = (Partition(name, processes) for name in ("LIDAR", "GPU", "OTHER"))
+    consumers = [part.submit(consume, pipe) for part in (gpu, other)]
+    producers = [lidar.submit(produce, pipe, number, 50) for number in range(3)]
+    for producer in producers:
+        producer.result(LONG_S)
+    pipe.close()
+    received = [consumer.result(LONG_S) for consumer in consumers]
+    assert sorted(itertools.chain(*received)) == [(n, i) for n in range(3) for i in range(50)]
+    for items in received:  # each producer's items stay in order
+        for number in range(3):
+            mine = [item for n, item in items if n == number]
+            assert mine == sorted(mine)
+
+
+def test_large_items_and_nested_ones(processes, make_pipe):
+    pipe = make_pipe(processes, capacity=2)
+    consumer = Partition("GPU", processes).submit(consume, pipe)
+    items = [bytes(5_000_000), {"keys": ["a", 1, None], "x": 2.5}]
+    for item in items:
+        pipe.put(item)
+    pipe.close()
+    large, nested = consumer.result(LONG_S)
+    assert large == items[0]
+    assert nested == {"keys": ("a", 1, None), "x": 2.5}  # lists come as tuples
+
+
+def test_a_consumer_that_is_killed_while_it_waits_swallows_nothing(processes, make_pipe):
+    greetings, pipe = make_pipe(processes), make_pipe(processes, capacity=10)
+    kill_a_waiting_consumer(processes, greet_and_get, greetings, pipe)
+    for item in range(8):
+        pipe.put(item)
+    pipe.close()
+    assert list(pipe) == list(range(8))
+
+
+def test_a_consumer_of_a_bare_queue_does(processes, make_pipe):
+    """The test above can fail: this is what it would see."""
+    greetings, queue = make_pipe(processes), Queue(f"bare-{uuid.uuid4().hex}", client=processes)
+    kill_a_waiting_consumer(processes, greet_and_get_from_queue, greetings, queue.name)
+    for item in range(8):
+        queue.put(item)
+    assert len(queue.get(batch=True)) < 8
+
+
+def test_deleting_forgets_consumers_that_were_killed(processes, make_pipe, wait_until):
+    def names(dask_scheduler):
+        queues = dask_scheduler.extensions["queues"]
+        variables = dask_scheduler.extensions["variables"]
+        return {*queues.queues, *queues.client_refcount, *variables.variables}
+
+    greetings, pipe = make_pipe(processes), make_pipe(processes)
+    kill_a_waiting_consumer(processes, greet_and_get, greetings, pipe)
+    assert {pipe.name, greetings.name} <= processes.run_on_scheduler(names)
+    pipe.delete()
+    greetings.delete()
+    assert not {pipe.name, greetings.name} & processes.run_on_scheduler(names)
+    assert not any(pipe.name in name for name in processes.cluster.scheduler.clients)
+
+
+def test_a_pipe_whose_scheduler_has_died_raises():
+    command = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1"]
+    command += ["--port", "0", "--dashboard-address", "127.0.0.1:0"]
+    scheduler = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    try:
+        address = next(line.split()[-1] for line in scheduler.stderr if "Scheduler at:" in line)
+        with (
+            dask.config.set({"distributed.comm.timeouts.connect": "1s"}),
+            Client(address) as client,
+        ):
+            pipe = Pipe("orphan", 1, client).create()
+            assert pipe.depth == 0
+            scheduler.kill()
+            with pytest.raises(OSError):
+                pipe.get(timeout_s=LONG_S)
+            with pytest.raises((OSError, RuntimeError, PipeFailed)):
+                pipe.put(1, timeout_s=LONG_S)
+    finally:
+        scheduler.kill()
+        scheduler.communicate()

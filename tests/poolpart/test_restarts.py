@@ -1,0 +1,101 @@
+"""Workers that are killed come back into their partition, and tasks that waited run."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+from distributed import Client, get_worker
+
+from poolpart import Partition, Pool
+
+LONG_S = 60.0
+
+
+def here():
+    return str(get_worker().name)
+
+
+def addresses(client):
+    """Addresses of the workers by name."""
+    workers = client.scheduler_info(n_workers=-1)["workers"].items()
+    return {str(worker["name"]): address for address, worker in workers}
+
+
+def kill(client, name):
+    """Kill a worker's process; returns the address that it had."""
+    address = addresses(client)[name]
+    os.kill(client.run(os.getpid, workers=[address])[address], signal.SIGKILL)
+    return address
+
+
+def kill_and_submit_at_once(client, partition, name, count=5):
+    """Kill a partition's only worker and submit before the scheduler knows of it."""
+    kill(client, name)
+    return [partition.submit(here) for _ in range(count)]
+
+
+def test_a_partition_made_at_run_time(nannies, wait_until):
+    part, rest = Pool.from_client(nannies).partition("P", workers=[1], slots=3)
+    for _ in range(2):
+        waiting = kill_and_submit_at_once(nannies, part, "1")
+        assert [future.result(LONG_S) for future in waiting] == ["1"] * 5
+        assert [(w.name, w.resources) for w in part.workers] == [("1", {"P": 3})]
+    # The other worker belongs to no partition, and stays so.
+    assert rest.names == ["0"]
+    killed = kill(nannies, "0")
+    wait_until(lambda: addresses(nannies).get("0", killed) != killed)
+    assert [worker.name for worker in part.workers] == ["1"]
+
+
+def test_a_partition_that_was_made_twice_keeps_the_later_slots(nannies):
+    pool = Pool.from_client(nannies)
+    pool.partition("P", workers=["0"], slots=1)
+    part, _ = pool.partition("P", n_workers=1, slots=4)
+    waiting = kill_and_submit_at_once(nannies, part, "0")
+    assert [future.result(LONG_S) for future in waiting] == ["0"] * 5
+    assert [(w.name, w.resources) for w in part.workers] == [("0", {"P": 4})]
+
+
+def test_every_worker_of_two_partitions_at_once(nannies):
+    one, rest = Pool.from_client(nannies).partition("ONE", n_workers=1)
+    two, _ = rest.partition("TWO", n_workers=1)
+    nannies.restart()
+    for part in (one, two):
+        assert (len(part), part.slots) == (1, 1)
+        name = part.workers[0].name
+        assert part.submit(here).result(LONG_S) == name
+
+
+def test_a_partition_of_a_cluster_declared_so(processes):
+    gpu = Partition("GPU", processes)
+    waiting = kill_and_submit_at_once(processes, gpu, "GPU-0")
+    assert [future.result(LONG_S) for future in waiting] == ["GPU-0"] * 5
+
+
+@pytest.fixture
+def nameless():
+    """Client of a cluster from the command line, whose worker was given no name."""
+    scheduler = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1"]
+    scheduler += ["--port", "0", "--dashboard-address", "127.0.0.1:0"]
+    with subprocess.Popen(scheduler, stderr=subprocess.PIPE, text=True) as first:
+        address = next(line.split()[-1] for line in first.stderr if "Scheduler at:" in line)
+        worker = [sys.executable, "-m", "distributed.cli.dask_worker", address, "--nthreads", "1"]
+        worker += ["--host", "127.0.0.1", "--no-dashboard"]
+        with subprocess.Popen(worker, stderr=subprocess.DEVNULL) as second:
+            with Client(address) as client:
+                client.wait_for_workers(1, timeout=LONG_S)
+                yield client
+            second.send_signal(signal.SIGINT)
+            second.wait(LONG_S)
+        first.send_signal(signal.SIGINT)
+
+
+def test_a_worker_without_a_name(nameless):
+    pool = Pool.from_client(nameless)
+    assert pool.names == [worker.address for worker in pool]
+    part, _ = pool.partition("P", n_workers=1)
+    waiting = kill_and_submit_at_once(nameless, part, pool.names[0])
+    assert len({future.result(LONG_S) for future in waiting}) == 1
+    assert [worker.resources for worker in part.workers] == [{"P": 1}]
