@@ -12,16 +12,22 @@ from numpy.typing import NDArray
 
 from .backend import Backend, Found
 from .clip import clip
+from .hits import Returns
 from .mesh import LocalMesh
-from .rays import Rays
+from .rays import Pattern, Rays
 from .refine import Refiner
 from .tree import PAD
+from .workspace import Workspace
 
 _MISS = 0xFFFFFFFF
 
 # Embree decides in float32: a start this much farther on, in local units, is surely beyond a
 # surface that refinement put just before the start.
 _NUDGE = 2.0**-20
+
+# A ray that starts farther from zero than this, in local units, is begun at the scene's box:
+# then float32 rounds by the scene's size, not by the way to it.
+_NEAR = 2.0
 
 
 @dataclass(frozen=True)
@@ -45,7 +51,8 @@ class EmbreeBackend(Backend):
     """
 
     name: ClassVar[str] = "embree"
-    chunk: ClassVar[int] = 1 << 17
+    # Rays and answers of a chunk, 100 bytes a ray, stay in a core's level 2 cache.
+    chunk: ClassVar[int] = 1 << 14
 
     @classmethod
     def missing(cls) -> str:
@@ -82,77 +89,128 @@ class EmbreeBackend(Backend):
 
     def closest(self, rays: Rays, weights: bool) -> Found:
         """See `Backend.closest`."""
-        origins, directions = self._mesh.to_local(rays.origins), rays.directions
-        t_min, t_max = rays.t_min * self._mesh.scale, rays.t_max * self._mesh.scale
-        hits = self._cast(origins, directions, 0.0)
-        early = hits.t < t_min
-        if early.any():
-            hits = self._beyond(hits, early, origins, directions, t_min)
-        if t_max < np.inf:
-            hits = hits.only(hits.t <= t_max)
+        origins, scale = self._mesh.to_local(rays.origins), self._mesh.scale
+        hits = self._within(rays.directions, None, origins, rays.t_min * scale, rays.t_max * scale)
         u = v = np.zeros(0)
         if weights:
             at = _of(origins, hits.ray)
-            u, v = self._refine.weights(at, directions[hits.ray], hits.place)
+            u, v = self._refine.weights(at, rays.directions[hits.ray], hits.place)
         return Found(hits.ray, hits.t, self._mesh.index[hits.place], u, v)
+
+    def scan(
+        self,
+        pattern: Pattern,
+        window: tuple[int, int],
+        origin: NDArray[np.float64],
+        rotation: NDArray[np.float64] | None,
+        interval: tuple[float, float],
+    ) -> Returns:
+        """See `Backend.scan`; rays are turned where Embree reads them, a chunk at a time."""
+        origins, scale = self._mesh.to_local(origin), self._mesh.scale
+        t_min, t_max = interval[0] * scale, interval[1] * scale
+        parts = [_Pairs(np.zeros(0, np.intp), np.zeros(0), np.zeros(0, np.intp))]
+        first, last = window
+        for start in range(first, last, self.chunk):
+            directions = pattern.directions[start : min(start + self.chunk, last)]
+            hits = self._within(directions, rotation, origins, t_min, t_max)
+            parts.append(_Pairs(hits.ray + (start - first), hits.t, hits.place))
+        hits = _joined(parts)
+        return Returns(hits.ray.astype(np.int64), hits.t / scale, self._mesh.index[hits.place])
+
+    def _within(
+        self,
+        directions: NDArray[np.float64],
+        rotation: NDArray[np.float64] | None,
+        origins: NDArray[np.float64],
+        t_min: float,
+        t_max: float,
+    ) -> _Pairs:
+        """Closest hits between two distances of rays whose directions are yet to be turned."""
+        if self._scene is None or not len(directions):
+            return _Pairs(np.zeros(0, np.intp), np.zeros(0), np.zeros(0, np.intp))
+        desk = self._desk(len(directions))
+        unit = desk.turn(directions, rotation)
+        hits = self._cast(desk, unit, origins, 0.0)
+        early = hits.t < t_min
+        if early.any():
+            hits = self._beyond(desk, hits, early, unit, origins, t_min)
+        return hits.only(hits.t <= t_max) if t_max < np.inf else hits
 
     def _beyond(
         self,
+        desk: Workspace,
         hits: _Pairs,
         early: NDArray[np.bool_],
+        unit: NDArray[np.float64],
         origins: NDArray[np.float64],
-        directions: NDArray[np.float64],
         t_min: float,
     ) -> _Pairs:
         """Replace hits before `t_min` by the next ones behind it."""
         parts = [hits.only(~early)]
         ray = hits.ray[early]
+        directions = unit[:, ray].T  # a copy: the workspace is about to be used again
         for start in (t_min, t_min + _NUDGE, t_min + 4 * _NUDGE):
-            again = self._cast(_of(origins, ray), directions[ray], start)
-            again = _Pairs(ray[again.ray], again.t, again.place)
-            parts.append(again.only(again.t >= t_min))
-            ray = again.ray[again.t < t_min]
+            again = self._cast(desk, desk.turn(directions, None), _of(origins, ray), start)
+            parts.append(_Pairs(ray[again.ray], again.t, again.place).only(again.t >= t_min))
+            left = again.ray[again.t < t_min]
+            ray, directions = ray[left], directions[left]
             if not len(ray):
                 break
-        joined = _Pairs(
-            np.concatenate([part.ray for part in parts]),
-            np.concatenate([part.t for part in parts]),
-            np.concatenate([part.place for part in parts]),
-        )
+        joined = _joined(parts)
         return joined.only(np.argsort(joined.ray))
 
     def _cast(
-        self, origins: NDArray[np.float64], directions: NDArray[np.float64], start: float
+        self,
+        desk: Workspace,
+        unit: NDArray[np.float64],
+        origins: NDArray[np.float64],
+        start: float,
     ) -> _Pairs:
-        """Closest hits at or behind `start`, up to float32 rounding; lengths are local."""
-        n = len(directions)
-        if self._scene is None or not n:
-            return _Pairs(np.zeros(0, np.intp), np.zeros(0), np.zeros(0, np.intp))
-        buffer = self._rows(n)
-        buffer[:, 3:] = directions
+        """Closest hits at or behind `start`, up to float32 rounding; lengths are local.
+
+        Parameters
+        ----------
+        desk
+            Its rows hold the directions already.
+        unit
+            (3, n): the same directions in float64.
+        origins
+            (n, 3) or (1, 3).
+        start
+            Distance along the rays.
+        """
+        rows = desk.rows(unit.shape[1])
         begin = np.zeros(1)
-        if start == 0 and ((origins >= self._low) & (origins <= self._high)).all():
-            buffer[:, :3] = origins
+        near = np.abs(origins).max(axis=1) <= _NEAR
+        if start == 0 and near.all():
+            rows[:, :3] = origins
         else:
-            # Start at the scene's box: then float32 rounds by the scene's size, not by the way.
-            entry, _ = clip(self._low, self._high, origins, directions)
-            begin = np.maximum(entry, start)
+            entry, _ = clip(self._low, self._high, origins, unit.T)
+            begin = np.maximum(np.where(near, 0, entry), start)
             # From so far away that float64 cannot place the start, it stays near the scene.
-            buffer[:, :3] = np.clip(origins + begin[:, None] * directions, -2, 2)
-        answer = self._scene.cast_rays(self._tensor(buffer), nthreads=self._threads)
+            rows[:, :3] = np.clip(origins + begin[:, None] * unit.T, -_NEAR, _NEAR)
+        answer = self._scene.cast_rays(self._tensor(rows), nthreads=self._threads)
         face = answer["primitive_ids"].numpy()
         ray = np.flatnonzero(face != _MISS)
-        rough = answer["t_hit"].numpy()[ray] + _of(begin, ray)
-        place = face[ray].astype(np.intp)
-        t = self._refine.distance(_of(origins, ray), directions.take(ray, axis=0), place, rough)
+        place = face.take(ray).astype(np.intp)
+        rough = answer["t_hit"].numpy().take(ray) + _of(begin, ray)
+        t = self._refine.distance(_of(origins, ray), unit.take(ray, axis=1), place, rough)
         return _Pairs(ray, t, place)
 
-    def _rows(self, n: int) -> NDArray[np.float32]:
-        """Room for n rays; kept, since fresh pages cost a quarter of what the cast does."""
-        kept: NDArray[np.float32] | None = getattr(self._local, "rows", None)
-        if kept is None or len(kept) < n:
-            kept = self._local.rows = np.empty((n, 6), np.float32)
-        return kept[:n]
+    def _desk(self, rays: int) -> Workspace:
+        """Workspace of this thread, for that many rays at least."""
+        kept: Workspace | None = getattr(self._local, "desk", None)
+        if kept is None or kept.size < rays:
+            kept = self._local.desk = Workspace(rays)
+        return kept
+
+
+def _joined(parts: list[_Pairs]) -> _Pairs:
+    return _Pairs(
+        np.concatenate([part.ray for part in parts]),
+        np.concatenate([part.t for part in parts]),
+        np.concatenate([part.place for part in parts]),
+    )
 
 
 def _of(values: NDArray[np.float64], rows: NDArray[np.intp]) -> NDArray[np.float64]:

@@ -32,23 +32,27 @@ class Refiner:
 
         Parameters
         ----------
-        origins, directions
-            (m, 3); origins may also be (1, 3).
+        origins
+            (m, 3) or (1, 3).
+        directions
+            (3, m): one row an axis, which is what makes this fast.
         place
             (m,): rows of the mesh's corners.
         rough
             (m,): distances in float32 accuracy.
         """
-        x, y, z, offset = self._planes.take(place, axis=0).T
+        # A row of planes is in one cache line; columns of them are what arithmetic is fast on.
+        x, y, z, offset = np.ascontiguousarray(self._planes.take(place, axis=0).T)
         ox, oy, oz = origins.T
-        dx, dy, dz = directions.T
+        dx, dy, dz = directions
+        offset -= (x * ox + y * oy) + z * oz
         with np.errstate(divide="ignore", invalid="ignore"):
-            t: Float = (offset - (x * ox + y * oy + z * oz)) / (x * dx + y * dy + z * dz)
+            t: Float = offset / ((x * dx + y * dy) + z * dz)
         far = np.flatnonzero(~(np.abs(t - rough) <= _TRUST))
         if len(far):
             # A grazing ray: the plane alone may be met anywhere, the triangle is not.
             at = origins if len(origins) == 1 else origins[far]
-            t[far] = self._grazing(at, directions[far], place[far], rough[far])
+            t[far] = self._grazing(at, directions[:, far].T, place[far], rough[far])
         return t
 
     def weights(
