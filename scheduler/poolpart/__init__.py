@@ -2,6 +2,7 @@
 
 from .backoff import Backoff
 from .errors import PipeClosed, PipeFailed, PoolError
+from .fetch import fetch_available
 from .ledger import Ledger
 from .local import local_cluster
 from .partition import Partition
@@ -24,6 +25,7 @@ __all__ = [
     "TaskRecord",
     "WorkerInfo",
     "assign_devices",
+    "fetch_available",
     "forget_pipes",
     "local_cluster",
     "placement_violations",

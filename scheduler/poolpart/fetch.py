@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
+import random
+from collections import defaultdict
 from collections.abc import Collection
 from typing import Any
 
@@ -13,7 +16,7 @@ from distributed.utils_comm import gather_from_workers
 def fetch_available(
     client: Client, keys: Collection[str], patience_s: float = 2.0
 ) -> dict[str, Any]:
-    """Those of the results that can be had now; ask again for the others.
+    """Fetch those of the results that can be had now; ask again for the others.
 
     `Client.gather` is the wrong tool for a long-running consumer. When a worker dies, a
     connection to it is tried for half a minute, and nothing else is delivered meanwhile; and
@@ -29,7 +32,8 @@ def fetch_available(
     keys
         Keys of tasks, finished or not.
     patience_s
-        Longest time to wait for a worker's answer, in seconds.
+        Longest time to wait for an answer of the scheduler, and then of each worker, in
+        seconds.
 
     Returns
     -------
@@ -37,15 +41,25 @@ def fetch_available(
         Results by key, possibly none.
     """
 
-    async def fetch() -> dict[str, Any]:
-        who_has = await client.scheduler.who_has(keys=list(keys))
-        data, _missing, _failed, _gone = await gather_from_workers(who_has, rpc=client.rpc)
-        return data
-
-    async def fetch_or_give_up() -> dict[str, Any]:
+    async def take(address: str, held: list[str]) -> dict[str, Any]:
+        who_has = {key: [address] for key in held}
         try:
-            return await wait_for(fetch(), timeout=patience_s)
+            data, *_ = await wait_for(gather_from_workers(who_has, rpc=client.rpc), patience_s)
         except TimeoutError:
             return {}
+        return data
 
-    return client.sync(fetch_or_give_up)
+    async def fetch() -> dict[str, Any]:
+        try:
+            who_has = await wait_for(client.scheduler.who_has(keys=list(keys)), patience_s)
+        except TimeoutError:
+            return {}
+        by_worker: dict[str, list[str]] = defaultdict(list)
+        for key, addresses in who_has.items():
+            if addresses:
+                # Any one of them: if it does not answer, the next call may ask another.
+                by_worker[random.choice(list(addresses))].append(key)
+        taken = await asyncio.gather(*(take(*worker) for worker in by_worker.items()))
+        return {key: result for data in taken for key, result in data.items()}
+
+    return client.sync(fetch)

@@ -1,12 +1,13 @@
 """Fetching what is there, without waiting for what is not."""
 
+import os
+import signal
 import uuid
 
 import pytest
 from distributed import Event, wait
 
-from poolpart import Partition
-from poolpart.fetch import fetch_available
+from poolpart import Partition, fetch_available
 
 
 def twice(x):
@@ -50,3 +51,15 @@ def test_tasks_fetch_for_themselves(client, partition):
     wait([future], timeout=30)
     fetched = Partition(partition, client).submit(fetch, [future.key]).result(30)
     assert fetched == {future.key: 6}
+
+
+def test_a_worker_that_does_not_answer_keeps_only_its_own_results(nannies):
+    futures = [nannies.submit(os.getpid, workers=[name], pure=False) for name in (0, 1)]
+    answering, stopped = (future.result(30) for future in futures)
+    os.kill(stopped, signal.SIGSTOP)
+    try:
+        fetched = fetch_available(nannies, [future.key for future in futures], patience_s=0.5)
+    finally:
+        os.kill(stopped, signal.SIGCONT)
+    assert fetched == {futures[0].key: answering}
+    assert len(fetch_available(nannies, [future.key for future in futures])) == 2
