@@ -179,16 +179,14 @@ class EmbreeBackend(Backend):
         start
             Distance along the rays.
         """
-        rows = desk.rows(unit.shape[1])
-        begin = np.zeros(1)
+        begin, starts = np.zeros(1), origins
         near = np.abs(origins).max(axis=1) <= _NEAR
-        if start == 0 and near.all():
-            rows[:, :3] = origins
-        else:
+        if start > 0 or not near.all():
             entry, _ = clip(self._low, self._high, origins, unit.T)
             begin = np.maximum(np.where(near, 0, entry), start)
             # From so far away that float64 cannot place the start, it stays near the scene.
-            rows[:, :3] = np.clip(origins + begin[:, None] * unit.T, -_NEAR, _NEAR)
+            starts = np.clip(origins + begin[:, None] * unit.T, -_NEAR, _NEAR)
+        rows = desk.start(unit.shape[1], starts)
         answer = self._scene.cast_rays(self._tensor(rows), nthreads=self._threads)
         face = answer["primitive_ids"].numpy()
         ray = np.flatnonzero(face != _MISS)

@@ -22,9 +22,28 @@ class Workspace:
         self._rows = np.empty((size, 6), np.float32)
         self._given, self._unit = np.empty((2, 3, size))
         self._product = np.empty(size)
+        self._origin: NDArray[np.float64] | None = None  # where all rows start, if at one point
 
-    def rows(self, n: int) -> NDArray[np.float32]:
-        """Origins and directions of n rays, side by side: (n, 6)."""
+    def start(self, n: int, origins: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Write where n rays start, and return their rows as an engine reads them.
+
+        Parameters
+        ----------
+        n
+            Number of rays.
+        origins
+            (n, 3), or (1, 3) for all: then nothing is written when it is the same as last time.
+
+        Returns
+        -------
+        (n, 6): origins, and the directions that `turn` wrote.
+        """
+        if len(origins) > 1:
+            self._origin = None
+            self._rows[:n, :3] = origins
+        elif self._origin is None or not np.array_equal(origins, self._origin):
+            self._origin = origins.copy()
+            self._rows[:, :3] = origins
         return self._rows[:n]
 
     def turn(
