@@ -118,12 +118,24 @@ def local_cluster(
         },
     }
     try:
-        return SpecCluster(workers=workers, scheduler=scheduler, silence_logs=logging.ERROR)
+        return _NannyCluster(workers=workers, scheduler=scheduler, silence_logs=logging.ERROR)
     except RuntimeError as error:
         raise PoolError(
             f"The workers did not start ({error.__cause__ or error}). Each imports the script "
             "that starts the cluster: do that under `if __name__ == '__main__':` in it."
         ) from error
+
+
+class _NannyCluster(SpecCluster):
+    """A cluster that leaves dead workers to their nannies.
+
+    A SpecCluster looks 15 seconds after a worker was lost whether one of its name is there,
+    and if not closes the nanny for good. A worker that dies twice within that time may be
+    starting just then, and would never come back.
+    """
+
+    def _update_worker_status(self, op: str, msg: Any) -> None:
+        super(SpecCluster, self)._update_worker_status(op, msg)
 
 
 def _check_count(name: str, count: int) -> None:

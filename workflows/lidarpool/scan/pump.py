@@ -33,6 +33,7 @@ BATCH_SECONDS = 0.05  # casting time that makes a batch worth its overhead
 BATCH_RAYS = 1_000_000  # bounds a batch's memory, at 16 bytes a hit and 24 a direction
 STALL_SECONDS = 20.0  # with nothing moving; then what was handed on is sent again
 LOOK_FOR_WORKERS_S = 1.0
+LAST_WORDS_S = 3.0  # for the stages to end after everything has arrived
 DELIVERY_CAPACITY = 16  # messages of at most `stages.DELIVERY_BYTES` on their way to the driver
 
 
@@ -99,7 +100,7 @@ class SurveyPump:
         self._greeted: Counter[str] = Counter()
         self._consumers = {SORT: 1, COLLECT: collectors}
         self._moved_at = time.monotonic()  # when something was last handed on or delivered
-        self._closed = False
+        self._closed_at: float | None = None  # when all had arrived and the pipes were closed
 
         def pipe(name: str, capacity: int) -> Pipe:
             return Pipe(f"lidarpool-{self.run_id}-{name}", capacity, client).create()
@@ -163,8 +164,15 @@ class SurveyPump:
 
     @property
     def finished(self) -> bool:
-        """Whether, after that, the stages have ended."""
-        return self._closed and all(future.done() for future in self._stages.values())
+        """Whether, after that, the stages have ended, or a moment has gone by.
+
+        One whose worker died in the last moment is run again by Dask; nobody needs that any
+        more, or waits for it long.
+        """
+        if self._closed_at is None:
+            return False
+        late = time.monotonic() - self._closed_at > LAST_WORDS_S
+        return late or all(future.done() for future in self._stages.values())
 
     def step(self) -> bool:
         """Do what can be done now; returns whether anything was.
@@ -175,7 +183,7 @@ class SurveyPump:
             If a task of the survey has failed, naming stage and scans.
         """
         self._check_tasks()
-        if self._closed:
+        if self._closed_at is not None:
             return False
         if time.monotonic() - self._looked_for_workers > LOOK_FOR_WORKERS_S:
             self._prepare_workers()
@@ -185,7 +193,7 @@ class SurveyPump:
         if self.complete:
             for inlet in self._inlets.values():
                 inlet.close()
-            self._closed = True
+            self._closed_at = time.monotonic()
         elif self._under_way and time.monotonic() - self._moved_at > STALL_SECONDS:
             for stage in self._inlets:
                 self._send_again(stage)
@@ -314,14 +322,14 @@ class SurveyPump:
             pipe.fail(reason)
         self.client.cancel([f for item in self._under_way for f in (item.frames, item.batch)])
 
-    def finish(self, timeout_s: float = 10.0) -> None:
+    def finish(self, timeout_s: float = LAST_WORDS_S) -> None:
         """Wait for the stages to end, take their records, and leave nothing on the scheduler."""
         deadline = time.monotonic() + timeout_s
         while not all(f.done() for f in self._stages.values()) and time.monotonic() < deadline:
             time.sleep(0.01)
         for future in self._stages.values():
             if future.status == "finished":
-                self.records.append(future.result(timeout=timeout_s))
+                self.records.append(future.result(timeout=10))
         pipes = (self._scans, self._deliveries, *self._inlets.values())
         forget_pipes(self.client, [pipe.name for pipe in pipes])
         self.client.cancel([*self._stages.values(), *self._prepared.values(), self._setup])
