@@ -21,3 +21,4 @@ def test_a_worker_that_is_slow_to_come_back_is_not_given_up():
         pid = client.run(os.getpid, workers=[address])[address]
         os.kill(pid, signal.SIGKILL)
         assert partition.submit(os.getpid).result(timeout=30) != pid
+        assert "OTHER-0" in cluster.workers
