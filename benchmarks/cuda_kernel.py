@@ -26,7 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from raybeam import Pattern, RayCaster, available_backends
-from raybeam.cuda_backend import CudaBackend, options, source
+from raybeam.cuda_backend import CudaBackend, flags
+from raybeam.cuda_module import source
 from raybeam.mesh import local_mesh
 
 Mesh = tuple[NDArray[np.float64], NDArray[np.int64]]
@@ -186,7 +187,7 @@ class Bench:
         grid = (-(-n // _BLOCK),)
         table = (*scene, origin, np.int32(0), rays, *limits, t, place)
         pattern = (*scene, pose, np.int32(1), rays, *limits, t, place)
-        get = self.engine._module.get_function
+        get = self.engine._kernels.module.get_function
         pattern_times = milliseconds(
             cupy, lambda: get("cast_pattern")(grid, (_BLOCK,), pattern), self.repeats
         )
@@ -220,8 +221,9 @@ class Bench:
 
     def variant(self, blocks: int) -> Any:
         """Compile cast_pattern so that `blocks` blocks fit on a multiprocessor."""
-        flags = (*options(self.engine._stack), f"-DBLOCKS={blocks}")
-        return self.cupy.RawModule(code=source(), options=flags).get_function("cast_pattern")
+        given = (*flags(self.engine._stack), f"-DBLOCKS={blocks}")
+        module = self.cupy.RawModule(code=source("intersect.cu"), options=given)
+        return module.get_function("cast_pattern")
 
     def brute_force(self, directions: Float) -> dict[str, float]:
         """Time of every ray against every triangle, on so many rays that it takes a moment."""
@@ -321,7 +323,7 @@ def measure(
         "cupy": cupy.__version__,
         "numpy": np.__version__,
         "python": platform.python_version(),
-        "kernels": attributes(bench.engine._module),
+        "kernels": attributes(bench.engine._kernels.module),
         "leaks": leaks(leak_rays),
         "scenes": results,
     }

@@ -46,7 +46,8 @@ class Backend(ABC):
 
     A backend is made with the mesh, the most CPU threads to use (None for its own choice) and
     the number of the CUDA device (None for the current one); each ignores what it has no use
-    for. It must offer `closest`; the rest may be overridden where the engine can do better.
+    for. It must offer `closest` and `along`; the rest may be overridden where the engine can do
+    better.
     """
 
     name: ClassVar[str]
@@ -65,6 +66,10 @@ class Backend(ABC):
     @abstractmethod
     def closest(self, rays: Rays, weights: bool) -> Found:
         """Closest hits of at most `chunk` rays; `weights` tells whether u and v are wanted."""
+
+    @abstractmethod
+    def along(self, rays: Rays) -> NDArray[np.int32]:
+        """Triangles that at most `chunk` rays meet, as often as they are met, in any order."""
 
     def cast(self, rays: Rays) -> Hits:
         """Closest hit of every ray."""
@@ -105,3 +110,24 @@ class Backend(ABC):
         """
         directions = rotated(pattern.directions[slice(*window)], rotation)
         return self.returns(Rays(origin, directions, *interval))
+
+    def count(self, rays: Rays, every: bool) -> NDArray[np.int64]:
+        """How many rays hit each triangle first or, if `every`, meet it at all: (face_count,)."""
+        counts = np.zeros(self._mesh.face_count, np.int64)
+        for start in range(0, len(rays), self.chunk):
+            part = rays.part(start, start + self.chunk)
+            np.add.at(counts, self.along(part) if every else self.closest(part, False).triangle, 1)
+        return counts
+
+    def count_scan(
+        self,
+        pattern: Pattern,
+        window: tuple[int, int],
+        origin: NDArray[np.float64],
+        rotation: NDArray[np.float64] | None,
+        interval: tuple[float, float],
+        every: bool,
+    ) -> NDArray[np.int64]:
+        """Like `count` for rows of a pattern, given as to `scan`."""
+        directions = rotated(pattern.directions[slice(*window)], rotation)
+        return self.count(Rays(origin, directions, *interval), every)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from .hits import Hits, Returns
 from .mesh import local_mesh
@@ -155,4 +155,53 @@ class RayCaster:
             check_origins(origin, 1),
             check_rotation(rotation),
             check_interval(t_min, t_max),
+        )
+
+    def count(
+        self,
+        origins: ArrayLike,
+        directions: ArrayLike,
+        t_min: float = 0.0,
+        t_max: float = np.inf,
+        *,
+        every: bool = False,
+    ) -> NDArray[np.int64]:
+        """How many of the rays hit each triangle: (face_count,).
+
+        Parameters and errors are those of `cast`, and:
+
+        Parameters
+        ----------
+        every
+            Count a ray for every triangle that it meets, not only for the closest. Of triangles
+            that a ray meets at one distance, as at a common edge, all are counted; the embree
+            backend counts one of them.
+
+        Examples
+        --------
+        >>> caster = RayCaster([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], backend="numpy")
+        >>> caster.count([0.25, 0.25, 3], [[0, 0, -1], [0, 0, 1]]).tolist()
+        [1]
+        """
+        return self._engine.count(check_rays(origins, directions, t_min, t_max), every)
+
+    def count_scan(
+        self,
+        pattern: Pattern,
+        origin: ArrayLike,
+        rotation: ArrayLike | None = None,
+        *,
+        window: tuple[int, int] | None = None,
+        t_min: float = 0.0,
+        t_max: float = np.inf,
+        every: bool = False,
+    ) -> NDArray[np.int64]:
+        """Count as `count` does, for a pattern cast from one pose as by `scan`."""
+        return self._engine.count_scan(
+            pattern,
+            pattern.window(*(window or (0, len(pattern)))),
+            check_origins(origin, 1),
+            check_rotation(rotation),
+            check_interval(t_min, t_max),
+            every,
         )

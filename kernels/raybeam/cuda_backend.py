@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-import importlib.resources
 import importlib.util
-from functools import lru_cache
+from collections.abc import Iterator
 from typing import Any, ClassVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
+from . import cuda_build
 from .backend import Backend, Found
+from .cuda_module import Kernels, options
+from .cuda_results import Packer, PinnedRoom
 from .hits import Returns
 from .layout import lay_out
 from .mesh import LocalMesh
 from .rays import Pattern, Rays
 
-_BLOCK = 128  # threads; intersect.cu is bound to it
 _STACK_STEP = 32
+_WORK = 1 << 28  # bytes on the device for rays and hits
 
 
 class CudaBackend(Backend):
@@ -26,6 +28,7 @@ class CudaBackend(Backend):
 
     name: ClassVar[str] = "cuda"
     chunk: ClassVar[int] = 1 << 22  # rays: some 150 MB on the device
+    device_build: ClassVar[int] = 4096  # triangles from which the device builds the tree faster
 
     @classmethod
     def missing(cls) -> str:
@@ -55,15 +58,14 @@ class CudaBackend(Backend):
         super().__init__(mesh, threads, device)
         self._cupy = cupy = self._library()
         self._device = _device(cupy, device)
-        layout = lay_out(mesh)
         with self._device:
-            _check_memory(cupy, layout.nbytes)
-            tables = (layout.nodes, layout.triangles, layout.corners, layout.faces, layout.frame)
-            self._scene = tuple(cupy.asarray(table) for table in tables)
-            self._corners, self._faces, self._frame = self._scene[2:]
+            tables = self._tables(mesh)
             # In steps, so that scenes share what is compiled.
-            self._stack = -(-max(layout.stack, 1) // _STACK_STEP) * _STACK_STEP
-            self._module = _module(cupy, self._device.id, self._stack)
+            self._stack = -(-max(tables.stack, 1) // _STACK_STEP) * _STACK_STEP
+            self._kernels = Kernels(cupy, self._device.id, "intersect.cu", flags(self._stack))
+        self._corners, self._faces, self._frame = tables.corners, tables.faces, tables.frame
+        self._scene = (tables.nodes, tables.triangles, tables.corners, tables.faces, tables.frame)
+        self._room = PinnedRoom(cupy)
         # {pattern: its directions on the device}
         self._patterns: WeakKeyDictionary[Pattern, Any] = WeakKeyDictionary()
 
@@ -74,21 +76,58 @@ class CudaBackend(Backend):
 
         return cupy
 
+    def _tables(self, mesh: LocalMesh) -> cuda_build.Tables:
+        """Build the scene where that is faster, and where there is memory for it."""
+        cupy, n = self._cupy, len(mesh.corners)
+        free = _free(cupy)
+        if n >= max(self.device_build, 1) and cuda_build.BYTES * n + _WORK <= free:
+            tables = cuda_build.build(cupy, self._device.id, mesh)
+            cupy.get_default_memory_pool().free_all_blocks()  # several times what is kept
+            return tables
+        layout = lay_out(mesh)
+        need = layout.nbytes + _WORK
+        if need > free:
+            raise MemoryError(
+                f"The mesh needs {need / 2**20:.0f} MiB on the CUDA device and "
+                f"{free / 2**20:.0f} MiB are free: use a smaller mesh or backend 'embree'."
+            )
+        return cuda_build.Tables(
+            cupy.asarray(layout.nodes),
+            cupy.asarray(layout.triangles),
+            cupy.asarray(layout.corners),
+            cupy.asarray(layout.faces),
+            cupy.asarray(layout.frame),
+            layout.stack,
+        )
+
     def closest(self, rays: Rays, weights: bool) -> Found:
         """See `Backend.closest`."""
         cp = self._cupy
         with self._device:
-            stride = np.int32(0 if len(rays.origins) == 1 else 3)
-            table = (cp.asarray(rays.origins), stride, cp.asarray(rays.directions))
-            limits = (np.float64(t * self._mesh.scale) for t in (rays.t_min, rays.t_max))
-            count = np.int64(len(rays))
-            ray, t, place = self._hits("cast_table", len(rays), (*table, count, *limits))
+            table = self._table(rays)
+            t, place = self._cast("cast_table", len(rays), self._limited(table, rays))
+            ray, *hits = self._packer().add(t, place, 0, 1.0)
             u = v = cp.empty(0)
             if weights:
                 u, v = cp.empty(len(ray)), cp.empty(len(ray))
-                hits = (ray, place, np.int64(len(ray)), u, v)
-                self._launch("weigh_table", len(ray), (self._corners, self._frame, *table, *hits))
-            return Found(ray.get(), t.get(), self._faces[place].get(), u.get(), v.get())
+                given = (self._corners, self._frame, *table, ray, place, np.int64(len(ray)))
+                self._kernels.run("weigh_table", len(ray), *given, u, v)
+            return Found(*(array.get() for array in (ray, *hits, u, v)))
+
+    def along(self, rays: Rays) -> NDArray[np.int32]:
+        """See `Backend.along`."""
+        triangles = np.arange(self._mesh.face_count, dtype=np.int32)
+        return np.repeat(triangles, self.count(rays, every=True))
+
+    def returns(self, rays: Rays) -> Returns:
+        """See `Backend.returns`."""
+        with self._device:
+            packer = self._packer()
+            for start in range(0, len(rays), self.chunk):
+                part = rays.part(start, start + self.chunk)
+                given = self._limited(self._table(part), part)
+                packer.add(*self._cast("cast_table", len(part), given), start, self._mesh.scale)
+            return packer.returns()
 
     def scan(
         self,
@@ -99,57 +138,92 @@ class CudaBackend(Backend):
         interval: tuple[float, float],
     ) -> Returns:
         """See `Backend.scan`; the rays are made on the device."""
-        cp = self._cupy
-        ray = [np.zeros(0, np.int64)]
-        distance = [np.zeros(0)]
-        triangle = [np.zeros(0, np.int32)]
-        turn = np.eye(3) if rotation is None else rotation
         with self._device:
-            if pattern not in self._patterns:
-                self._patterns[pattern] = cp.asarray(pattern.directions)
-            directions = self._patterns[pattern][slice(*window)]
-            pose = cp.asarray(np.concatenate([origin.ravel(), turn.ravel()]))
-            limits = [np.float64(t * self._mesh.scale) for t in interval]
-            for start in range(0, len(directions), self.chunk):
-                part = directions[start : start + self.chunk]
-                rays = (pose, np.int32(rotation is not None), part, np.int64(len(part)), *limits)
-                hit, t, place = self._hits("cast_pattern", len(part), rays)
-                ray.append(hit.get() + start)
-                distance.append(t.get() / self._mesh.scale)
-                triangle.append(self._faces[place].get())
-        return Returns(np.concatenate(ray), np.concatenate(distance), np.concatenate(triangle))
+            packer = self._packer()
+            for start, n, rays in self._turned(pattern, window, origin, rotation, interval):
+                packer.add(*self._cast("cast_pattern", n, rays), start, self._mesh.scale)
+            return packer.returns()
 
-    def _hits(self, kernel: str, n: int, rays: tuple[Any, ...]) -> tuple[Any, Any, Any]:
-        """Run a cast and keep the hits: ray, local distance, place; on the device."""
+    def count(self, rays: Rays, every: bool) -> NDArray[np.int64]:
+        """See `Backend.count`; only the counts leave the device."""
+        with self._device:
+            counts = self._cupy.zeros(self._mesh.face_count, np.int64)
+            for start in range(0, len(rays), self.chunk):
+                part = rays.part(start, start + self.chunk)
+                given = self._limited(self._table(part), part)
+                self._tally("table", len(part), given, every, counts)
+            return self._cupy.asnumpy(counts)
+
+    def count_scan(
+        self,
+        pattern: Pattern,
+        window: tuple[int, int],
+        origin: NDArray[np.float64],
+        rotation: NDArray[np.float64] | None,
+        interval: tuple[float, float],
+        every: bool,
+    ) -> NDArray[np.int64]:
+        """See `Backend.count_scan`; the rays are made on the device."""
+        with self._device:
+            counts = self._cupy.zeros(self._mesh.face_count, np.int64)
+            for _, n, rays in self._turned(pattern, window, origin, rotation, interval):
+                self._tally("pattern", n, rays, every, counts)
+            return self._cupy.asnumpy(counts)
+
+    # ---- arguments of the kernels ----
+
+    def _table(self, rays: Rays) -> tuple[Any, ...]:
+        stride = np.int32(0 if len(rays.origins) == 1 else 3)
+        return self._cupy.asarray(rays.origins), stride, self._cupy.asarray(rays.directions)
+
+    def _limited(self, table: tuple[Any, ...], rays: Rays) -> tuple[Any, ...]:
+        limits = (np.float64(t * self._mesh.scale) for t in (rays.t_min, rays.t_max))
+        return (*table, np.int64(len(rays)), *limits)
+
+    def _turned(
+        self,
+        pattern: Pattern,
+        window: tuple[int, int],
+        origin: NDArray[np.float64],
+        rotation: NDArray[np.float64] | None,
+        interval: tuple[float, float],
+    ) -> Iterator[tuple[int, int, tuple[Any, ...]]]:
+        """Chunks of a pattern: number of the first ray, how many, and arguments for them."""
         cp = self._cupy
-        t, place = cp.empty(n), cp.empty(n, np.int32)
-        self._launch(kernel, n, (*self._scene, *rays, t, place))
-        # Compacted by a scan in ray order, not by atomics: the same bytes on every run.
-        ray = cp.flatnonzero(place >= 0)  # int64, as weigh_table takes it
-        return ray, t[ray], place[ray]
+        if pattern not in self._patterns:
+            self._patterns[pattern] = cp.asarray(pattern.directions)
+        directions = self._patterns[pattern][slice(*window)]
+        turn = np.eye(3) if rotation is None else rotation
+        pose = cp.asarray(np.concatenate([origin.ravel(), turn.ravel()]))
+        limits = [np.float64(t * self._mesh.scale) for t in interval]
+        for start in range(0, len(directions), self.chunk):
+            part = directions[start : start + self.chunk]
+            n = len(part)
+            yield start, n, (pose, np.int32(rotation is not None), part, np.int64(n), *limits)
 
-    def _launch(self, kernel: str, n: int, arguments: tuple[Any, ...]) -> None:
-        if n:
-            self._module.get_function(kernel)((-(-n // _BLOCK),), (_BLOCK,), arguments)
+    # ---- casts ----
+
+    def _packer(self) -> Packer:
+        return Packer(self._cupy, self._kernels, self._faces, self._room)
+
+    def _cast(self, kernel: str, n: int, rays: tuple[Any, ...]) -> tuple[Any, Any]:
+        """Local distance and place of the closest hit of each ray, on the device."""
+        t, place = self._cupy.empty(n), self._cupy.empty(n, np.int32)
+        self._kernels.run(kernel, n, *self._scene, *rays, t, place)
+        return t, place
+
+    def _tally(self, kind: str, n: int, rays: tuple[Any, ...], every: bool, counts: Any) -> None:
+        """Add to the counts of a chunk's triangles."""
+        if every:
+            self._kernels.run(f"count_{kind}", n, *self._scene, *rays, counts)
+            return
+        _, place = self._cast(f"cast_{kind}", n, rays)
+        self._kernels.run("count_closest", n, self._faces, place, np.int64(n), counts)
 
 
-def source() -> str:
-    """Text of intersect.cu, with its name for the compiler's messages."""
-    text = importlib.resources.files(__package__).joinpath("intersect.cu").read_text("utf-8")
-    return f'#line 1 "intersect.cu"\n{text}'
-
-
-def options(stack: int) -> tuple[str, ...]:
-    """Compiler options for `source`; `stack` is the most nodes that may wait in a walk."""
-    return ("-std=c++17", "-fmad=false", f"-DSTACK={stack}")
-
-
-@lru_cache(maxsize=32)
-def _module(cupy: Any, device: int, stack: int) -> Any:
-    """Compile for the current device, once."""
-    module = cupy.RawModule(code=source(), options=options(stack))
-    module.compile()
-    return module
+def flags(stack: int) -> tuple[str, ...]:
+    """Compiler options of intersect.cu; `stack` is the most nodes that may wait in a walk."""
+    return options(STACK=stack)
 
 
 def _device(cupy: Any, number: int | None) -> Any:
@@ -160,12 +234,7 @@ def _device(cupy: Any, number: int | None) -> Any:
     return cupy.cuda.Device(number)
 
 
-def _check_memory(cupy: Any, need: int) -> None:
-    """Raise MemoryError when the tables, and room to work, do not fit on the device."""
+def _free(cupy: Any) -> int:
+    """Bytes that can be had on the current device."""
     free = cupy.cuda.runtime.memGetInfo()[0] + cupy.get_default_memory_pool().free_bytes()
-    work = 1 << 28
-    if need + work > free:
-        raise MemoryError(
-            f"The mesh needs {(need + work) / 2**20:.0f} MiB on the CUDA device and "
-            f"{free / 2**20:.0f} MiB are free: use a smaller mesh or backend 'embree'."
-        )
+    return int(free)

@@ -117,6 +117,25 @@ class EmbreeBackend(Backend):
         hits = _joined(parts)
         return Returns(hits.ray.astype(np.int64), hits.t / scale, self._mesh.index[hits.place])
 
+    def along(self, rays: Rays) -> NDArray[np.int32]:
+        """See `Backend.along`; of triangles at one distance Open3D lists one."""
+        if self._scene is None or not len(rays):
+            return np.zeros(0, np.int32)
+        origins, scale = self._mesh.to_local(rays.origins), self._mesh.scale
+        entry, _ = clip(self._low, self._high, origins, rays.directions)
+        rows = np.empty((len(rays), 6), np.float32)
+        rows[:, :3] = np.clip(origins + entry[:, None] * rays.directions, -_NEAR, _NEAR)
+        rows[:, 3:] = rays.directions
+        answer = self._scene.list_intersections(self._tensor(rows), nthreads=self._threads)
+        ray = answer["ray_ids"].numpy().astype(np.intp)
+        place = answer["primitive_ids"].numpy().astype(np.intp)
+        rough = answer["t_hit"].numpy() + entry.take(ray)
+        unit = rays.directions.take(ray, axis=0).T
+        t = self._refine.distance(_of(origins, ray), unit, place, rough)
+        hit = (t >= rays.t_min * scale) & (t <= rays.t_max * scale)
+        found: NDArray[np.int32] = self._mesh.index[place[hit]]
+        return found
+
     def _within(
         self,
         directions: NDArray[np.float64],

@@ -25,6 +25,7 @@
 // Comparisons are written so that one with NaN is false, and false means "no hit".
 
 typedef long long Count;
+typedef unsigned long long Sum;
 
 #ifdef BLOCKS
 #define BOUNDS __launch_bounds__(128, BLOCKS)
@@ -54,12 +55,6 @@ struct Ray {
 // What `decide` found: weights of the corners times det, and distance.
 struct Exact {
     double a, b, c, det, t;
-};
-
-// The closest hit so far: local distance, and place in the tables (-1: none yet).
-struct Best {
-    double t;
-    int place;
 };
 
 // ---- where rays come from ----
@@ -317,10 +312,10 @@ __device__ __forceinline__ bool may_hit(const float4* record, const Walk& w)
            t >= fmaf(w.from, size, -g.w) && t <= fmaf(w.to, size, g.w);
 }
 
-// Test the triangles of a leaf.
-template <class Rays>
+// Test the triangles of a leaf; hits that are not too near go to the taker.
+template <class Rays, class Taker>
 __device__ __forceinline__ void test_leaf(
-    const Scene& scene, const Rays& rays, Count i, int code, double t_min, Walk& w, Best& best)
+    const Scene& scene, const Rays& rays, Count i, int code, double t_min, Walk& w, Taker& taker)
 {
     const int leaf = ~code;
     const int first = leaf >> LEAF_BITS, last = first + (leaf & ((1 << LEAF_BITS) - 1));
@@ -330,25 +325,17 @@ __device__ __forceinline__ void test_leaf(
         // The ray is loaded again: keeping it in double through the walk costs more registers
         // than it saves time, since this happens once or twice a ray.
         if (!decide(scene, rays.load(scene, i), place, hit) || !(hit.t >= t_min)) continue;
-        const bool tie = hit.t == best.t &&
-                         (best.place < 0 || scene.faces[place] < scene.faces[best.place]);
-        if (hit.t < best.t || tie) {
-            best.t = hit.t;
-            best.place = place;
-            w.to = limit(hit.t, w.entry);
-        }
+        taker.take(scene, place, hit.t, w);
     }
 }
 
-template <class Rays>
-__device__ __forceinline__ Best closest(
-    const Scene& scene, const Rays& rays, Count i, double t_min, double t_max)
+// Show the taker all triangles that the ray may still be of use with.
+template <class Rays, class Taker>
+__device__ __forceinline__ void walk(
+    const Scene& scene, const Rays& rays, Count i, double t_min, double t_max, Taker& taker)
 {
-    Best best;
-    best.t = t_max;
-    best.place = -1;
     Walk w;
-    if (!begin(scene, rays.load(scene, i), t_min, t_max, w)) return best;
+    if (!begin(scene, rays.load(scene, i), t_min, t_max, w)) return;
     Stack stack;
     stack.top = 0;
     int node = 0;
@@ -356,12 +343,41 @@ __device__ __forceinline__ Best closest(
         if (node >= 0) {
             node = descend(scene.nodes, node, w, stack);
         } else {
-            test_leaf(scene, rays, i, node, t_min, w, best);
+            test_leaf(scene, rays, i, node, t_min, w, taker);
             node = stack.pop(w.to);
         }
     }
-    return best;
 }
+
+// ---- what is made of hits ----
+
+// Keeps the closest: local distance, and place in the tables (-1: none yet).
+struct Closest {
+    double t;
+    int place;
+
+    __device__ __forceinline__ void take(const Scene& scene, int at, double distance, Walk& w)
+    {
+        const bool tie =
+            distance == t && (place < 0 || scene.faces[at] < scene.faces[place]);
+        if (distance < t || tie) {
+            t = distance;
+            place = at;
+            w.to = limit(distance, w.entry);
+        }
+    }
+};
+
+// Counts every triangle on the way, by the caller's number.
+struct Tally {
+    double t_max;
+    Sum* counts;
+
+    __device__ __forceinline__ void take(const Scene& scene, int at, double distance, Walk& w)
+    {
+        if (distance <= t_max) atomicAdd(counts + scene.faces[at], 1ull);
+    }
+};
 
 // ---- kernels: scene, rays in, hits out ----
 
@@ -379,7 +395,8 @@ extern "C" __global__ void BOUNDS cast_table(
     if (i >= count) return;
     const Scene scene = {nodes, triangles, corners, faces, frame};
     const TableRays rays = {origins, origin_stride, directions};
-    const Best best = closest(scene, rays, i, t_min, t_max);
+    Closest best = {t_max, -1};
+    walk(scene, rays, i, t_min, t_max, best);
     place[i] = best.place;
     if (best.place >= 0) distance[i] = best.t;
 }
@@ -397,12 +414,13 @@ extern "C" __global__ void BOUNDS cast_pattern(
     if (i >= count) return;
     const Scene scene = {nodes, triangles, corners, faces, frame};
     const PatternRays rays = {pose, directions, turned};
-    const Best best = closest(scene, rays, i, t_min, t_max);
+    Closest best = {t_max, -1};
+    walk(scene, rays, i, t_min, t_max, best);
     place[i] = best.place;
     if (best.place >= 0) distance[i] = best.t;
 }
 
-// Weights of the second and third corner for hits of cast_table: hit k is ray[k] at place[k].
+// Weights of the second and third corner for hits of cast_table, one a ray that is listed.
 extern "C" __global__ void BOUNDS weigh_table(
     const double* __restrict__ corners, const double* __restrict__ frame,
     const double* __restrict__ origins, int origin_stride,
@@ -415,7 +433,68 @@ extern "C" __global__ void BOUNDS weigh_table(
     const Scene scene = {0, 0, corners, 0, frame};
     const TableRays rays = {origins, origin_stride, directions};
     Exact hit;
-    decide(scene, rays.load(scene, ray[k]), place[k], hit);
+    decide(scene, rays.load(scene, ray[k]), place[ray[k]], hit);
     u[k] = hit.b / hit.det;
     v[k] = hit.c / hit.det;
+}
+
+// Count every triangle along rays from memory.
+extern "C" __global__ void BOUNDS count_table(
+    const float4* __restrict__ nodes, const float4* __restrict__ triangles,
+    const double* __restrict__ corners, const int* __restrict__ faces,
+    const double* __restrict__ frame,
+    const double* __restrict__ origins, int origin_stride,
+    const double* __restrict__ directions, Count count, double t_min, double t_max,
+    Sum* __restrict__ counts)
+{
+    const Count i = blockIdx.x * (Count)blockDim.x + threadIdx.x;
+    if (i >= count) return;
+    const Scene scene = {nodes, triangles, corners, faces, frame};
+    const TableRays rays = {origins, origin_stride, directions};
+    Tally tally = {t_max, counts};
+    walk(scene, rays, i, t_min, t_max, tally);
+}
+
+// Count every triangle along the rays of a pattern.
+extern "C" __global__ void BOUNDS count_pattern(
+    const float4* __restrict__ nodes, const float4* __restrict__ triangles,
+    const double* __restrict__ corners, const int* __restrict__ faces,
+    const double* __restrict__ frame,
+    const double* __restrict__ pose, int turned,
+    const double* __restrict__ directions, Count count, double t_min, double t_max,
+    Sum* __restrict__ counts)
+{
+    const Count i = blockIdx.x * (Count)blockDim.x + threadIdx.x;
+    if (i >= count) return;
+    const Scene scene = {nodes, triangles, corners, faces, frame};
+    const PatternRays rays = {pose, directions, turned};
+    Tally tally = {t_max, counts};
+    walk(scene, rays, i, t_min, t_max, tally);
+}
+
+// ---- kernels: hits of a cast made smaller ----
+
+// Count the triangles of closest hits.
+extern "C" __global__ void BOUNDS count_closest(
+    const int* __restrict__ faces, const int* __restrict__ place, Count count,
+    Sum* __restrict__ counts)
+{
+    const Count i = blockIdx.x * (Count)blockDim.x + threadIdx.x;
+    if (i < count && place[i] >= 0) atomicAdd(counts + faces[place[i]], 1ull);
+}
+
+// Close up hits, in ray order: number of the ray, distance in metres, the caller's triangle.
+// `ends` are the sums of hits up to each ray, itself included; the first ray's number is `first`.
+extern "C" __global__ void BOUNDS pack(
+    const int* __restrict__ faces, const double* __restrict__ distance,
+    const int* __restrict__ place, const int* __restrict__ ends, Count count, Count first,
+    double scale, Count* __restrict__ ray, double* __restrict__ metres,
+    int* __restrict__ triangle)
+{
+    const Count i = blockIdx.x * (Count)blockDim.x + threadIdx.x;
+    if (i >= count || place[i] < 0) return;
+    const int k = ends[i] - 1;
+    ray[k] = first + i;
+    metres[k] = distance[i] / scale;
+    triangle[k] = faces[place[i]];
 }

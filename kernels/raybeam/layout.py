@@ -11,9 +11,9 @@ from .mesh import LocalMesh
 from .tree import PAD, WideTree, build_tree
 
 _WIDTH = 4  # seven float4 a node: one 128-byte line
-_LEAF_SIZE = 4
-_UNIT = 2.0**-24  # half the distance from 1 to the next float32
-_FLOOR = 1e-36  # products of tiny edges round by this much where float32 underflows
+LEAF_SIZE = 4
+UNIT = 2.0**-24  # half the distance from 1 to the next float32
+FLOOR = 1e-36  # products of tiny edges round by this much where float32 underflows
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Layout:
 
 def lay_out(mesh: LocalMesh) -> Layout:
     """Build the tree over a mesh and flatten both."""
-    tree = build_tree(mesh.corners, _WIDTH, _LEAF_SIZE)
+    tree = build_tree(mesh.corners, _WIDTH, LEAF_SIZE)
     corners = mesh.corners[tree.order]
     low, high = mesh.box
     return Layout(
@@ -90,13 +90,19 @@ def _records(corners: NDArray[np.float64]) -> NDArray[np.float32]:
     """
     first = corners[:, 0]
     edge, other = corners[:, 1] - first, corners[:, 2] - first
-    e, g = np.linalg.norm(edge, axis=1), np.linalg.norm(other, axis=1)
+    e, g = _lengths(edge), _lengths(other)
     out = np.empty((len(corners), 3, 4), np.float32)
     out[:, 0, :3], out[:, 1, :3], out[:, 2, :3] = first, edge, other
-    out[:, 0, 3] = _UNIT * g * (48 + 24 * e) + _FLOOR
-    out[:, 1, 3] = _UNIT * e * (56 + 24 * g) + _FLOOR
-    out[:, 2, 3] = _UNIT * e * g * 144 + _FLOOR
+    out[:, 0, 3] = UNIT * g * (48 + 24 * e) + FLOOR
+    out[:, 1, 3] = UNIT * e * (56 + 24 * g) + FLOOR
+    out[:, 2, 3] = UNIT * e * g * 144 + FLOOR
     return out.reshape(-1, 12)
+
+
+def _lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    x, y, z = vectors.T
+    length: NDArray[np.float64] = np.sqrt((x * x + y * y) + z * z)  # rounds as build.cu does
+    return length
 
 
 def _stack_need(tree: WideTree) -> int:

@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .backend import Backend, Found
+from .crossings import Crossings
 from .mesh import LocalMesh
 from .rays import Rays
-from .traverse import Walker
 from .tree import build_tree
 
 _WIDTH = 8
@@ -31,7 +32,7 @@ class NumpyBackend(Backend):
         self, mesh: LocalMesh, threads: int | None = None, device: int | None = None
     ) -> None:
         super().__init__(mesh, threads, device)
-        self._walker = Walker(mesh, build_tree(mesh.corners, _WIDTH, _LEAF_SIZE))
+        self._walker = Crossings(mesh, build_tree(mesh.corners, _WIDTH, _LEAF_SIZE))
 
     def closest(self, rays: Rays, weights: bool) -> Found:
         """See `Backend.closest`."""
@@ -40,3 +41,9 @@ class NumpyBackend(Backend):
         return self._walker.closest(
             origins, rays.directions, rays.t_min * scale, rays.t_max * scale
         )
+
+    def along(self, rays: Rays) -> NDArray[np.int32]:
+        """See `Backend.along`."""
+        origins = np.broadcast_to(self._mesh.to_local(rays.origins), rays.directions.shape)
+        scale = self._mesh.scale
+        return self._walker.along(origins, rays.directions, rays.t_min * scale, rays.t_max * scale)

@@ -1,6 +1,6 @@
 """Backends under test: the list grows with what the machine has.
 
-Beside the three real ones there is "source": intersect.cu compiled for the CPU.
+Beside the three real ones there is "source": the .cu files compiled for the CPU.
 """
 
 from __future__ import annotations
@@ -12,11 +12,12 @@ import subprocess
 from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 import pytest
 
-from raybeam import RayCaster, available_backends, registry
+from raybeam import RayCaster, available_backends, cuda_backend, cuda_build, registry
 from raybeam.cuda_backend import CudaBackend
 
 HERE = Path(__file__).parent
@@ -35,8 +36,18 @@ def pytest_collection_modifyitems(config, items):
 class Array(np.ndarray):
     """An array "on the device"."""
 
-    def get(self):
-        return np.array(self)
+    def get(self, out=None):
+        if out is None:
+            return np.array(self)
+        assert out.shape == self.shape
+        assert out.dtype == self.dtype
+        out[...] = self
+        return out
+
+    def set(self, values):
+        assert values.shape == self.shape
+        assert values.dtype == self.dtype
+        self[...] = values
 
 
 class Device(nullcontext):
@@ -48,17 +59,33 @@ class Device(nullcontext):
         pass
 
 
-KINDS = {np.int32: ctypes.c_int, np.int64: ctypes.c_longlong, np.float64: ctypes.c_double}
+class Pinned(bytearray):
+    """Page-locked memory; unlike a plain bytearray it can be referred to weakly."""
+
+
+KINDS = {
+    np.int32: ctypes.c_int, np.int64: ctypes.c_longlong, np.float64: ctypes.c_double,
+}  # fmt: skip
+
+
+def pointed(argument):
+    """A kernel's argument, as something that `ctypes.byref` can point to."""
+    if isinstance(argument, np.ndarray):
+        assert argument.flags.c_contiguous
+        return ctypes.c_void_p(argument.ctypes.data)
+    return KINDS[type(argument)](argument)
 
 
 class Kernels:
-    """Stands for CuPy's RawModule: the kernels of intersect.cu, run thread by thread."""
+    """Stands for CuPy's RawModule: the kernels of a .cu file, run thread by thread."""
 
-    library: ctypes.CDLL
+    libraries: ClassVar[dict[str, ctypes.CDLL]] = {}  # {name of the .cu file: compiled}
 
     def __init__(self, code, options):
-        stack = int(next(option for option in options if "STACK" in option).split("=")[1])
-        assert stack <= STACK
+        self.library = self.libraries[code.split('"')[1]]
+        for option in options:
+            if option.startswith("-DSTACK="):
+                assert int(option.partition("=")[2]) <= STACK
 
     def compile(self):
         pass
@@ -66,12 +93,10 @@ class Kernels:
     def get_function(self, name):
         def launch(grid, block, arguments):
             assert block == (128,)
-            plain = [
-                ctypes.c_void_p(a.ctypes.data) if isinstance(a, np.ndarray) else KINDS[type(a)](a)
-                for a in arguments
-            ]
-            assert all(a.flags.c_contiguous for a in arguments if isinstance(a, np.ndarray))
-            getattr(self.library, f"run_{name}")(ctypes.c_uint(grid[0]), *plain)
+            assert getattr(self.library, f"parameters_{name}")() == len(arguments)
+            values = [pointed(argument) for argument in arguments]
+            pointers = (ctypes.c_void_p * len(values))(*(ctypes.addressof(v) for v in values))
+            getattr(self.library, f"run_{name}")(ctypes.c_uint(grid[0]), pointers)
 
         launch.num_regs = launch.local_size_bytes = 0
         return launch
@@ -81,15 +106,30 @@ class Module(SimpleNamespace):
     __hash__ = object.__hash__
 
 
+def poisoned(shape, dtype=np.float64):
+    """Memory that nobody has written to yet."""
+    array = np.empty(shape, dtype)
+    array.view(np.uint8).fill(0xA5)
+    return array.view(Array)
+
+
 # As much of CuPy as the backend uses, on the CPU.
 HOST = Module(
     RawModule=Kernels,
     asarray=lambda a: np.array(a, order="C").view(Array),
-    empty=lambda n, dtype=np.float64: np.empty(n, dtype).view(Array),
-    flatnonzero=lambda a: np.flatnonzero(a).view(Array),
-    get_default_memory_pool=lambda: SimpleNamespace(free_bytes=lambda: 0),
+    asnumpy=np.array,
+    empty=poisoned,
+    zeros=lambda shape, dtype=np.float64: np.zeros(shape, dtype).view(Array),
+    arange=lambda n, dtype: np.arange(n, dtype=dtype).view(Array),
+    minimum=np.minimum,
+    argsort=np.argsort,
+    cumsum=np.cumsum,
+    get_default_memory_pool=lambda: SimpleNamespace(
+        free_bytes=lambda: 0, free_all_blocks=lambda: None
+    ),
     cuda=SimpleNamespace(
         Device=Device,
+        alloc_pinned_memory=Pinned,
         runtime=SimpleNamespace(getDeviceCount=lambda: 1, memGetInfo=lambda: (1 << 34, 1 << 35)),
     ),
 )
@@ -100,6 +140,7 @@ class SourceBackend(CudaBackend):
 
     name = "source"
     chunk = 1 << 16
+    device_build = 1
 
     @classmethod
     def missing(cls):
@@ -110,24 +151,32 @@ class SourceBackend(CudaBackend):
         return HOST
 
 
-@pytest.fixture(scope="session")
-def source_backend(tmp_path_factory):
-    """`SourceBackend`, its library made by g++."""
-    compiler = shutil.which("g++")
-    if compiler is None:
-        pytest.skip("g++ is not here to compile intersect.cu for the CPU")
-    library = tmp_path_factory.mktemp("source") / "intersect.so"
+def compiled(compiler, folder, name, flags):
+    """A .cu file made a library for the CPU."""
+    library = folder / f"{name}.so"
     with importlib.resources.as_file(
-        importlib.resources.files("raybeam") / "intersect.cu"
+        importlib.resources.files("raybeam") / f"{name}.cu"
     ) as kernels:
         command = [
-            compiler, "-std=c++17", "-O2", "-Wall", "-Werror", "-ffp-contract=off", "-shared",
-            "-fPIC", f"-DSTACK={STACK}", f'-DINTERSECT_CU="{kernels}"',
-            "-o", str(library), str(HERE / "host" / "run.cpp"),
+            compiler, "-O2", "-Wall", "-Werror", "-ffp-contract=off", "-shared", "-fPIC",
+            *(flag for flag in flags if flag != "-fmad=false"), f'-DSOURCE="{kernels}"',
+            "-o", str(library), str(HERE / "host" / f"{name}.cpp"),
         ]  # fmt: skip
         done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    Kernels.library = ctypes.CDLL(str(library))
+    return ctypes.CDLL(str(library))
+
+
+@pytest.fixture(scope="session")
+def source_backend(tmp_path_factory):
+    """`SourceBackend`, its libraries made by g++."""
+    compiler = shutil.which("g++")
+    if compiler is None:
+        pytest.skip("g++ is not here to compile the kernels for the CPU")
+    folder = tmp_path_factory.mktemp("source")
+    given = {"intersect": cuda_backend.flags(STACK), "build": cuda_build.flags()}
+    for name, flags in given.items():
+        Kernels.libraries[f"{name}.cu"] = compiled(compiler, folder, name, flags)
     return SourceBackend
 
 

@@ -2,6 +2,7 @@
 #pragma once
 #include <cmath>
 #include <cstring>
+#include <utility>
 
 #define __global__
 #define __device__
@@ -12,18 +13,34 @@
 struct float4 {
     float x, y, z, w;
 };
+struct int2 {
+    int x, y;
+};
+struct int4 {
+    int x, y, z, w;
+};
 struct Dim {
     unsigned x, y, z;
 };
 static thread_local Dim blockIdx, blockDim, threadIdx;
 
-static inline int __float_as_int(float f)
+template <class To, class From>
+static inline To bits(From from)
 {
-    int i;
-    std::memcpy(&i, &f, sizeof i);
-    return i;
+    To to;
+    static_assert(sizeof to == sizeof from, "same size");
+    std::memcpy(&to, &from, sizeof to);
+    return to;
+}
+static inline int __float_as_int(float f) { return bits<int>(f); }
+static inline float __int_as_float(int i) { return bits<float>(i); }
+
+static inline unsigned long long atomicAdd(unsigned long long* at, unsigned long long more)
+{
+    return __atomic_fetch_add(at, more, __ATOMIC_RELAXED);
 }
 
 using std::fabs;
 using std::fmax;
 using std::fmin;
+using std::sqrt;

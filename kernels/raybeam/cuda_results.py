@@ -1,0 +1,114 @@
+"""Hits on their way from the device to the caller's arrays."""
+
+from __future__ import annotations
+
+import threading
+import weakref
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .cuda_module import Kernels
+from .hits import Returns
+
+_PINNED = 1 << 30  # bytes in the hands of callers, at most
+_DTYPES = (np.int64, np.float64, np.int32)  # ray, distance, triangle
+
+
+class PinnedRoom:
+    """Arrays in page-locked memory, to which the device copies at the full rate of its bus.
+
+    Fresh ordinary memory is several times slower: the driver stages it through memory of its
+    own, and the system has to hand out each page. Page-locked memory is scarce, so callers who
+    keep more than `limit` bytes get ordinary arrays from then on. What they let go is used again.
+    """
+
+    def __init__(self, cupy: Any, limit: int = _PINNED) -> None:
+        self._allocate = cupy.cuda.alloc_pinned_memory
+        self._limit = limit
+        self._out = 0  # bytes
+        self._lock = threading.Lock()
+
+    def __repr__(self) -> str:
+        return f"PinnedRoom({self._out} of {self._limit} bytes in use)"
+
+    def empty(self, n: int, dtype: type) -> NDArray[Any]:
+        """Return an array of n numbers, page-locked while there is room."""
+        size = n * np.dtype(dtype).itemsize
+        with self._lock:
+            if not size or self._out + size > self._limit:
+                return np.empty(n, dtype)
+            self._out += size
+        memory = self._allocate(size)
+        weakref.finalize(memory, self._give_back, size)
+        return np.frombuffer(memory, dtype, n)
+
+    def _give_back(self, size: int) -> None:
+        with self._lock:
+            self._out -= size
+
+
+class Packer:
+    """Hits of one call, closed up on the device and fetched together.
+
+    Parameters
+    ----------
+    cupy
+        CuPy, or what stands in for it.
+    kernels
+        Those of intersect.cu.
+    faces
+        The caller's number of each triangle, on the device.
+    room
+        Where the arrays for the caller come from.
+    limit
+        Bytes of hits kept on the device before they are fetched.
+    """
+
+    def __init__(
+        self, cupy: Any, kernels: Kernels, faces: Any, room: PinnedRoom, limit: int = 1 << 30
+    ) -> None:
+        self._cupy, self._kernels, self._faces, self._room = cupy, kernels, faces, room
+        self._limit = limit
+        self._waiting: list[tuple[Any, ...]] = []  # on the device: ray, distance, triangle
+        self._bytes = 0
+        self._fetched: list[tuple[NDArray[Any], ...]] = []
+
+    def add(self, distance: Any, place: Any, first: int, scale: float) -> tuple[Any, ...]:
+        """Take the results of a cast, one entry a ray; distances are divided by `scale`.
+
+        Returns what is kept of them, on the device: rays numbered from `first`, distances, and
+        the caller's triangles, one entry a hit.
+        """
+        cp, n = self._cupy, len(place)
+        # Closed up by sums in ray order, not by atomics: the same bytes on every run.
+        ends = cp.cumsum(place >= 0, dtype=np.int32)
+        hits = tuple(cp.empty(int(ends[-1]) if n else 0, dtype) for dtype in _DTYPES)
+        given = (self._faces, distance, place, ends, np.int64(n), np.int64(first))
+        self._kernels.run("pack", n, *given, np.float64(scale), *hits)
+        self._waiting.append(hits)
+        self._bytes += sum(part.nbytes for part in hits)
+        if self._bytes > self._limit:
+            self._fetch()
+        return hits
+
+    def returns(self) -> Returns:
+        """Everything taken, on the host."""
+        self._fetch()
+        if len(self._fetched) == 1:
+            return Returns(*self._fetched[0])
+        return Returns(*(np.concatenate(parts) for parts in zip(*self._fetched, strict=True)))
+
+    def _fetch(self) -> None:
+        total = sum(len(ray) for ray, _, _ in self._waiting)
+        arrays = tuple(self._room.empty(total, dtype) for dtype in _DTYPES)
+        start = 0
+        for parts in self._waiting:
+            stop = start + len(parts[0])
+            if stop > start:
+                for part, array in zip(parts, arrays, strict=True):
+                    part.get(out=array[start:stop])
+            start = stop
+        self._fetched.append(arrays)
+        self._waiting, self._bytes = [], 0

@@ -1,0 +1,137 @@
+"""The tree built by build.cu: bit for bit the one that NumPy builds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from raybeam import RayCaster, cuda_build
+from raybeam.layout import lay_out
+from raybeam.mesh import local_mesh
+
+pytest.importorskip("hypothesis")
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+TABLES = ("nodes", "triangles", "corners", "faces", "frame")
+
+# Few values: many equal boxes, equal codes and ties between partners.
+coarse = st.integers(1, 40).flatmap(
+    lambda n: hnp.arrays(np.float64, (3 * n, 3), elements=st.integers(-2, 2))
+)
+fine = st.integers(1, 40).flatmap(
+    lambda n: hnp.arrays(np.float64, (3 * n, 3), elements=st.floats(-9, 9, width=32))
+)
+
+
+@pytest.fixture(params=["source", pytest.param("cuda", marks=pytest.mark.gpu)])
+def built(request):
+    """Build a mesh with build.cu: arrays by name."""
+    if request.param == "source":
+        library = request.getfixturevalue("source_backend")._library()
+    else:
+        library = pytest.importorskip("cupy", reason="CuPy is not installed")
+        if not library.is_available():
+            pytest.skip("there is no CUDA device")
+
+    def build(mesh):
+        tables = cuda_build.build(library, 0, mesh)
+        arrays = {name: library.asnumpy(getattr(tables, name)) for name in TABLES}
+        return {**arrays, "stack": tables.stack}
+
+    return build
+
+
+def assert_same_as_numpy(built, mesh):
+    got, want = built(mesh), lay_out(mesh)
+    assert got["stack"] == want.stack
+    for name in TABLES:
+        np.testing.assert_array_equal(
+            got[name].view(np.uint8), getattr(want, name).view(np.uint8), err_msg=name
+        )
+
+
+@pytest.mark.parametrize("name", ["cube", "sphere", "vase", "terrain box"])
+def test_shapes(built, shapes, name):
+    assert_same_as_numpy(built, local_mesh(*shapes[name]()))
+
+
+@pytest.mark.parametrize("kind", ["random", "sliver", "huge", "tiny"])
+def test_soups(built, shapes, kind):
+    assert_same_as_numpy(built, local_mesh(*shapes["soup"](kind, count=5000)))
+
+
+def test_far_away_and_many(built, shapes):
+    points, faces = shapes["vase"](150, 150)
+    assert_same_as_numpy(built, local_mesh(points + np.array([5e5, 4e6, 100]), faces))
+
+
+@pytest.mark.parametrize("copies", [2, 5, 64, 1000])
+def test_copies_of_one_triangle(built, copies):
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    assert_same_as_numpy(built, local_mesh(points, np.tile([[0, 1, 2]], (copies, 1))))
+
+
+def test_chain_of_ever_better_partners(built):
+    """Each triangle's best partner is the next one: pairs are made by force."""
+    x = 1.2 ** -np.arange(300.0)
+    zero = np.zeros_like(x)
+    points = np.stack([x, zero, zero, x, zero, 0.1 * x, x, 0.1 * x, zero], axis=-1)
+    assert_same_as_numpy(
+        built, local_mesh(points.reshape(-1, 3), np.arange(3 * len(x)).reshape(-1, 3))
+    )
+
+
+@settings(
+    deadline=None,
+    max_examples=80,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(points=st.one_of(coarse, fine))
+def test_any_triangles(built, points):
+    mesh = local_mesh(points, np.arange(len(points)).reshape(-1, 3))
+    if len(mesh.corners):
+        assert_same_as_numpy(built, mesh)
+
+
+def test_same_on_every_run(built, shapes):
+    mesh = local_mesh(*shapes["soup"]("random", count=3000))
+    one, other = built(mesh), built(mesh)
+    assert all(one[name].tobytes() == other[name].tobytes() for name in TABLES)
+
+
+@pytest.mark.parametrize(("triangles", "called"), [(3, 0), (12, 1)])
+def test_device_builds_where_it_pays(source_backend, shapes, monkeypatch, triangles, called):
+    monkeypatch.setattr(source_backend, "device_build", 10)
+    calls = []
+    build = cuda_build.build
+    monkeypatch.setattr(cuda_build, "build", lambda *given: calls.append(given) or build(*given))
+    points, faces = shapes["cube"]()
+    source_backend(local_mesh(points, faces[:triangles]))
+    assert len(calls) == called
+
+
+def test_host_builds_where_only_the_tables_fit(source_backend, shapes, monkeypatch):
+    mesh = local_mesh(*shapes["soup"]("random", count=4000))
+    need = lay_out(mesh).nbytes + (1 << 28)
+    assert need < cuda_build.BYTES * len(mesh.corners) + (1 << 28)
+    runtime = source_backend._library().cuda.runtime
+    monkeypatch.setattr(runtime, "memGetInfo", lambda: (need, 1 << 35))
+    monkeypatch.setattr(cuda_build, "build", None)
+    assert len(source_backend(mesh)._faces) == len(mesh.corners)
+
+
+def test_casts_do_not_depend_on_who_builds(source_backend, shapes, monkeypatch):
+    mesh = shapes["soup"]("random", count=2000)
+    directions = np.random.default_rng(0).normal(size=(3000, 3))
+    want = RayCaster(*mesh, backend="numpy").cast([0, 0, 0], directions)
+    local = local_mesh(*mesh)
+    from raybeam.rays import check_rays
+
+    for least in (1, 10_000):
+        monkeypatch.setattr(source_backend, "device_build", least)
+        got = source_backend(local).cast(check_rays([0, 0, 0], directions, 0, np.inf))
+        np.testing.assert_array_equal(got.distance, want.distance)
+        np.testing.assert_array_equal(got.triangle, want.triangle)
