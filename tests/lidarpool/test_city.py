@@ -1,0 +1,160 @@
+"""The made-up city: as large as asked, closed things on the ground, streets between them."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from lidarpool import LidarpoolError
+from lidarpool.city import city
+from lidarpool.city.city import _catalogue
+from lidarpool.city.solids import box, gable, joined, loft, lying, rectangle, regular
+from raybeam import RayCaster
+
+
+def volume(solid):
+    """By the divergence theorem: right only where the surface is closed and faces outward."""
+    a, b, c = (solid.vertices[solid.faces[:, k]] for k in range(3))
+    return (a * np.cross(b, c)).sum() / 6
+
+
+def is_closed(solid):
+    """Whether each edge is used once in each direction."""
+    edges = np.concatenate([solid.faces[:, [0, 1]], solid.faces[:, [1, 2]], solid.faces[:, [2, 0]]])
+    there, back = (Counter(map(tuple, e.tolist())) for e in (edges, edges[:, ::-1]))
+    return there == back and max(there.values()) == 1
+
+
+@pytest.mark.parametrize("triangles", [1_000, 5_000, 20_000, 100_000, 1_000_000])
+def test_as_many_triangles_as_asked(triangles):
+    scene = city(triangles)
+    assert 0.98 * triangles <= len(scene.faces) <= triangles
+    if triangles >= 100_000:
+        assert len(scene.faces) >= 0.999 * triangles
+
+
+def test_more_triangles_make_it_larger_not_finer():
+    small, large = city(20_000), city(500_000)
+    assert np.ptp(large.bounds[:, 0]) > 2 * np.ptp(small.bounds[:, 0])
+    per_object = [len(scene.faces) / len(scene.names) for scene in (small, large)]
+    assert 0.5 < per_object[0] / per_object[1] < 2
+
+
+def test_same_seed_same_city():
+    one, other, third = city(20_000, 3), city(20_000, 3), city(20_000, 4)
+    assert one.vertices.tobytes() == other.vertices.tobytes()
+    assert one.faces.tobytes() == other.faces.tobytes()
+    assert one.names == other.names
+    assert third.vertices.tobytes() != one.vertices.tobytes()
+
+
+def test_names_and_numbers():
+    scene = city(100_000)
+    classes = Counter(name.partition("-")[0] for name in scene.names)
+    assert set(classes) == {"ground", "pavement", "building", "tree", "car", "lamp"}
+    assert classes["ground"] == classes["pavement"] == 1
+    assert len(set(scene.names)) == len(scene.names)
+    for name, count in classes.items():
+        if count > 1:
+            assert {f"{name}-{k + 1}" for k in range(count)} <= set(scene.names)
+    assert np.bincount(scene.face_object, minlength=len(scene.names)).min() > 0
+
+
+def test_everything_stands_on_the_ground():
+    scene = city(100_000)
+    bounds = scene.object_bounds
+    assert scene.names[0] == "ground"
+    assert np.ptp(bounds[0, :, 2]) == 0
+    things = bounds[2:]
+    np.testing.assert_array_less(-0.2, things[:, 0, 2])
+    np.testing.assert_array_less(things[:, 0, 2], 0.2)
+    assert (things[:, 0, :2] > bounds[0, 0, :2]).all()
+    assert (things[:, 1, :2] < bounds[0, 1, :2]).all()
+    assert things[:, 1, 2].max() > 30  # there are towers
+    # their sizes are those of what they are called
+    height = dict(zip(scene.names[2:], things[:, 1, 2], strict=True))
+    assert all(1 < height[name] < 3 for name in height if name.startswith("car"))
+    assert all(3 < height[name] < 15 for name in height if name.startswith("tree"))
+    assert all(height[name] > 3 for name in height if name.startswith("building"))
+
+
+def test_buildings_do_not_run_into_one_another():
+    scene = city(200_000)
+    rows = [k for k, name in enumerate(scene.names) if name.startswith("building")]
+    low, high = scene.object_bounds[rows].transpose(1, 0, 2)
+    assert len(rows) > 80
+    over = np.minimum(high[:, None], high) - np.maximum(low[:, None], low)
+    np.fill_diagonal(over[..., 0], -1)
+    # Bounding boxes may touch a little where roofs overhang.
+    assert (over[..., :2].min(axis=-1) > 1.5).sum() == 0
+
+
+def test_a_sensor_at_the_crossing_sees_the_streets_and_the_houses():
+    scene = city(100_000)
+    caster = RayCaster(scene.vertices, scene.faces, "numpy")
+    around = np.linspace(0, 2 * np.pi, 2000, endpoint=False)
+    level = np.column_stack([np.cos(around), np.sin(around), np.zeros(2000)])
+    hits = caster.cast([0, 0, 2], level)
+    assert hits.distance.min() > 3  # nothing stands on the crossing
+    assert 0.5 < hits.hit.mean() < 1  # one can look out along the streets
+    seen = {scene.names[k].partition("-")[0] for k in scene.face_object[hits.triangle[hits.hit]]}
+    assert "building" in seen
+    assert "tree" in seen
+    down = caster.cast([0, 0, 2], level - [0, 0, 0.5])
+    assert (scene.face_object[down.triangle] == 0).mean() > 0.5
+
+
+def test_every_kind_is_made_of_closed_solids_that_face_outward():
+    kinds, _ = _catalogue(0)
+    assert len(kinds) > 30
+    for kind in kinds:
+        assert volume(kind) > 0
+        assert is_closed(kind)
+        assert kind.vertices[:, 2].min() > -0.05
+        edges = kind.vertices[kind.faces[:, 1:]] - kind.vertices[kind.faces[:, :1]]
+        assert np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1).min() > 0
+
+
+@pytest.mark.parametrize(
+    ("solid", "expected"),
+    [
+        (box(2, 3, 4), 24),
+        (loft(rectangle(4, 4), [(0, 0), (3, 2 - 1e-12)]), 16),  # a pyramid
+        (loft(regular(6, 1), [(0, 0), (2, 0)]), 2 * 1.5 * np.sqrt(3)),
+        (lying(box(2, 3, 4)), 24),
+        (gable(6, 4, 0, 3), 36),
+        (joined([box(1, 1, 1), box(1, 1, 2).moved(5)]), 3),
+    ],
+)
+def test_solids(solid, expected):
+    assert is_closed(solid)
+    assert volume(solid) == pytest.approx(expected)
+
+
+def test_inset_moves_sides_not_corners():
+    frustum = loft(rectangle(10, 4), [(0, 0), (1, 1)])
+    top = frustum.vertices[frustum.vertices[:, 2] == 1]
+    np.testing.assert_allclose(np.ptp(top, axis=0), [8, 2, 0])
+
+
+@pytest.mark.parametrize(("triangles", "seed"), [(0, 0), (999, 0), (10**9, 0), (10_000, -1)])
+def test_out_of_range(triangles, seed):
+    with pytest.raises(LidarpoolError, match=r"give 1000 to|at least 0"):
+        city(triangles, seed)
+
+
+def test_memory_for_two_million_triangles():
+    code = (
+        "import resource; from lidarpool.city import city; "
+        "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss; scene = city(2_000_000); "
+        "after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss; "
+        "print(len(scene.faces), (after - before) // 1024)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    faces, mebibytes = map(int, done.stdout.split())
+    assert faces > 1_998_000
+    assert mebibytes < 200

@@ -1,0 +1,60 @@
+"""The made-up terrain: a height field of the size asked for, rough at every scale."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lidarpool import LidarpoolError
+from lidarpool.terrain import terrain
+from raybeam import RayCaster
+
+
+@pytest.mark.parametrize("triangles", [2, 3, 7, 50, 1999, 20_000, 100_000])
+def test_as_many_triangles_as_fit_a_grid(triangles):
+    scene = terrain(triangles)
+    assert triangles - 2 * np.sqrt(triangles) <= len(scene.faces) <= triangles
+    assert scene.names == ("terrain",)
+
+
+def test_size_and_place():
+    low, high = terrain(20_000, side_m=300).bounds
+    np.testing.assert_allclose(low, [-150, -150, 0])
+    np.testing.assert_allclose(high, [150, 150, 0.16 * 300])
+
+
+def test_same_seed_same_terrain():
+    one, other, third = (terrain(5000, seed) for seed in (1, 1, 2))
+    assert one.vertices.tobytes() == other.vertices.tobytes()
+    assert np.abs(one.vertices - third.vertices).max() > 1
+
+
+def test_it_is_a_height_field_without_holes():
+    scene = terrain(20_000)
+    rng = np.random.default_rng(0)
+    above = np.column_stack([rng.uniform(-500, 500, (2000, 2)), np.full(2000, 500)])
+    hits = RayCaster(scene.vertices, scene.faces, "numpy").cast(above, [[0, 0, -1]] * 2000)
+    assert hits.hit.all()
+    a, b, c = (scene.vertices[scene.faces[:, k]] for k in range(3))
+    assert (np.cross(b - a, c - a)[:, 2] > 0).all()
+
+
+def test_it_is_rough_at_every_scale():
+    """Second differences shrink with the step, and more slowly than on a smooth surface."""
+    scene = terrain(2 * 512 * 512)
+    height = scene.vertices[:, 2].reshape(513, 513)
+    steps = np.array([1, 4, 16, 64])
+    bends = [
+        np.abs(height[2 * s :] - 2 * height[s:-s] + height[: -2 * s]).mean() for s in steps.tolist()
+    ]
+    slopes = np.diff(np.log(bends)) / np.diff(np.log(steps))
+    assert (slopes > 0.3).all()
+    assert (slopes < 1.7).all()  # 2 where it is smooth
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"triangles": 1}, {"triangles": 10**9}, {"seed": -1}, {"side_m": 0.0}]
+)
+def test_out_of_range(wrong):
+    with pytest.raises(LidarpoolError):
+        terrain(**{"triangles": 1000, **wrong})
