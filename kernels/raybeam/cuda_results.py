@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import threading
 import weakref
 from typing import Any
@@ -12,7 +13,8 @@ from numpy.typing import NDArray
 from .cuda_module import Kernels
 from .hits import Returns
 
-_PINNED = 1 << 30  # bytes in the hands of callers, at most
+_PINNED = 1 << 30  # bytes that are page-locked, at most
+_LEAST = 1 << 16
 _DTYPES = (np.int64, np.float64, np.int32)  # ray, distance, triangle
 
 
@@ -22,31 +24,50 @@ class PinnedRoom:
     Fresh ordinary memory is several times slower: the driver stages it through memory of its
     own, and the system has to hand out each page. Page-locked memory is scarce, so callers who
     keep more than `limit` bytes get ordinary arrays from then on. What they let go is used again.
+
+    Blocks are powers of two in size, so that one fits many calls. CuPy's own pool keeps every
+    size that was ever asked for, without a limit.
     """
 
     def __init__(self, cupy: Any, limit: int = _PINNED) -> None:
-        self._allocate = cupy.cuda.alloc_pinned_memory
+        self._allocate = cupy.cuda.PinnedMemory
         self._limit = limit
-        self._out = 0  # bytes
-        self._lock = threading.Lock()
+        self._held = 0  # bytes, free ones included
+        self._free: dict[int, list[Any]] = {}  # {bytes: blocks of that size}
+        self._lock = threading.RLock()  # a loan may end while this thread holds it
 
     def __repr__(self) -> str:
-        return f"PinnedRoom({self._out} of {self._limit} bytes in use)"
+        return f"PinnedRoom({self._held} of {self._limit} bytes held)"
 
     def empty(self, n: int, dtype: type) -> NDArray[Any]:
         """Return an array of n numbers, page-locked while there is room."""
-        size = n * np.dtype(dtype).itemsize
-        with self._lock:
-            if not size or self._out + size > self._limit:
-                return np.empty(n, dtype)
-            self._out += size
-        memory = self._allocate(size)
-        weakref.finalize(memory, self._give_back, size)
-        return np.frombuffer(memory, dtype, n)
+        need = n * np.dtype(dtype).itemsize
+        size = max(_LEAST, 1 << (need - 1).bit_length()) if need else 0
+        block = self._take(size)
+        if block is None:
+            return np.empty(n, dtype)
+        # Views of the array keep this alive; when the last is gone, so is the loan.
+        loan = (ctypes.c_char * size).from_address(block.ptr)
+        weakref.finalize(loan, self._give_back, size, block)
+        return np.ndarray((n,), dtype, loan)
 
-    def _give_back(self, size: int) -> None:
+    def _take(self, size: int) -> Any:
+        """Return a block, or None when there is no room for it."""
         with self._lock:
-            self._out -= size
+            if self._free.get(size):
+                return self._free[size].pop()
+            if self._held + size > self._limit:
+                # Free blocks of other sizes are in the way.
+                self._held -= sum(each * len(blocks) for each, blocks in self._free.items())
+                self._free.clear()
+            if not size or self._held + size > self._limit:
+                return None
+            self._held += size
+        return self._allocate(size)
+
+    def _give_back(self, size: int, block: Any) -> None:
+        with self._lock:
+            self._free.setdefault(size, []).append(block)
 
 
 class Packer:

@@ -59,8 +59,12 @@ class Device(nullcontext):
         pass
 
 
-class Pinned(bytearray):
-    """Page-locked memory; unlike a plain bytearray it can be referred to weakly."""
+class Pinned:
+    """Page-locked memory."""
+
+    def __init__(self, size):
+        self._bytes = np.empty(size, np.uint8)
+        self.ptr, self.size = self._bytes.ctypes.data, size
 
 
 KINDS = {
@@ -129,7 +133,7 @@ HOST = Module(
     ),
     cuda=SimpleNamespace(
         Device=Device,
-        alloc_pinned_memory=Pinned,
+        PinnedMemory=Pinned,
         runtime=SimpleNamespace(getDeviceCount=lambda: 1, memGetInfo=lambda: (1 << 34, 1 << 35)),
     ),
 )
