@@ -1,0 +1,187 @@
+"""Ray casting, side by side with what one would use instead: `python -m benchmarks.raycast`.
+
+All engines that are installed cast the same rays in one process, in turns (A B C, A B C, ...),
+so that whatever else the machine does befalls all of them. Rates are medians over the rounds,
+with the least and the greatest; ratios are medians of the ratios within each round.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import importlib.metadata
+import json
+import os
+import platform
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .raycast_engines import ENGINES, Cast, Engine
+from .raycast_scenes import Job, jobs
+
+_MOMENT_S = 0.15  # an engine's turn takes about that long at least
+_VERSIONS = ("numpy", "open3d-cpu", "open3d", "trimesh", "embreex", "warp-lang", "cupy-cuda13x")
+
+
+def timed(cast: Cast, repeats: int) -> tuple[float, int]:
+    """Seconds of one call, as a mean over some, and what it returned."""
+    start = time.perf_counter()
+    for _ in range(repeats):
+        hits = cast()
+    return (time.perf_counter() - start) / repeats, hits
+
+
+def measure(job: Job, engines: list[Engine], rounds: int, moment: float) -> dict[str, Any]:
+    """Rates of all engines on one job."""
+    ready: list[tuple[Engine, Cast, int]] = []
+    builds = {}
+    for engine in engines:
+        start = time.perf_counter()
+        cast = engine.prepare(job)
+        builds[engine.name] = time.perf_counter() - start
+        once, _ = timed(cast, 1)
+        ready.append((engine, cast, max(1, int(moment / once))))
+    rates: dict[str, list[float]] = {engine.name: [] for engine in engines}
+    hits = {}
+    for turn in range(rounds):
+        # Whoever is first finds the caches as the last one left them: not always the same two.
+        shift = turn % len(ready)
+        for engine, cast, repeats in ready[shift:] + ready[:shift]:
+            seconds, found = timed(cast, repeats)
+            rates[engine.name].append(engine.rays(job) / seconds / 1e6)
+            hits[engine.name] = found / engine.rays(job)
+    return {
+        "scene": job.name,
+        "triangles": len(job.faces),
+        "order": job.order,
+        "rays": job.rays,
+        "engines": {
+            engine.name: {
+                "ours": engine.ours,
+                "peer": engine.peer,
+                "mrays_s": rates[engine.name],
+                "hit_share": hits[engine.name],
+                "build_s": builds[engine.name],
+            }
+            for engine in engines
+        },
+    }
+
+
+def best_peer(row: dict[str, Any]) -> str | None:
+    """Name of the peer with the highest median rate, on the device or not."""
+    peers = {k: np.median(v["mrays_s"]) for k, v in row["engines"].items() if v["peer"]}
+    return max(peers, key=lambda name: peers[name]) if peers else None
+
+
+def ratio(row: dict[str, Any], one: str, other: str) -> float:
+    """Median over the rounds of how many times faster one engine was than another."""
+    rates = [np.array(row["engines"][name]["mrays_s"]) for name in (one, other)]
+    return float(np.median(rates[0] / rates[1]))
+
+
+def show(row: dict[str, Any]) -> None:
+    """Print one job's rates."""
+    print(f"\n{row['scene']}, {row['triangles']:,} triangles, {row['rays']:,} {row['order']} rays")
+    peer = best_peer(row)
+    for name, entry in row["engines"].items():
+        rates = entry["mrays_s"]
+        line = (
+            f"  {name:<20} {np.median(rates):12.5g} Mray/s  ({min(rates):.4g} to {max(rates):.4g})"
+            f"  hits {100 * entry['hit_share']:5.1f} %  prepared in {entry['build_s']:.2f} s"
+        )
+        if entry["ours"] and peer:
+            line += f"  {ratio(row, name, peer):.3g} x {peer}"
+        print(line)
+    for text in findings(row):
+        print(f"  {text}")
+
+
+def findings(row: dict[str, Any]) -> list[str]:
+    """Say what the targets are about."""
+    has = row["engines"]
+    out = []
+    if "Open3D, bare" in has and "embree" in has:
+        slower = 1 / ratio(row, "embree, cast alone", "Open3D, bare") - 1
+        whole = 1 / ratio(row, "embree", "embree, cast alone") - 1
+        out.append(
+            f"embree's cast alone takes {100 * slower:+.1f} % of bare Open3D's time more; making "
+            f"rays and gathering hits takes {100 * whole:.0f} % of the cast"
+        )
+    if "brute force, NumPy" in has and "numpy" in has:
+        out.append(f"numpy is {ratio(row, 'numpy', 'brute force, NumPy'):,.0f} x brute force")
+    return out
+
+
+def environment(threads: int) -> dict[str, Any]:
+    """Where and with what it was measured."""
+    found = {}
+    for name in _VERSIONS:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return {
+        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        "machine": platform.machine(),
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "load": os.getloadavg() if hasattr(os, "getloadavg") else None,
+        "threads": threads,
+        "python": platform.python_version(),
+        "versions": found,
+    }
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next((x.partition(":")[2].strip() for x in lines if x.startswith("model name")), "")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run from the command line."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--quick", action="store_true", help="toy scenes, few rays, two rounds")
+    parser.add_argument("--scene", action="append", help="only this one; may be given again")
+    parser.add_argument("--mesh", action="append", type=Path, default=[], help="a mesh file more")
+    parser.add_argument("--rays", type=int, default=1 << 17, help="rays of a scan")
+    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--threads", type=int, default=1, help="CPU threads of those that can")
+    parser.add_argument("--without", action="append", default=[], help="leave this engine out")
+    parser.add_argument("--json", type=Path, help="write the results here")
+    chosen = parser.parse_args(arguments)
+    quick = chosen.quick
+    makers = jobs(2_000 if quick else chosen.rays, chosen.mesh, quick)
+    unknown = set(chosen.scene or ()) - set(makers)
+    if unknown:
+        parser.error(f"there is no scene {', '.join(unknown)}: {', '.join(makers)}")
+    engines = []
+    for engine in (made(chosen.threads) for made in ENGINES if made.name not in chosen.without):
+        reason = engine.missing()
+        if reason:
+            print(f"{engine.name} is left out: {reason}")
+        else:
+            engines.append(engine)
+    results = []
+    for name, make in makers.items():
+        if not chosen.scene or name in chosen.scene:
+            job = make()
+            for order in (job, job.shuffled()):
+                rounds, moment = (2, 0.0) if quick else (chosen.rounds, _MOMENT_S)
+                results.append(measure(order, engines, rounds, moment))
+                show(results[-1])
+    if chosen.json:
+        report = {"environment": environment(chosen.threads), "jobs": results}
+        chosen.json.write_text(json.dumps(report, indent=1) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

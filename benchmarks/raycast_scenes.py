@@ -1,0 +1,129 @@
+"""What benchmarks/raycast.py casts: scenes, and a lidar's rays in them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarpool import Scene, Sensor, Survey
+from lidarpool.city import city
+from lidarpool.terrain import terrain
+from raybeam import RayCaster
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """A mesh and the rays to cast at it.
+
+    Attributes
+    ----------
+    name
+        Of the scene.
+    vertices, faces
+        float64 (v, 3), int32 (f, 3).
+    origins
+        float64 (p, 3): from each of them all rays are cast.
+    directions
+        float64 (n, 3), unit vectors, in the sensor's axes.
+    rotation
+        float64 (3, 3): the sensor's axes in the scene.
+    order
+        "coherent", as a lidar fires them, or "shuffled".
+    """
+
+    name: str
+    vertices: Float
+    faces: NDArray[np.int32]
+    origins: Float
+    directions: Float
+    rotation: Float
+    order: str = "coherent"
+
+    @property
+    def rays(self) -> int:
+        """Number of rays from all origins."""
+        return len(self.origins) * len(self.directions)
+
+    def shuffled(self) -> Job:
+        """Return the same rays in no order."""
+        directions = np.random.default_rng(0).permutation(self.directions)
+        return replace(self, directions=directions, order="shuffled")
+
+
+def _turned(degrees: float) -> Float:
+    """Rotation of a sensor that is not set up level: about z, then a little about x."""
+    a, b = np.radians(degrees), np.radians(2.0)
+    about_z = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
+    about_x = np.array([[1, 0, 0], [0, np.cos(b), -np.sin(b)], [0, np.sin(b), np.cos(b)]])
+    return about_z @ about_x
+
+
+def _job(name: str, scene: Scene, origins: Float, sensor: Sensor) -> Job:
+    return Job(
+        name,
+        np.array(scene.vertices),
+        np.array(scene.faces),
+        np.atleast_2d(np.asarray(origins, dtype=np.float64)),
+        sensor.directions.reshape(-1, 3),
+        _turned(17.0),
+    )
+
+
+def _lidar(rays: int) -> Sensor:
+    """Make a sensor of 128 rings and 45 degrees, with so many rays in a turn."""
+    return Sensor(rays_per_revolution=max(36, rays // 128), layers=128, vertical_fov_deg=45)
+
+
+def survey_job(rays: int) -> Job:
+    """Make the default survey: its scene, its sensor, its three poses."""
+    survey = Survey(poses=[(0, 0, 1), (0, 0, 2), (0, 0, 3)])
+    origins = np.array([pose.position for pose in survey.poses])
+    turn = max(36, min(survey.sensor.rays_per_revolution, rays // 120))
+    return _job(
+        "default survey", Scene.seed(), origins, replace(survey.sensor, rays_per_revolution=turn)
+    )
+
+
+def city_job(triangles: int, rays: int) -> Job:
+    """Make a city, the sensor on the crossing in its middle."""
+    return _job(
+        f"city {triangles:.0e}".replace("e+0", "e"), city(triangles), [0, 0, 2], _lidar(rays)
+    )
+
+
+def terrain_job(triangles: int, rays: int) -> Job:
+    """Make a terrain, the sensor 30 m above its middle."""
+    scene = terrain(triangles)
+    down = RayCaster(scene.vertices, scene.faces, "numpy").cast([0.1, 0.2, 1e4], [[0, 0, -1]])
+    height = 1e4 - float(down.distance[0]) + 30
+    return _job(
+        f"terrain {triangles:.0e}".replace("e+0", "e"), scene, [0.1, 0.2, height], _lidar(rays)
+    )
+
+
+def mesh_job(path: Path, rays: int) -> Job:
+    """Read a mesh file, the sensor 1.5 m above the lowest point in its middle."""
+    scene = Scene.load(path)
+    low, high = scene.bounds
+    middle = (low + high) / 2
+    return _job(path.stem, scene, [*middle[:2], low[2] + 1.5], _lidar(rays))
+
+
+def jobs(rays: int, meshes: list[Path], quick: bool) -> dict[str, Callable[[], Job]]:
+    """Makers of all jobs by the name that --scene takes; `quick` for toy sizes."""
+    cities = [2_000] if quick else [100_000, 1_000_000, 10_000_000]
+    hills = 2_000 if quick else 2_000_000
+    out: dict[str, Callable[[], Job]] = {"survey": lambda: survey_job(rays)}
+    for triangles in cities:
+        name = f"city-{triangles:.0e}".replace("e+0", "e")
+        out[name] = lambda triangles=triangles: city_job(triangles, rays)  # type: ignore[misc]
+    out[f"terrain-{hills:.0e}".replace("e+0", "e")] = lambda: terrain_job(hills, rays)
+    for path in meshes:
+        out[path.stem] = lambda path=path: mesh_job(path, rays)  # type: ignore[misc]
+    return out
