@@ -1,14 +1,23 @@
 from __future__ import annotations
 
+import json
+import logging
 import os
 import signal
+import subprocess
+import sys
+import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
 from distributed import Client
 
+import lidarpool.output
 from lidarpool import Cloud
+from lidarpool.cli import main
 from poolpart import local_cluster
 
 
@@ -41,3 +50,124 @@ def same_cloud() -> Callable[[Cloud, Cloud], bool]:
         )
 
     return same
+
+
+class OutsideCluster:
+    """A scheduler and workers from the `dask` command line, each a process of its own."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.processes: dict[str, subprocess.Popen[bytes]] = {}
+        file = folder / "scheduler.json"
+        self._start(
+            "scheduler", "scheduler", "--port", "0", "--no-dashboard", "--scheduler-file", str(file)
+        )
+        _wait(file.exists)
+        self.address = json.loads(file.read_text())["address"]
+
+    def _start(self, name: str, *arguments: str) -> None:
+        log = (self.folder / f"{name}.log").open("wb")
+        self.processes[name] = subprocess.Popen(
+            [Path(sys.executable).with_name("dask"), *arguments, "--host", "127.0.0.1"],
+            stdout=log,
+            stderr=log,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        )
+
+    def add(self, partition: str, count: int = 1, slots: int = 1, preload: str = "") -> None:
+        """Start workers of a partition; `preload` is Python that each runs first."""
+        for _ in range(count):
+            name = f"{partition}-{len(self.processes)}"
+            options = ["--nthreads", str(slots), "--resources", f"{partition}={slots}"]
+            if preload:
+                file = self.folder / f"{name}.py"
+                file.write_text(preload)
+                options += ["--preload", str(file)]
+            self._start(
+                name, "worker", self.address, "--name", name, "--no-dashboard", "--no-nanny",
+                "--local-directory", str(self.folder), *options,
+            )  # fmt: skip
+
+    def wait(self) -> None:
+        """Wait until all workers are there."""
+        with Client(self.address, set_as_default=False) as client:
+            client.wait_for_workers(len(self.processes) - 1, timeout=60)
+
+    def kill(self, name: str) -> None:
+        """Kill a process, without goodbye."""
+        self.processes[name].kill()
+        self.processes.pop(name).wait(10)
+
+    def log(self) -> str:
+        """What all processes have logged."""
+        return "\n".join(file.read_text() for file in sorted(self.folder.glob("*.log")))
+
+    def close(self) -> None:
+        """End all processes."""
+        for process in self.processes.values():
+            process.kill()
+        for process in self.processes.values():
+            process.wait(10)
+
+
+@pytest.fixture(scope="module")
+def outside(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[Callable[[], OutsideCluster]]:
+    """Start clusters from the `dask` command line that end with the module."""
+    clusters: list[OutsideCluster] = []
+
+    def start() -> OutsideCluster:
+        clusters.append(OutsideCluster(tmp_path_factory.mktemp("cluster")))
+        return clusters[-1]
+
+    yield start
+    for cluster in clusters:
+        cluster.close()
+
+
+def _wait(condition: Callable[[], bool], seconds: float = 60) -> None:
+    stop = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < stop, "waited in vain"
+        time.sleep(0.05)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a command ended."""
+
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture(name="lidarpool")
+def run_lidarpool(
+    capfd: pytest.CaptureFixture[str],
+) -> Iterator[Callable[..., Outcome]]:
+    """Run the command in this process."""
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    loggers = [logging.getLogger(name) for name in ("distributed", "poolpart", "matplotlib")]
+    levels = [logger.level for logger in loggers]
+
+    def run(*arguments: object) -> Outcome:
+        capfd.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            main([str(argument) for argument in arguments])
+        out, err = capfd.readouterr()
+        return Outcome(int(ended.value.code or 0), out, err)
+
+    yield run
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+    for logger, level in zip(loggers, levels, strict=True):
+        logger.setLevel(level)
+
+
+@pytest.fixture
+def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave the drawing out, which takes longer than a small survey."""
+    monkeypatch.setattr(lidarpool.output, "take_shot", lambda *_: None)
+    for name in ("draw_scene", "draw_intensity", "draw_cloud", "draw_path"):
+        monkeypatch.setattr(lidarpool.output, name, lambda path, *_, **__: path.write_bytes(b"x"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import math
 import os
@@ -13,6 +14,7 @@ from typing import NoReturn
 
 import click
 from distributed import Client
+from distributed.comm import connect
 
 from poolpart import Pool, PoolError, local_cluster
 from raybeam import available_backends
@@ -50,7 +52,7 @@ class _Commands(click.Group):
         if args and self.get_command(ctx, args[0]) is None and not args[0].startswith("-"):
             hint = did_you_mean(args[0], self.list_commands(ctx))
             raise click.UsageError(
-                f"There is no command {args[0]!r}{hint or ''}; see lidarpool --help.", ctx
+                f"There is no command {args[0]!r}.{hint} See lidarpool --help.", ctx
             )
         return super().resolve_command(ctx, args)
 
@@ -116,7 +118,7 @@ def _run(
     from .output import result_folder, write_result
 
     backend = backend or scenario.pool.backend
-    (check_backend_name if scheduler else check_backend_here)(backend)
+    (check_backend_here if scheduler is None else check_backend_name)(backend)
     scene = scenario.build_scene()
     survey = scenario.survey(scene)
     planning = None if no_plan else scenario.plan(scene)
@@ -124,7 +126,9 @@ def _run(
     pool = scenario.pool
     with result_folder(out):
         with (
-            _connected(scheduler) if scheduler else _local_client(scenario, quiet) as client,
+            _local_client(scenario, quiet)
+            if scheduler is None
+            else _connected(scheduler) as client,
             shown_progress(quiet) as show,
         ):
             result = simulate(
@@ -176,15 +180,20 @@ def info(scheduler: str | None) -> None:
       lidarpool info
       lidarpool info --scheduler tcp://127.0.0.1:8786
     """
+    pool = None
+    if scheduler is not None:
+        with _connected(scheduler) as client:
+            pool = Pool.from_client(client)
     for name, number in versions().items():
         click.echo(f"{name:<14} {number}")
     click.echo("backends")
     for name, reason in available_backends().items():
         click.echo(f"  {name:<12} {reason or 'ready'}")
-    if scheduler is None:
-        return
-    with _connected(scheduler) as client:
-        pool = Pool.from_client(client)
+    if pool is not None:
+        _tell_workers(pool)
+
+
+def _tell_workers(pool: Pool) -> None:
     click.echo(f"{pool!r}")
     for worker in sorted(pool, key=lambda worker: (sorted(worker.resources), worker.name)):
         held = ", ".join(f"{name}={slots:g}" for name, slots in sorted(worker.resources.items()))
@@ -198,14 +207,22 @@ def info(scheduler: str | None) -> None:
 def _connected(scheduler: str) -> Iterator[Client]:
     """Client of a cluster that is running already."""
     try:
+        asyncio.run(asyncio.wait_for(_knock(scheduler), CONNECT_TIMEOUT_S))
         client = Client(scheduler, timeout=CONNECT_TIMEOUT_S, set_as_default=False)
-    except (OSError, ValueError, RuntimeError, TypeError, ImportError) as error:
+    except Exception as error:
+        # What is there may be no scheduler, and what it answers may make any error.
         raise LidarpoolError(
             f"No Dask scheduler answers at {scheduler!r} ({type(error).__name__}): start one with "
             "dask scheduler, and give its address as tcp://host:8786."
         ) from error
     with client:
         yield client
+
+
+async def _knock(address: str) -> None:
+    """See whether a scheduler answers; a client waits for ever for one that says nothing."""
+    comm = await connect(address, timeout=CONNECT_TIMEOUT_S)
+    comm.abort()
 
 
 @contextmanager

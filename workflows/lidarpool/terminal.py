@@ -85,7 +85,7 @@ class PlainLines:
 
     def __init__(self, stream: TextIO) -> None:
         self.stream = stream
-        self._next = 0.0  # seconds since the start at which to tell again
+        self._next = PLAIN_EVERY_S[0]  # seconds since the start at which to tell again
         self._survey, self._planning = _Pace(), _Pace()
         self._done: set[str] = set()
 
