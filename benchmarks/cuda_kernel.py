@@ -1,12 +1,14 @@
-"""How fast the kernels of raybeam's cuda backend are, measured on the device.
+"""How fast raybeam's cuda backend is, measured on the device, with Warp beside it where it is.
 
 Needs numpy and cupy only. From the repository's root:
 
     PYTHONPATH=kernels python -m benchmarks.cuda_kernel --json cuda_kernel.json
 
-Times are medians of CUDA events around one launch, after a warm-up. Each scene is also cast by
-the numpy backend on a sample of the rays; distances must have the same bits. The last column is
-the original's method, every ray against every triangle, on fewer rays.
+Times are medians of CUDA events around one launch, after a warm-up; builds and whole scans are
+taken by the clock, from arrays on the host to arrays on the device and the other way round. Each
+scene that NumPy can build a tree of in reasonable time is also cast by the numpy backend on a
+sample of the rays; distances must have the same bits. Brute force is the original's method:
+every ray against every triangle.
 """
 
 from __future__ import annotations
@@ -14,28 +16,24 @@ from __future__ import annotations
 import argparse
 import json
 import platform
-import statistics
 import sys
 import time
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from raybeam import Pattern, RayCaster, available_backends
-from raybeam.cuda_backend import CudaBackend, flags
-from raybeam.cuda_module import source
+from raybeam.cuda_backend import CudaBackend
 from raybeam.mesh import local_mesh
 
-Mesh = tuple[NDArray[np.float64], NDArray[np.int64]]
-Float = NDArray[np.float64]
+from . import cuda_limits, cuda_warp
+from .cuda_scenes import Float, Mesh, city, revolution, six_objects
+from .cuda_timing import milliseconds, wall_milliseconds
 
 _BLOCK = 128
-_VARIANTS = (4, 6, 8, 10)  # blocks on a multiprocessor that a thread's registers must allow
 _SAMPLE = 2000  # rays compared with the numpy backend
+_NUMPY_MOST = 2_000_000  # triangles; NumPy takes seconds a million to build its tree
 
 # Moeller and Trumbore in float against all triangles, without a tree.
 _BRUTE_FORCE = """
@@ -63,106 +61,6 @@ extern "C" __global__ void brute_force(
 """
 
 
-# ---- scenes and rays ----
-
-
-def grid_faces(rows: int, columns: int, wrap: bool = False) -> NDArray[np.int64]:
-    """Two triangles for each cell of a grid of vertices."""
-    i = np.arange(rows - 1)[:, None] * columns
-    j = np.arange(columns if wrap else columns - 1)[None, :]
-    k = (j + 1) % columns
-    quad = np.stack(np.broadcast_arrays(i + j, i + k, i + columns + k, i + columns + j), axis=-1)
-    return np.concatenate([quad[..., [0, 1, 2]], quad[..., [0, 2, 3]]]).reshape(-1, 3)
-
-
-def joined(meshes: list[Mesh]) -> Mesh:
-    """Several meshes as one."""
-    starts = np.cumsum([0] + [len(vertices) for vertices, _ in meshes])
-    return (
-        np.concatenate([vertices for vertices, _ in meshes]),
-        np.concatenate([f + start for (_, f), start in zip(meshes, starts, strict=False)]),
-    )
-
-
-def six_objects() -> Mesh:
-    """Six surfaces of revolution, 80 by 80, as in the default survey."""
-    polar = np.linspace(0, np.pi, 80)[:, None]
-    around = np.arange(80) * 2 * np.pi / 80
-    radius = 2 * np.sin(polar) * (0.75 + 0.25 * np.cos(3 * polar))
-    height = np.broadcast_to(2 - 2 * np.cos(polar), (80, 80))
-    one = np.stack([radius * np.cos(around), radius * np.sin(around), height], -1).reshape(-1, 3)
-    places = [(-20, -20), (20, -20), (-20, 20), (20, 20), (-10, -5), (5, 5)]
-    faces = grid_faces(80, 80, wrap=True)
-    return joined([(one + np.array([x, y, 0]), faces) for x, y in places])
-
-
-def city(triangles: int, seed: int = 0) -> Mesh:
-    """Streets of box-shaped buildings with panelled faces on flat ground, about `triangles`."""
-    rng = np.random.default_rng(seed)
-    panels, pitch = 4, 20.0
-    side = max(1, round(np.sqrt(triangles / (5 * 2 * panels**2 + 2))))
-    line = np.linspace(-1, 1, panels + 1)
-    a, b = (x.ravel() for x in np.meshgrid(line, line, indexing="ij"))
-    one = np.ones_like(a)
-    sides = [(a, b, one), (a, one, b), (a, -one, b), (one, a, b), (-one, a, b)]
-    face = grid_faces(panels + 1, panels + 1)
-    box, faces = joined([(np.stack(points, axis=-1), face) for points in sides])
-    x, y = (c.ravel() for c in np.meshgrid(np.arange(side), np.arange(side), indexing="ij"))
-    count = side * side
-    middle = pitch * (np.stack([x, y], axis=-1) - (side - 1) / 2)
-    half = rng.uniform(4, 7.5, (count, 2))
-    height = rng.gamma(3, 6, count) + 3
-    vertices = np.empty((count, len(box), 3))
-    vertices[..., :2] = middle[:, None] + box[:, :2] * half[:, None]
-    vertices[..., 2] = (box[:, 2] + 1) / 2 * height[:, None]
-    buildings = faces + len(box) * np.arange(count)[:, None, None]
-    edge = pitch * (np.arange(side + 1) - side / 2)
-    gx, gy = np.meshgrid(edge, edge, indexing="ij")
-    ground = np.stack([gx, gy, np.zeros_like(gx)], axis=-1).reshape(-1, 3)
-    return joined([
-        (vertices.reshape(-1, 3), buildings.reshape(-1, 3)),
-        (ground, grid_faces(side + 1, side + 1)),
-    ])  # fmt: skip
-
-
-def revolution(rays: int, layers: int = 128) -> Float:
-    """Return unit directions of one turn of a lidar with a field of view of 60 degrees."""
-    azimuth = 2 * np.pi * np.arange(max(1, rays // layers))[:, None] / max(1, rays // layers)
-    elevation = np.radians(np.linspace(-30, 30, layers))
-    level = np.cos(elevation)
-    parts = (np.cos(azimuth) * level, np.sin(azimuth) * level, np.sin(elevation))
-    return np.stack(np.broadcast_arrays(*parts), axis=-1).reshape(-1, 3)
-
-
-# ---- measuring ----
-
-
-def milliseconds(cupy: Any, launch: Callable[[], object], repeats: int) -> dict[str, float]:
-    """Median, least and greatest time of a launch on the device."""
-    for _ in range(3):
-        launch()
-    times = []
-    for _ in range(repeats):
-        start, stop = cupy.cuda.Event(), cupy.cuda.Event()
-        start.record()
-        launch()
-        stop.record()
-        stop.synchronize()
-        times.append(float(cupy.cuda.get_elapsed_time(start, stop)))
-    return {"median": statistics.median(times), "least": min(times), "greatest": max(times)}
-
-
-def wall_milliseconds(call: Callable[[], object], repeats: int) -> float:
-    """Median time of a call that ends with its results on the host."""
-    call()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        call()
-        times.append(1e3 * (time.perf_counter() - start))
-    return statistics.median(times)
-
-
 class Bench:
     """One scene on the device, and everything that is measured of it."""
 
@@ -171,150 +69,125 @@ class Bench:
         self.origin = np.asarray(origin, dtype=np.float64)
         start = time.perf_counter()
         self.local = local_mesh(*mesh)
+        self.check_seconds = time.perf_counter() - start
         self.engine = CudaBackend(self.local)
-        cupy.cuda.Device().synchronize()
-        self.build_seconds = time.perf_counter() - start
 
-    def kernels(self, directions: Float) -> dict[str, Any]:
-        """Time the two casts alone, and a whole scan up to arrays on the host."""
-        cupy, n = self.cupy, len(directions)
-        limits = (np.int64(n), np.float64(0), np.float64(np.inf))
-        rays = cupy.asarray(directions)
-        origin = cupy.asarray(self.origin)
-        pose = cupy.asarray(np.concatenate([self.origin, np.eye(3).ravel()]))
-        t, place = cupy.empty(n), cupy.empty(n, np.int32)
-        scene = self.engine._scene
-        grid = (-(-n // _BLOCK),)
-        table = (*scene, origin, np.int32(0), rays, *limits, t, place)
-        pattern = (*scene, pose, np.int32(1), rays, *limits, t, place)
-        get = self.engine._kernels.module.get_function
-        pattern_times = milliseconds(
-            cupy, lambda: get("cast_pattern")(grid, (_BLOCK,), pattern), self.repeats
-        )
-        table_times = milliseconds(
-            cupy, lambda: get("cast_table")(grid, (_BLOCK,), table), self.repeats
-        )
-        variants = {}
-        for blocks in _VARIANTS:
-            variant = self.variant(blocks)
-            variants[f"blocks {blocks}"] = {
-                "registers": int(variant.num_regs),
-                "local_bytes": int(variant.local_size_bytes),
-                **milliseconds(cupy, partial(variant, grid, (_BLOCK,), pattern), self.repeats),
-            }
-        kept = Pattern(directions)
-        whole = wall_milliseconds(
-            lambda: self.engine.scan(kept, (0, n), self.origin[None], None, (0.0, np.inf)),
-            max(3, self.repeats // 4),
-        )
+    def whole(self, directions: Float) -> tuple[Any, ...]:
+        """Arguments of the engine's scans: all directions, from the origin, not turned."""
+        return Pattern(directions), (0, len(directions)), self.origin[None], None, (0.0, np.inf)
+
+    def build(self) -> dict[str, Any]:
+        """Time both builds, from the checked mesh on the host to the tables on the device."""
         return {
-            "rays": n,
-            "hit_share": float((place >= 0).mean()),
-            "cast_pattern_ms": pattern_times,
-            "cast_table_ms": table_times,
-            "variants_ms": variants,
-            "scan_to_host_ms": whole,
-            "cast_pattern_mrays_s": n / pattern_times["median"] / 1e3,
-            "cast_table_mrays_s": n / table_times["median"] / 1e3,
-            "scan_to_host_mrays_s": n / whole / 1e3,
+            "check_mesh_s": self.check_seconds,
+            "device_ms": cuda_limits.build_on_device(self.cupy, self.local, 3),
+            "host_ms": cuda_limits.build_on_host(self.cupy, self.local)
+            if len(self.mesh[1]) <= _NUMPY_MOST
+            else None,
         }
 
-    def variant(self, blocks: int) -> Any:
-        """Compile cast_pattern so that `blocks` blocks fit on a multiprocessor."""
-        given = (*flags(self.engine._stack), f"-DBLOCKS={blocks}")
-        module = self.cupy.RawModule(code=source("intersect.cu"), options=given)
-        return module.get_function("cast_pattern")
+    def kernels(self, directions: Float) -> dict[str, Any]:
+        """Rates of the kernels alone, and of a whole scan up to arrays on the host."""
+        cupy, engine, n, repeats = self.cupy, self.engine, len(directions), self.repeats
+        parts = list(engine._turned(*self.whole(directions)))
+        counts = cupy.zeros(engine._mesh.face_count, np.int64)
+        results = [engine._cast("cast_pattern", size, rays) for _, size, rays in parts]
+        hits = sum(int((place >= 0).sum()) for _, place in results)
+
+        def cast() -> None:
+            for _, size, rays in parts:
+                engine._cast("cast_pattern", size, rays)
+
+        def tally(every: bool) -> None:
+            for _, size, rays in parts:
+                engine._tally("pattern", size, rays, every, counts)
+
+        def pack() -> None:
+            for t, place in results:
+                engine._packer().add(t, place, 0, 1.0)
+
+        given = self.whole(directions)
+        times = {
+            "cast": milliseconds(cupy, cast, repeats),
+            "count_closest": milliseconds(cupy, lambda: tally(False), repeats),
+            "count_every": milliseconds(cupy, lambda: tally(True), repeats),
+            "pack": milliseconds(cupy, pack, repeats),
+            "scan_to_host": wall_milliseconds(cupy, lambda: engine.scan(*given), repeats),
+        }
+        rates = {name: n / took["median"] / 1e3 for name, took in times.items()}
+        return {"rays": n, "hit_share": hits / n, "ms": times, "mrays_s": rates}
 
     def brute_force(self, directions: Float) -> dict[str, float]:
-        """Time of every ray against every triangle, on so many rays that it takes a moment."""
+        """Rate of every ray against every triangle, on so many rays that it takes a moment."""
         cupy = self.cupy
         triangles = self.engine._scene[1]
         n = int(np.clip(4e10 / len(triangles), 1024, len(directions)))
         part = cupy.asarray(directions[:: max(1, len(directions) // n)][:n])
         n = len(part)
-        at = self.local.to_local(self.origin[None])[0]
         kernel = cupy.RawKernel(_BRUTE_FORCE, "brute_force")
+        at = [np.float32(x) for x in self.local.to_local(self.origin[None])[0]]
         out = cupy.empty(n, np.float32)
-        at = [np.float32(x) for x in at]
-        arguments = (triangles, np.int32(len(triangles)), *at, part, np.int32(n), out)
-        took = milliseconds(cupy, lambda: kernel((-(-n // _BLOCK),), (_BLOCK,), arguments), 5)
+        given = (triangles, np.int32(len(triangles)), *at, part, np.int32(n), out)
+        took = milliseconds(cupy, lambda: kernel((-(-n // _BLOCK),), (_BLOCK,), given), 3)
         return {"rays": n, "ms": took["median"], "mrays_s": n / took["median"] / 1e3}
 
-    def check(self, directions: Float) -> dict[str, int]:
+    def differences(self, directions: Float) -> dict[str, int] | None:
         """Count rays of a sample that differ from the numpy backend's in any bit."""
+        if len(self.mesh[1]) > _NUMPY_MOST:
+            return None
         sample = np.ascontiguousarray(directions[:: max(1, len(directions) // _SAMPLE)])
         reference = RayCaster(*self.mesh, backend="numpy")
-        want = reference.cast(self.origin, sample)
-        got = RayCaster(*self.mesh, backend="cuda").cast(self.origin, sample)
+        device = RayCaster(*self.mesh, backend="cuda")
+        want, got = (caster.cast(self.origin, sample) for caster in (reference, device))
         names = ("distance", "triangle", "u", "v")
         wrong = {name: int((getattr(got, name) != getattr(want, name)).sum()) for name in names}
         turn, _ = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))
-        scan = self.engine.scan(
-            Pattern(sample), (0, len(sample)), self.origin[None], turn, (0.0, np.inf)
-        )
-        turned = reference.scan(Pattern(sample), self.origin, turn)
+        pattern = Pattern(sample)
+        scan, turned = (c.scan(pattern, self.origin, turn) for c in (device, reference))
         wrong["scan"] = len(sample)
         if np.array_equal(scan.ray, turned.ray):
             wrong["scan"] = int((scan.distance != turned.distance).sum())
+        for every in (False, True):
+            counts = [c.count_scan(pattern, self.origin, every=every) for c in (device, reference)]
+            wrong[f"counts, every {every}"] = int((counts[0] != counts[1]).sum())
         return {"sample": len(sample), "hits": int(want.hit.sum()), **wrong}
 
 
-def leaks(rays: int) -> dict[str, int]:
-    """Count rays from inside a closed object, at its edges and corners, that hit nothing."""
-    vertices, faces = six_objects()
-    faces = faces[: len(faces) // 6]
-    vertices = vertices[: faces.max() + 1] + 5e5
-    caster = RayCaster(vertices, faces, backend="cuda")
-    inside = np.array([-20, -20, 1.5]) + 5e5
-    rng = np.random.default_rng(2)
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    escaped = done = 0
-    while done < rays:
-        count = min(1 << 20, rays - done)
-        ends = vertices[edges[rng.integers(len(edges), size=count)]]
-        part = np.clip(rng.uniform(-0.5, 1.5, (count, 1)), 0, 1)  # half of them at corners
-        origins = inside + 0.1 * rng.uniform(-1, 1, (count, 3))
-        directions = ends[:, 0] * (1 - part) + ends[:, 1] * part - origins
-        escaped += count - len(caster.returns(origins, directions))
-        done += count
-    return {"rays": done, "escaped": escaped}
-
-
-def attributes(module: Any) -> dict[str, dict[str, int]]:
-    """Look up registers and local memory of the kernels."""
-    out = {}
-    for name in ("cast_table", "cast_pattern", "weigh_table"):
-        kernel = module.get_function(name)
-        out[name] = {
-            "registers": int(kernel.num_regs),
-            "local_bytes": int(kernel.local_size_bytes),
-        }
-    return out
+def measure_scene(
+    cupy: Any, name: str, mesh: Mesh, origin: Float, rays: dict[str, Float], repeats: int
+) -> tuple[dict[str, Any], Bench]:
+    """Everything about one scene."""
+    bench = Bench(cupy, mesh, origin, repeats)
+    row: dict[str, Any] = {"scene": name, "triangles": len(mesh[1]), "build": bench.build()}
+    row |= {kind: bench.kernels(directions) for kind, directions in rays.items()}
+    row["brute_force"] = bench.brute_force(rays["coherent"])
+    row["differences"] = bench.differences(rays["coherent"])
+    row["warp"] = None
+    if cuda_warp.available():
+        cupy.get_default_memory_pool().free_all_blocks()
+        row["warp"] = cuda_warp.casts(mesh, origin, rays, repeats)
+    return row, bench
 
 
 def measure(
-    cupy: Any, rays: int, triangles: list[int], repeats: int, leak_rays: int
+    cupy: Any, rays: int, triangles: list[int], repeats: int, many: int, leak_rays: int
 ) -> dict[str, Any]:
     """All scenes, coherent and shuffled rays."""
-    scenes: dict[str, tuple[Mesh, Float]] = {"six objects": (six_objects(), np.array([0, 0, 2.0]))}
-    for count in triangles:
-        scenes[f"city {count:.0e}"] = (city(count), np.array([10.0, 10.0, 2.0]))
     directions = revolution(rays)
-    shuffled = np.random.default_rng(0).permutation(directions)
-    results = []
-    for name, (mesh, origin) in scenes.items():
-        bench = Bench(cupy, mesh, origin, repeats)
-        row = {
-            "scene": name,
-            "triangles": len(mesh[1]),
-            "build_seconds": bench.build_seconds,
-            "coherent": bench.kernels(directions),
-            "shuffled": bench.kernels(shuffled),
-            "brute_force": bench.brute_force(directions),
-            "differences": bench.check(directions),
-        }
-        results.append(row)
+    cast = {
+        "coherent": directions,
+        "shuffled": np.random.default_rng(0).permutation(directions),
+    }
+    middle = np.array([10.0, 10.0, 2.0])
+    row, bench = measure_scene(
+        cupy, "six objects", six_objects(), np.array([0, 0, 2.0]), cast, repeats
+    )
+    show(row)
+    rows = [row]
+    for count in triangles:
+        row, bench = measure_scene(cupy, f"city {count:.0e}", city(count), middle, cast, repeats)
         show(row)
+        rows.append(row)
     properties = cupy.cuda.runtime.getDeviceProperties(cupy.cuda.Device().id)
     return {
         "device": properties["name"].decode(),
@@ -323,28 +196,35 @@ def measure(
         "cupy": cupy.__version__,
         "numpy": np.__version__,
         "python": platform.python_version(),
-        "kernels": attributes(bench.engine._kernels.module),
-        "leaks": leaks(leak_rays),
-        "scenes": results,
+        "kernels": cuda_limits.attributes(bench.engine),
+        "crossover": cuda_limits.crossover(cupy),
+        "transfers_gb_s": cuda_limits.transfers(cupy),
+        "many_rays": cuda_limits.many_rays(bench.engine, bench.origin, many),
+        "leaks": cuda_limits.leaks(leak_rays),
+        "scenes": rows,
     }
 
 
 def show(row: dict[str, Any]) -> None:
     """Print one scene's rates in millions of rays a second."""
-    print(f"{row['scene']}: {row['triangles']} triangles, built in {row['build_seconds']:.2f} s")
+    build = row["build"]
+    host = "" if build["host_ms"] is None else f", {build['host_ms']:.0f} ms on the host"
+    print(
+        f"{row['scene']}: {row['triangles']} triangles, tree {build['device_ms']['median']:.1f} ms"
+        f" on the device{host}; mesh checked in {build['check_mesh_s']:.2f} s"
+    )
     for kind in ("coherent", "shuffled"):
         part = row[kind]
-        times = part["cast_pattern_ms"]
+        took = part["ms"]["cast"]
+        rates = ", ".join(f"{name} {rate:.0f}" for name, rate in part["mrays_s"].items())
         print(
-            f"  {kind}: pattern {part['cast_pattern_mrays_s']:9.1f} Mray/s"
-            f" ({times['least']:.3f} to {times['greatest']:.3f} ms)"
-            f"  table {part['cast_table_mrays_s']:9.1f}"
-            f"  scan to host {part['scan_to_host_mrays_s']:7.1f}"
-            f"  hits {100 * part['hit_share']:.1f} %"
+            f"  {kind}: {rates} Mray/s"
+            f" (cast {took['least']:.3f} to {took['greatest']:.3f} ms,"
+            f" {100 * part['hit_share']:.1f} % hit)"
         )
-        for name, times in part["variants_ms"].items():
-            rate = part["rays"] / times["median"] / 1e3
-            print(f"    {name}: {rate:9.1f} Mray/s, {times['registers']} registers")
+        if row["warp"]:
+            peer = cuda_warp.best(row["warp"], kind)
+            print(f"    Warp {peer:.0f} Mray/s at best; {part['mrays_s']['cast'] / peer:.2f} times")
     print(f"  brute force: {row['brute_force']['mrays_s']:.3f} Mray/s")
     print(f"  differences from numpy: {row['differences']}")
 
@@ -353,8 +233,11 @@ def main(arguments: list[str] | None = None) -> int:
     """Run from the command line; 1 when the device's answers are wrong, 2 without a device."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--rays", type=int, default=1 << 22)
-    parser.add_argument("--triangles", type=int, nargs="*", default=[100_000, 1_000_000])
+    parser.add_argument(
+        "--triangles", type=int, nargs="*", default=[100_000, 1_000_000, 10_000_000]
+    )
     parser.add_argument("--repeats", type=int, default=21)
+    parser.add_argument("--many-rays", type=int, default=1 << 31)
     parser.add_argument("--leak-rays", type=int, default=10_000_000)
     parser.add_argument("--json", type=Path, help="write the results here")
     chosen = parser.parse_args(arguments)
@@ -364,16 +247,17 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     import cupy
 
-    results = measure(cupy, chosen.rays, chosen.triangles, chosen.repeats, chosen.leak_rays)
+    sizes = (chosen.rays, chosen.triangles, chosen.repeats, chosen.many_rays, chosen.leak_rays)
+    results = measure(cupy, *sizes)
     if chosen.json:
         chosen.json.write_text(json.dumps(results, indent=1) + "\n")
+    checked = [row["differences"] for row in results["scenes"] if row["differences"]]
     differ = any(
-        row["differences"][name]
-        for row in results["scenes"]
-        for name in ("distance", "triangle", "u", "v", "scan")
+        number for row in checked for name, number in row.items() if name not in ("sample", "hits")
     )
     print(f"{results['device']}, CuPy {results['cupy']}; kernels: {results['kernels']}")
-    print(f"rays at seams: {results['leaks']}")
+    for name in ("crossover", "transfers_gb_s", "many_rays", "leaks"):
+        print(f"{name}: {results[name]}")
     print("differences from numpy: " + ("yes" if differ else "none"))
     return int(differ or results["leaks"]["escaped"] > 0)
 

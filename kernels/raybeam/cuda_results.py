@@ -49,7 +49,7 @@ class PinnedRoom:
         # Views of the array keep this alive; when the last is gone, so is the loan.
         loan = (ctypes.c_char * size).from_address(block.ptr)
         weakref.finalize(loan, self._give_back, size, block)
-        return np.ndarray((n,), dtype, loan)
+        return np.ndarray((n,), dtype, memoryview(loan))
 
     def _take(self, size: int) -> Any:
         """Return a block, or None when there is no room for it."""

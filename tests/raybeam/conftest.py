@@ -63,8 +63,8 @@ class Pinned:
     """Page-locked memory."""
 
     def __init__(self, size):
-        self._bytes = np.empty(size, np.uint8)
-        self.ptr, self.size = self._bytes.ctypes.data, size
+        self.bytes = np.empty(size, np.uint8)
+        self.ptr, self.size = self.bytes.ctypes.data, size
 
 
 KINDS = {

@@ -1,0 +1,77 @@
+"""Scenes and rays for the device's benchmark, made with NumPy alone."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Mesh = tuple[NDArray[np.float64], NDArray[np.int64]]
+Float = NDArray[np.float64]
+
+
+def grid_faces(rows: int, columns: int, wrap: bool = False) -> NDArray[np.int64]:
+    """Two triangles for each cell of a grid of vertices."""
+    i = np.arange(rows - 1)[:, None] * columns
+    j = np.arange(columns if wrap else columns - 1)[None, :]
+    k = (j + 1) % columns
+    quad = np.stack(np.broadcast_arrays(i + j, i + k, i + columns + k, i + columns + j), axis=-1)
+    return np.concatenate([quad[..., [0, 1, 2]], quad[..., [0, 2, 3]]]).reshape(-1, 3)
+
+
+def joined(meshes: list[Mesh]) -> Mesh:
+    """Several meshes as one."""
+    starts = np.cumsum([0] + [len(vertices) for vertices, _ in meshes])
+    return (
+        np.concatenate([vertices for vertices, _ in meshes]),
+        np.concatenate([f + start for (_, f), start in zip(meshes, starts, strict=False)]),
+    )
+
+
+def six_objects() -> Mesh:
+    """Six surfaces of revolution, 80 by 80, as in the default survey."""
+    polar = np.linspace(0, np.pi, 80)[:, None]
+    around = np.arange(80) * 2 * np.pi / 80
+    radius = 2 * np.sin(polar) * (0.75 + 0.25 * np.cos(3 * polar))
+    height = np.broadcast_to(2 - 2 * np.cos(polar), (80, 80))
+    one = np.stack([radius * np.cos(around), radius * np.sin(around), height], -1).reshape(-1, 3)
+    places = [(-20, -20), (20, -20), (-20, 20), (20, 20), (-10, -5), (5, 5)]
+    faces = grid_faces(80, 80, wrap=True)
+    return joined([(one + np.array([x, y, 0]), faces) for x, y in places])
+
+
+def city(triangles: int, seed: int = 0) -> Mesh:
+    """Streets of box-shaped buildings with panelled faces on flat ground, about `triangles`."""
+    rng = np.random.default_rng(seed)
+    panels, pitch = 4, 20.0
+    side = max(1, round(np.sqrt(triangles / (5 * 2 * panels**2 + 2))))
+    line = np.linspace(-1, 1, panels + 1)
+    a, b = (x.ravel() for x in np.meshgrid(line, line, indexing="ij"))
+    one = np.ones_like(a)
+    sides = [(a, b, one), (a, one, b), (a, -one, b), (one, a, b), (-one, a, b)]
+    face = grid_faces(panels + 1, panels + 1)
+    box, faces = joined([(np.stack(points, axis=-1), face) for points in sides])
+    x, y = (c.ravel() for c in np.meshgrid(np.arange(side), np.arange(side), indexing="ij"))
+    count = side * side
+    middle = pitch * (np.stack([x, y], axis=-1) - (side - 1) / 2)
+    half = rng.uniform(4, 7.5, (count, 2))
+    height = rng.gamma(3, 6, count) + 3
+    vertices = np.empty((count, len(box), 3))
+    vertices[..., :2] = middle[:, None] + box[:, :2] * half[:, None]
+    vertices[..., 2] = (box[:, 2] + 1) / 2 * height[:, None]
+    buildings = faces + len(box) * np.arange(count)[:, None, None]
+    edge = pitch * (np.arange(side + 1) - side / 2)
+    gx, gy = np.meshgrid(edge, edge, indexing="ij")
+    ground = np.stack([gx, gy, np.zeros_like(gx)], axis=-1).reshape(-1, 3)
+    return joined([
+        (vertices.reshape(-1, 3), buildings.reshape(-1, 3)),
+        (ground, grid_faces(side + 1, side + 1)),
+    ])  # fmt: skip
+
+
+def revolution(rays: int, layers: int = 128) -> Float:
+    """Return unit directions of one turn of a lidar with a field of view of 60 degrees."""
+    azimuth = 2 * np.pi * np.arange(max(1, rays // layers))[:, None] / max(1, rays // layers)
+    elevation = np.radians(np.linspace(-30, 30, layers))
+    level = np.cos(elevation)
+    parts = (np.cos(azimuth) * level, np.sin(azimuth) * level, np.sin(elevation))
+    return np.stack(np.broadcast_arrays(*parts), axis=-1).reshape(-1, 3)
