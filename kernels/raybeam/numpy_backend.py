@@ -21,7 +21,7 @@ class NumpyBackend(Backend):
     """Bounding volume hierarchy, walked by many rays at a time on one thread."""
 
     name: ClassVar[str] = "numpy"
-    chunk: ClassVar[int] = 1 << 15
+    chunk: ClassVar[int] = 1 << 16
 
     @classmethod
     def missing(cls) -> str:

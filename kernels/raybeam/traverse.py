@@ -2,8 +2,10 @@
 
 The unit of work is a pair of a ray and a node. A block of pairs is tested against the children's
 boxes in float32; pairs of a ray and an inner child make new blocks, pairs with a leaf are tested
-against its triangles. Blocks are taken last in, first out and are limited in size, so memory
-stays bounded whatever the scene, and hits found early spare later blocks the search behind them.
+against its triangles. Blocks are taken last in, first out, and of a block that is too large the
+pairs that are nearest to their rays' starts go first: memory stays bounded whatever the scene,
+and hits found early spare later pairs the search behind them. To order the children of every
+node would test a fifth fewer boxes, but in many small blocks, which takes twice as long.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ Float = NDArray[np.float64]
 Single = NDArray[np.float32]
 Index = NDArray[np.intp]
 
-_BLOCK = 1 << 14  # pairs: the arrays of one step stay within a few hundred kilobytes
+_BLOCK = 1 << 15  # pairs: a step's arrays take about 6 MiB; smaller ones cost more calls
 _ACROSS = 4.0  # local units: more than the diagonal of any scene
 _SLACK = 2.0**-20  # on limits of distance in float32: far more than their rounding
 
@@ -66,6 +68,21 @@ class _Bundle:
     sheared: exact.ShearedRays
 
 
+@dataclass(frozen=True)
+class _Pairs:
+    """Rays that are to visit nodes, and where each enters the node's box; (m,) each."""
+
+    ray: Index
+    node: Index
+    enter: Single
+
+    def only(self, rows: Index) -> _Pairs:
+        """Return some of the pairs; as many rows as there are pairs mean all of them."""
+        if len(rows) == len(self.ray):
+            return self
+        return _Pairs(self.ray.take(rows), self.node.take(rows), self.enter.take(rows))
+
+
 class Walker:
     """Finds closest hits in a tree over a mesh."""
 
@@ -106,23 +123,27 @@ class Walker:
 
     def _walk(self, rays: _Bundle, best: _Best, t_min: float) -> None:
         n = len(rays.entry)
-        blocks: list[tuple[Index, Index]] = [(np.arange(n), np.zeros(n, np.intp))]
+        blocks = [_Pairs(np.arange(n), np.zeros(n, np.intp), np.zeros(n, np.float32))]
         while blocks:
-            ray, node = blocks.pop()
-            if len(ray) > _BLOCK:
-                blocks.append((ray[_BLOCK:], node[_BLOCK:]))
-                ray, node = ray[:_BLOCK], node[:_BLOCK]
-            met = np.flatnonzero(self._meets(rays, ray, node))
-            child = self._child.take(node, axis=0).reshape(-1).take(met)
-            ray = ray.take(met // self._width)
-            inner = child >= 0
-            leaf = ~inner
-            self._test(rays, best, t_min, ray[leaf], ~child[leaf])
-            if inner.any():
-                blocks.append((ray[inner], child[inner]))
+            pairs = blocks.pop()
+            if len(pairs.ray) > _BLOCK:
+                order = np.argpartition(pairs.enter, _BLOCK)
+                blocks.append(pairs.only(order[_BLOCK:]))
+                pairs = pairs.only(order[:_BLOCK])
+            # Since the block was made, hits may have been found in front of some of its boxes.
+            pairs = pairs.only(np.flatnonzero(pairs.enter <= rays.limit.take(pairs.ray)))
+            enter, meets = self._meets(rays, pairs.ray, pairs.node)
+            met = np.flatnonzero(meets)
+            ray = pairs.ray.take(met // self._width)
+            child = self._child.take(pairs.node, axis=0).reshape(-1).take(met)
+            leaf = np.flatnonzero(child < 0)
+            self._test(rays, best, t_min, ray.take(leaf), ~child.take(leaf))
+            inner = np.flatnonzero(child >= 0)
+            if len(inner):
+                blocks.append(_Pairs(ray, child, enter.take(met)).only(inner))
 
-    def _meets(self, rays: _Bundle, ray: Index, node: Index) -> NDArray[np.bool_]:
-        """Which children's boxes each ray meets before its limit: (m * width,)."""
+    def _meets(self, rays: _Bundle, ray: Index, node: Index) -> tuple[Single, NDArray[np.bool_]]:
+        """Where rays enter children's boxes, and whether before they leave: (m * width,) each."""
         enter = np.zeros((len(ray), self._width), np.float32)
         leave = np.empty_like(enter)
         leave[:] = rays.limit.take(ray)[:, None]
@@ -138,7 +159,7 @@ class Walker:
             far *= inverse
             far -= shift
             np.minimum(leave, far, out=leave)
-        return (enter <= leave).reshape(-1)
+        return enter.reshape(-1), (enter <= leave).reshape(-1)
 
     def _test(self, rays: _Bundle, best: _Best, t_min: float, ray: Index, leaf: Index) -> None:
         """Test rays against the triangles of leaves and keep what is closer."""
