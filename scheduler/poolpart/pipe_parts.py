@@ -7,6 +7,7 @@ moment; and a write after the pipe was deleted would bring half of it back.
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -14,6 +15,8 @@ from typing import Any
 from distributed import Client, Queue
 
 from .errors import PoolError
+
+_LATE_WORD_S = 2.0  # clients send such words every few milliseconds
 
 
 @dataclass(frozen=True)
@@ -94,10 +97,17 @@ async def _forget(names: list[str], dask_scheduler: Any = None) -> None:
     for name in names:
         while name in queues.queues:
             queues.release(name=name, client="poolpart")
-        for counted in [counted for counted in queues.future_refcount if counted[0] == name]:
-            del queues.future_refcount[counted]
+        _forget_counts(queues, name)
+        # A consumer's word that it has a future may still be under way, and would be counted.
+        asyncio.get_running_loop().call_later(_LATE_WORD_S, _forget_counts, queues, name)
         # Futures that were taken by a consumer which died before it could say so.
         if f"queue-{name}" in dask_scheduler.clients:
             dask_scheduler.remove_client(f"queue-{name}")
         if name in variables.variables:
             await variables.delete(name=name, client="poolpart")
+
+
+def _forget_counts(queues: Any, name: str) -> None:
+    if name not in queues.queues:
+        for counted in [counted for counted in queues.future_refcount if counted[0] == name]:
+            del queues.future_refcount[counted]

@@ -328,6 +328,7 @@ def test_a_future_that_was_cancelled_is_refused(client, make_pipe, monkeypatch, 
     monkeypatch.setattr(pipe_module, "_UNKNOWN_FUTURE_S", 0.05)
     pipe = make_pipe(client)
     future = Partition("A", client).submit(add_one, 1)
+    assert future.result(LONG_S) == 2
     future.cancel()
     wait_until(lambda: not client.cluster.scheduler.tasks)
     with pytest.raises(ValueError, match="the scheduler does not know its task"):
