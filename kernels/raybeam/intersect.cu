@@ -36,7 +36,7 @@ typedef unsigned long long Sum;
 #define LEAF_BITS 3
 #define DONE ((int)0x80000000)
 #define TINY 8.673617379884035e-19  // 2^-60: stands for a direction component of zero
-#define SLACK 9.5367431640625e-07   // 2^-20: on limits in float, far more than their rounding
+#define SLACK 9.5367431640625e-07f  // 2^-20: on limits in float, far more than their rounding
 #define ACROSS 4.0                  // more than the diagonal of any scene
 
 struct Scene {
@@ -241,33 +241,34 @@ __device__ __forceinline__ void order(float& t0, int& c0, float& t1, int& c1)
     c1 = c;
 }
 
-// Nodes that wait, each with the distance at which the ray enters it.
-struct Stack {
-    int node[STACK];
-    float t[STACK];
-    int top;
-
-    __device__ __forceinline__ void push(int code, float at)
-    {
-        if (at < 1e30f) {
-            node[top] = code;
-            t[top] = at;
-            ++top;
-        }
-    }
-
-    __device__ __forceinline__ int pop(float to)
-    {
-        while (top > 0) {
-            --top;
-            if (t[top] <= to) return node[top];
-        }
-        return DONE;
-    }
+// A node that waits, and the distance at which the ray enters it.
+struct alignas(8) Waiting {
+    int node;
+    float t;
 };
 
+// The stack's top is a variable of its own: as a member beside the array it would live in local
+// memory, and every push would wait for it.
+__device__ __forceinline__ void push(Waiting* stack, int& top, int node, float t)
+{
+    if (t < 1e30f) {
+        const Waiting entry = {node, t};
+        stack[top++] = entry;
+    }
+}
+
+__device__ __forceinline__ int pop(const Waiting* stack, int& top, float to)
+{
+    while (top > 0) {
+        const Waiting entry = stack[--top];
+        if (entry.t <= to) return entry.node;
+    }
+    return DONE;
+}
+
 // Test a node's children; the nearest that is met is next, the others wait.
-__device__ __forceinline__ int descend(const float4* nodes, int node, const Walk& w, Stack& stack)
+__device__ __forceinline__ int descend(
+    const float4* nodes, int node, const Walk& w, Waiting* stack, int& top)
 {
     const float4* line = nodes + 8 * (Count)node;
     const float4 nx = line[w.nx], ny = line[w.ny], nz = line[w.nz];
@@ -284,15 +285,22 @@ __device__ __forceinline__ int descend(const float4* nodes, int node, const Walk
     order(t0, c0, t2, c2);
     order(t1, c1, t3, c3);
     order(t1, c1, t2, c2);
-    stack.push(c3, t3);
-    stack.push(c2, t2);
-    stack.push(c1, t1);
-    return t0 < 1e30f ? c0 : stack.pop(w.to);
+    push(stack, top, c3, t3);
+    push(stack, top, c2, t2);
+    push(stack, top, c1, t1);
+    return t0 < 1e30f ? c0 : pop(stack, top, w.to);
 }
+
+// What the test in float knows of a triangle that the ray may hit: bounds of the distance from the
+// start of the walk, and whether the ray hits it within the limits for certain.
+struct Guess {
+    float near, far;
+    bool sure;
+};
 
 // Moeller and Trumbore in float: false only when the ray certainly misses the triangle, or meets
 // it outside [from, to].
-__device__ __forceinline__ bool may_hit(const float4* record, const Walk& w)
+__device__ __forceinline__ bool may_hit(const float4* record, const Walk& w, Guess& guess)
 {
     const float4 v = record[0], e = record[1], g = record[2];
     const float px = fmaf(w.dy, g.z, -(w.dz * g.y));
@@ -308,63 +316,72 @@ __device__ __forceinline__ bool may_hit(const float4* record, const Walk& w)
     const float qz = fmaf(tx, e.y, -(ty * e.x));
     const float c = sign * fmaf(w.dx, qx, fmaf(w.dy, qy, w.dz * qz));
     const float t = sign * fmaf(g.x, qx, fmaf(g.y, qy, g.z * qz));
-    return b >= -v.w && c >= -e.w && b + c <= size + (v.w + e.w) &&
-           t >= fmaf(w.from, size, -g.w) && t <= fmaf(w.to, size, g.w);
-}
-
-// Test the triangles of a leaf; hits that are not too near go to the taker.
-template <class Rays, class Taker>
-__device__ __forceinline__ void test_leaf(
-    const Scene& scene, const Rays& rays, Count i, int code, double t_min, Walk& w, Taker& taker)
-{
-    const int leaf = ~code;
-    const int first = leaf >> LEAF_BITS, last = first + (leaf & ((1 << LEAF_BITS) - 1));
-    for (int place = first; place <= last; ++place) {
-        if (!may_hit(scene.triangles + 3 * (Count)place, w)) continue;
-        Exact hit;
-        // The ray is loaded again: keeping it in double through the walk costs more registers
-        // than it saves time, since this happens once or twice a ray.
-        if (!decide(scene, rays.load(scene, i), place, hit) || !(hit.t >= t_min)) continue;
-        taker.take(scene, place, hit.t, w);
-    }
-}
-
-// Show the taker all triangles that the ray may still be of use with.
-template <class Rays, class Taker>
-__device__ __forceinline__ void walk(
-    const Scene& scene, const Rays& rays, Count i, double t_min, double t_max, Taker& taker)
-{
-    Walk w;
-    if (!begin(scene, rays.load(scene, i), t_min, t_max, w)) return;
-    Stack stack;
-    stack.top = 0;
-    int node = 0;
-    while (node != DONE) {
-        if (node >= 0) {
-            node = descend(scene.nodes, node, w, stack);
-        } else {
-            test_leaf(scene, rays, i, node, t_min, w, taker);
-            node = stack.pop(w.to);
-        }
-    }
+    const bool may = b >= -v.w && c >= -e.w && b + c <= size + (v.w + e.w) &&
+                     t >= fmaf(w.from, size, -g.w) && t <= fmaf(w.to, size, g.w);
+    if (!may) return false;
+    // Inside by more than the bands: then det is far from zero as well, and its sign is right.
+    guess.sure = b >= v.w && c >= e.w && b + c <= size - (v.w + e.w);
+    const float scale = 1.0f / size;
+    guess.near = guess.sure ? (t - g.w) * scale * (1.0f - SLACK) - SLACK : w.from;
+    guess.far = guess.sure ? (t + g.w) * scale * (1.0f + SLACK) + SLACK : w.to;
+    guess.sure = guess.sure && guess.near >= w.from + 16.0f * SLACK;
+    return true;
 }
 
 // ---- what is made of hits ----
 
-// Keeps the closest: local distance, and place in the tables (-1: none yet).
+// Finds the closest hit: local distance, and place in the tables (-1: none yet).
+//
+// The test that decides costs as much as several nodes, and the rays of a warp come to their
+// triangles at different times. So triangles that may be the closest wait until all rays of the
+// warp are done, or have no room left; a hit that is certain shortens the walk at once.
 struct Closest {
     double t;
     int place;
+    int one, two;              // triangles that wait, -1: none
+    float near_one, near_two;  // the least that their distances may be
 
-    __device__ __forceinline__ void take(const Scene& scene, int at, double distance, Walk& w)
+    __device__ __forceinline__ Closest(double t_max) : t(t_max), place(-1), one(-1), two(-1) {}
+
+    // Take in a triangle; false when there is no room for another.
+    template <class Rays>
+    __device__ __forceinline__ bool offer(
+        const Scene&, const Rays&, Count, int at, const Guess& guess, double, Walk& w)
     {
-        const bool tie =
-            distance == t && (place < 0 || scene.faces[at] < scene.faces[place]);
-        if (distance < t || tie) {
-            t = distance;
-            place = at;
-            w.to = limit(distance, w.entry);
+        if (guess.sure) w.to = fminf(w.to, guess.far);
+        if (one >= 0 && near_one > w.to) one = -1;
+        if (two >= 0 && near_two > w.to) two = -1;
+        if (one < 0) {
+            one = at;
+            near_one = guess.near;
+        } else {
+            two = at;
+            near_two = guess.near;
         }
+        return one < 0 || two < 0;
+    }
+
+    // Decide on the triangles that wait.
+    template <class Rays>
+    __device__ __forceinline__ void settle(
+        const Scene& scene, const Rays& rays, Count i, double t_min, Walk& w)
+    {
+#pragma unroll 1  // one copy of the test
+        for (int turn = 0; turn < 2; ++turn) {
+            const int at = turn == 0 ? one : two;
+            if (at < 0 || (turn == 0 ? near_one : near_two) > w.to) continue;
+            Exact hit;
+            // The ray is loaded again: keeping it in double through the walk costs more
+            // registers than it saves time.
+            if (!decide(scene, rays.load(scene, i), at, hit) || !(hit.t >= t_min)) continue;
+            const bool tie = hit.t == t && (place < 0 || scene.faces[at] < scene.faces[place]);
+            if (hit.t < t || tie) {
+                t = hit.t;
+                place = at;
+                w.to = fminf(w.to, limit(t, w.entry));
+            }
+        }
+        one = two = -1;
     }
 };
 
@@ -373,11 +390,56 @@ struct Tally {
     double t_max;
     Sum* counts;
 
-    __device__ __forceinline__ void take(const Scene& scene, int at, double distance, Walk& w)
+    template <class Rays>
+    __device__ __forceinline__ bool offer(
+        const Scene& scene, const Rays& rays, Count i, int at, const Guess& guess, double t_min,
+        Walk& w)
     {
-        if (distance <= t_max) atomicAdd(counts + scene.faces[at], 1ull);
+        bool hit = guess.sure && guess.far < w.to - 16.0f * SLACK;
+        if (!hit) {
+            Exact found;
+            hit = decide(scene, rays.load(scene, i), at, found) && found.t >= t_min &&
+                  found.t <= t_max;
+        }
+        if (hit) atomicAdd(counts + scene.faces[at], 1ull);
+        return true;
+    }
+
+    template <class Rays>
+    __device__ __forceinline__ void settle(
+        const Scene&, const Rays&, Count, double, Walk&)
+    {
     }
 };
+
+// Offer the taker all triangles that the ray may hit and that may still be of use. A step is a
+// node or one triangle of a leaf.
+template <class Rays, class Taker>
+__device__ __forceinline__ void walk(
+    const Scene& scene, const Rays& rays, Count i, double t_min, double t_max, Taker& taker)
+{
+    Walk w;
+    if (!begin(scene, rays.load(scene, i), t_min, t_max, w)) return;
+    Waiting stack[STACK];
+    int top = 0, node = 0;
+    do {
+        bool room = true;
+        while (node != DONE && room) {
+            if (node >= 0) {
+                node = descend(scene.nodes, node, w, stack, top);
+            } else {
+                const int leaf = ~node, place = leaf >> LEAF_BITS;
+                Guess guess;
+                if (may_hit(scene.triangles + 3 * (Count)place, w, guess))
+                    room = taker.offer(scene, rays, i, place, guess, t_min, w);
+                // The rest of the leaf, one triangle on and one less.
+                const bool more = leaf & ((1 << LEAF_BITS) - 1);
+                node = more ? ~(leaf + (1 << LEAF_BITS) - 1) : pop(stack, top, w.to);
+            }
+        }
+        taker.settle(scene, rays, i, t_min, w);
+    } while (node != DONE);
+}
 
 // ---- kernels: scene, rays in, hits out ----
 
@@ -395,7 +457,7 @@ extern "C" __global__ void BOUNDS cast_table(
     if (i >= count) return;
     const Scene scene = {nodes, triangles, corners, faces, frame};
     const TableRays rays = {origins, origin_stride, directions};
-    Closest best = {t_max, -1};
+    Closest best(t_max);
     walk(scene, rays, i, t_min, t_max, best);
     place[i] = best.place;
     if (best.place >= 0) distance[i] = best.t;
@@ -414,7 +476,7 @@ extern "C" __global__ void BOUNDS cast_pattern(
     if (i >= count) return;
     const Scene scene = {nodes, triangles, corners, faces, frame};
     const PatternRays rays = {pose, directions, turned};
-    Closest best = {t_max, -1};
+    Closest best(t_max);
     walk(scene, rays, i, t_min, t_max, best);
     place[i] = best.place;
     if (best.place >= 0) distance[i] = best.t;
