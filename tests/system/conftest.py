@@ -148,8 +148,6 @@ def run_lidarpool(
 ) -> Iterator[Callable[..., Outcome]]:
     """Run the command in this process."""
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    loggers = [logging.getLogger(name) for name in ("distributed", "poolpart", "matplotlib")]
-    levels = [logger.level for logger in loggers]
 
     def run(*arguments: object) -> Outcome:
         capfd.readouterr()
@@ -161,8 +159,7 @@ def run_lidarpool(
     yield run
     for number, handler in handlers.items():
         signal.signal(number, handler)
-    for logger, level in zip(loggers, levels, strict=True):
-        logger.setLevel(level)
+    logging.disable(logging.NOTSET)
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 import math
 import os
 import sys
@@ -24,6 +23,7 @@ from .checks import check_backend_here, check_backend_name, check_precision
 from .complaints import did_you_mean
 from .errors import LidarpoolError
 from .interrupts import INTERRUPTED, children_spared, deferred_interrupts, interrupt_on_signals
+from .quiet import QuietWorkers, silence_logs
 from .report import versions
 from .scenario import Scenario
 from .scene import Scene
@@ -242,15 +242,14 @@ def _local_client(scenario: Scenario, quiet: bool) -> Iterator[Client]:
             )
             stack.callback(cluster.close)
             client = stack.enter_context(Client(cluster, set_as_default=False))
+            client.register_plugin(QuietWorkers())
         yield client
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:
     """Run the command and exit: 0 done, 2 for what the user can put right, 130 interrupted."""
     interrupt_on_signals()
-    for name in ("distributed", "poolpart"):  # their warnings are told in the result's notes
-        logging.getLogger(name).setLevel(logging.CRITICAL)
-    logging.getLogger("matplotlib").setLevel(logging.ERROR)
+    silence_logs()
     try:
         cli.main(args=arguments, prog_name="lidarpool", standalone_mode=False)
         sys.stdout.flush()

@@ -1,0 +1,27 @@
+"""No logs: what a user of the command has to know, it says itself, in its own words."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+from distributed.diagnostics.plugin import WorkerPlugin
+
+
+def silence_logs() -> None:
+    """Drop all log messages of this process, whatever levels Dask gave its many loggers."""
+    logging.disable(logging.CRITICAL)
+
+
+class QuietWorkers(WorkerPlugin):
+    """Silences the logs of workers that share a terminal with the command.
+
+    A task that fails is told of once, by the driver; Dask's worker would log it as well, with
+    a traceback.
+    """
+
+    name = "lidarpool-quiet"
+
+    def setup(self, worker: Any) -> None:
+        """Silence a worker, also one that is started again."""
+        silence_logs()
