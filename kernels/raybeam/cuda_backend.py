@@ -20,7 +20,8 @@ from .mesh import LocalMesh
 from .rays import Pattern, Rays
 
 _STACK_STEP = 32
-_WORK = 1 << 28  # bytes on the device for rays and hits
+_WORK = 1 << 28  # bytes on the device for a chunk of rays and its hits
+_KEEP = 1 << 30  # bytes of hits that wait on the device, at most
 
 
 class CudaBackend(Backend):
@@ -63,6 +64,7 @@ class CudaBackend(Backend):
             # In steps, so that scenes share what is compiled.
             self._stack = -(-max(tables.stack, 1) // _STACK_STEP) * _STACK_STEP
             self._kernels = Kernels(cupy, self._device.id, "intersect.cu", flags(self._stack))
+            self._keep = min(_KEEP, _free(cupy) // 4)
         self._corners, self._faces, self._frame = tables.corners, tables.faces, tables.frame
         self._scene = (tables.nodes, tables.triangles, tables.corners, tables.faces, tables.frame)
         self._room = PinnedRoom(cupy)
@@ -190,21 +192,27 @@ class CudaBackend(Backend):
     ) -> Iterator[tuple[int, int, tuple[Any, ...]]]:
         """Chunks of a pattern: number of the first ray, how many, and arguments for them."""
         cp = self._cupy
-        if pattern not in self._patterns:
-            self._patterns[pattern] = cp.asarray(pattern.directions)
-        directions = self._patterns[pattern][slice(*window)]
+        directions = self._directions(pattern)[slice(*window)]
         turn = np.eye(3) if rotation is None else rotation
         pose = cp.asarray(np.concatenate([origin.ravel(), turn.ravel()]))
         limits = [np.float64(t * self._mesh.scale) for t in interval]
         for start in range(0, len(directions), self.chunk):
-            part = directions[start : start + self.chunk]
+            part = cp.asarray(directions[start : start + self.chunk])
             n = len(part)
             yield start, n, (pose, np.int32(rotation is not None), part, np.int64(n), *limits)
+
+    def _directions(self, pattern: Pattern) -> Any:
+        """Directions of a pattern: on the device, if there is room for all of them."""
+        if pattern not in self._patterns:
+            if pattern.directions.nbytes + _WORK > _free(self._cupy):
+                return pattern.directions
+            self._patterns[pattern] = self._cupy.asarray(pattern.directions)
+        return self._patterns[pattern]
 
     # ---- casts ----
 
     def _packer(self) -> Packer:
-        return Packer(self._cupy, self._kernels, self._faces, self._room)
+        return Packer(self._cupy, self._kernels, self._faces, self._room, self._keep)
 
     def _cast(self, kernel: str, n: int, rays: tuple[Any, ...]) -> tuple[Any, Any]:
         """Local distance and place of the closest hit of each ray, on the device."""

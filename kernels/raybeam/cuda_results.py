@@ -88,7 +88,7 @@ class Packer:
     """
 
     def __init__(
-        self, cupy: Any, kernels: Kernels, faces: Any, room: PinnedRoom, limit: int = 1 << 30
+        self, cupy: Any, kernels: Kernels, faces: Any, room: PinnedRoom, limit: int
     ) -> None:
         self._cupy, self._kernels, self._faces, self._room = cupy, kernels, faces, room
         self._limit = limit

@@ -162,7 +162,8 @@ def compiled(compiler, folder, name, flags):
         importlib.resources.files("raybeam") / f"{name}.cu"
     ) as kernels:
         command = [
-            compiler, "-O2", "-Wall", "-Werror", "-Wno-unknown-pragmas", "-ffp-contract=off", "-shared", "-fPIC",
+            compiler, "-O2", "-Wall", "-Werror", "-Wno-unknown-pragmas",
+            "-ffp-contract=off", "-shared", "-fPIC",
             *(flag for flag in flags if flag != "-fmad=false"), f'-DSOURCE="{kernels}"',
             "-o", str(library), str(HERE / "host" / f"{name}.cpp"),
         ]  # fmt: skip

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from raybeam import Pattern
-from raybeam.cuda_results import Packer, PinnedRoom
+from raybeam.cuda_results import PinnedRoom
 from raybeam.mesh import local_mesh
 
 
@@ -100,11 +100,11 @@ def test_repr(room):
 @pytest.mark.parametrize("chunk", [1, 7, 4096])
 def test_hits_stay_in_ray_order(source_backend, shapes, monkeypatch, limit, chunk):
     """However often hits are fetched, and in however many casts they were found."""
-    monkeypatch.setattr(Packer.__init__, "__defaults__", (limit,))
     engine = source_backend(local_mesh(*shapes["soup"]("random")))
     pattern = Pattern(np.random.default_rng(0).normal(size=(600, 3)))
     given = (pattern, (50, 550), np.array([[1.0, 2.0, 3.0]]), None, (0.0, np.inf))
     want = engine.scan(*given)
+    engine._keep = limit
     monkeypatch.setattr(source_backend, "chunk", chunk)
     got = engine.scan(*given)
     assert len(got) > 50
@@ -113,3 +113,20 @@ def test_hits_stay_in_ray_order(source_backend, shapes, monkeypatch, limit, chun
         mine, other = getattr(got, name), getattr(want, name)
         assert mine.dtype == other.dtype
         np.testing.assert_array_equal(mine, other)
+
+
+def test_pattern_that_does_not_fit_goes_chunk_by_chunk(source_backend, shapes, monkeypatch):
+    engine = source_backend(local_mesh(*shapes["vase"]()))
+    pattern = Pattern(np.random.default_rng(0).normal(size=(3000, 3)))
+    given = ((5, 2990), np.array([[0.05, 0.1, 0.4]]), None, (0.0, np.inf))
+    runtime = source_backend._library().cuda.runtime
+    monkeypatch.setattr(source_backend, "chunk", 500)
+    with monkeypatch.context() as patch:
+        patch.setattr(runtime, "memGetInfo", lambda: ((1 << 28) + 3000 * 24 - 1, 1 << 30))
+        got = engine.scan(pattern, *given)
+        assert pattern not in engine._patterns
+    want = engine.scan(pattern, *given)
+    assert pattern in engine._patterns
+    assert len(got) > 2000
+    np.testing.assert_array_equal(got.ray, want.ray)
+    np.testing.assert_array_equal(got.distance, want.distance)

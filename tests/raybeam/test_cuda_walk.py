@@ -1,0 +1,115 @@
+"""Where intersect.cu decides late: triangles that wait must not be lost or win wrongly."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from raybeam import RayCaster
+
+SHEETS = [0.0, 1e-300, 1e-12, 1e-9, 1e-7, 3e-7, 1e-6, 4e-6, 1e-5, 1e-3]
+
+
+@pytest.fixture(params=["source", pytest.param("cuda", marks=pytest.mark.gpu)])
+def same_as_numpy(request, monkeypatch):
+    """Cast with the kernels and with NumPy; all bits must be equal. Returns the hits."""
+    if request.param == "source":
+        from raybeam import registry
+
+        made = request.getfixturevalue("source_backend")
+        monkeypatch.setattr(registry, "_BACKENDS", (*registry._BACKENDS, made))
+    elif not pytest.importorskip("cupy", reason="CuPy is not installed").is_available():
+        pytest.skip("there is no CUDA device")
+
+    def cast(mesh, *rays):
+        want, got = (
+            RayCaster(*mesh, backend=name).cast(*rays) for name in ("numpy", request.param)
+        )
+        for name in ("triangle", "distance", "u", "v"):
+            np.testing.assert_array_equal(getattr(got, name), getattr(want, name), err_msg=name)
+        counts = [
+            RayCaster(*mesh, backend=name).count(*rays, every=True)
+            for name in ("numpy", request.param)
+        ]
+        np.testing.assert_array_equal(*counts)
+        return want
+
+    return cast
+
+
+def sheets(gaps, slope=0.0, cells=4):
+    """Parallel sheets, the first at z = 0, each so far below the one before."""
+    line = np.linspace(-1, 1, cells + 1)
+    x, y = (c.ravel() for c in np.meshgrid(line, line, indexing="ij"))
+    i = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).ravel()
+    one = np.concatenate(
+        [np.stack([i, i + 1, i + cells + 2], -1), np.stack([i, i + cells + 2, i + cells + 1], -1)]
+    )
+    depth = np.cumsum(gaps)
+    points = [np.stack([x, y, slope * x - z], -1) for z in depth]
+    faces = [one + k * len(x) for k in range(len(depth))]
+    order = np.random.default_rng(len(gaps)).permutation(len(faces))  # not nearest first
+    return np.concatenate(points), np.concatenate([faces[k] for k in order])
+
+
+def rays_down(count, tilt, seed=0):
+    rng = np.random.default_rng(seed)
+    origins = np.column_stack([rng.uniform(-1, 1, (count, 2)), np.full(count, 2.0)])
+    return origins, np.column_stack([tilt * rng.normal(size=(count, 2)), np.full(count, -1.0)])
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.3])
+@pytest.mark.parametrize("slope", [0.0, 30.0])
+@pytest.mark.parametrize("gap", SHEETS)
+def test_sheets_close_together(same_as_numpy, gap, slope, tilt):
+    hits = same_as_numpy(sheets([gap] * 12, slope), *rays_down(400, tilt))
+    assert hits.hit.sum() > 100
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_sheets_at_all_distances(same_as_numpy, seed):
+    gaps = np.random.default_rng(seed).permutation(SHEETS * 3)
+    same_as_numpy(sheets(gaps), *rays_down(600, 0.2, seed))
+
+
+def test_limits_at_the_surfaces(same_as_numpy):
+    """Limits that are exactly, or nearly, the distance of a hit."""
+    mesh = sheets([0.0, 1e-7, 1e-7, 1e-3, 0.5])
+    origins, directions = rays_down(300, 0.0)
+    for t in (2.0, np.nextafter(2, 0), np.nextafter(2, 3), 2 + 1e-7, 2 + 2e-7, 2.0010002):
+        same_as_numpy(mesh, origins, directions, 0.0, t)
+        same_as_numpy(mesh, origins, directions, t, np.inf)
+        same_as_numpy(mesh, origins, directions, t, t)
+
+
+@pytest.mark.parametrize("height", [0.0, 1e-8, 1e-6, 1e-4])
+def test_starts_on_and_near_a_surface(same_as_numpy, height):
+    origins, directions = rays_down(400, 0.5)
+    origins[:, 2] = height
+    same_as_numpy(sheets([0.0, 1e-7, 1e-5, 0.1]), origins, directions)
+
+
+def test_grazing_rays(same_as_numpy):
+    rng = np.random.default_rng(3)
+    origins = np.column_stack([np.full(800, -3.0), rng.uniform(-1, 1, 800), np.zeros(800)])
+    origins[:, 2] = rng.choice([1e-9, 1e-7, 1e-5, 1e-3], 800)
+    directions = np.column_stack(
+        [np.ones(800), 0.1 * rng.normal(size=800), -rng.choice([1e-9, 1e-7, 1e-5, 1e-3], 800)]
+    )
+    same_as_numpy(sheets([0.0, 1e-7, 1e-6, 1e-4]), origins, directions)
+
+
+def test_rays_from_far_away(same_as_numpy):
+    rng = np.random.default_rng(4)
+    directions = rng.normal(size=(600, 3))
+    targets = np.column_stack([rng.uniform(-1, 1, (600, 2)), np.zeros(600)])
+    same_as_numpy(sheets([0.0, 1e-6, 1e-3], slope=0.2), targets - 1e5 * directions, directions)
+
+
+def test_soups_with_limits(same_as_numpy, shapes):
+    rng = np.random.default_rng(5)
+    for kind in ("random", "sliver", "huge", "tiny"):
+        mesh = shapes["soup"](kind, count=500)
+        middles = mesh[0].reshape(-1, 3, 3).mean(axis=1)
+        origins = rng.uniform(-25, 25, (500, 3))
+        same_as_numpy(mesh, origins, middles - origins, 3.0, 40.0)
