@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from distributed import Client, Scheduler, SpecCluster, Worker
 
-from lidarpool import LidarpoolError, Planning, Pose, Scene, Sensor, Survey, simulate
+from lidarpool import LidarpoolError, Planning, Pose, ScanSpec, Scene, Sensor, Survey, simulate
 from lidarpool.mesh import Mesh
 
 
@@ -154,3 +154,53 @@ def test_a_precision_too_fine_for_the_scene_is_refused(client):
 def test_too_few_slots_are_told_before_anything_runs(client):
     with pytest.raises(LidarpoolError, match="Partition 'LIDAR' has 4 of the 7 slots"):
         simulate(room(), Survey(SENSOR, [(0, 0, 0)], 5), client=client, collectors=5)
+
+
+def raise_at(scan: int | None, scan_of=None):
+    """A stand-in that fails, at one scan if it can tell which it is about."""
+
+    def fail(*arguments, **_):
+        if scan is None or scan_of(arguments) == scan:
+            raise FloatingPointError("the mirror is loose")
+        return ScanSpec(0, Pose((0, 0, 0)), (0, 1))
+
+    return fail
+
+
+@pytest.mark.parametrize(
+    ("target", "stand_in", "message"),
+    [
+        (
+            "lidarpool.survey.Survey.scan",
+            raise_at(0, lambda arguments: arguments[1]),
+            "stage generate failed: scan 0: FloatingPointError",
+        ),
+        (
+            "lidarpool.scan.setup.SurveySetup.cast",
+            raise_at(None),
+            r"stage intersect, scans 0 to 0 failed: scan 0: FloatingPointError",
+        ),
+        (
+            "lidarpool.scan.setup.SurveySetup.prepare",
+            raise_at(None),
+            "preparing the scene on the GPU workers failed: .*the mirror is loose",
+        ),
+        (
+            "lidarpool.scan.stages.points_of",
+            raise_at(None),
+            r"stage collect-\d failed: scan \d+: FloatingPointError",
+        ),
+        ("lidarpool.scan.stages._frame_runs", raise_at(None), "stage sort failed: scan"),
+        ("lidarpool.trials.run_trial", raise_at(None), "Planning trial 0 failed: .*the mirror"),
+    ],
+)
+def test_a_failure_anywhere_ends_the_run_and_says_where(
+    client, monkeypatch, target, stand_in, message
+):
+    monkeypatch.setattr(target, stand_in)
+    planning = Planning((25, 25), (-30, -20), [(0, 0)], 2.0, trials=1, particles=50, iterations=20)
+    survey = Survey(SENSOR, [(0, 0, 0)], 20)
+    with pytest.raises(LidarpoolError, match=message):
+        simulate(room(), survey, planning, client=client)
+    monkeypatch.undo()
+    assert len(simulate(room(), survey, client=client).cloud) > 0

@@ -11,6 +11,7 @@ from poolpart import Recorder, TaskRecord
 from raybeam import Returns
 
 from ..survey import Pose, ScanSpec
+from .failures import naming_scans
 from .messages import HIT, Batch, Frame
 from .setup import SurveySetup, ray_directions
 from .stage_names import GPU, INTERSECT
@@ -38,11 +39,8 @@ def intersect(setup: SurveySetup, wire: Sequence[Sequence[float]]) -> Batch:
     frames: list[Frame] = []
     tables: list[NDArray[np.void]] = []
     for pose, group in _same_pose(specs):
-        try:
+        with naming_scans(group[0].scan, group[-1].scan):
             hits = setup.cast(pose, (group[0].azimuths[0], group[-1].azimuths[1]))
-        except Exception as error:
-            span = f"scan {group[0].scan}" + (f" to {group[-1].scan}" if len(group) > 1 else "")
-            raise RuntimeError(f"{span}: {type(error).__name__}: {error}") from error
         for spec, part in _by_scan(setup, group, hits):
             frames.append(_frame(setup, spec, part))
             table = np.empty(len(part), HIT)

@@ -202,7 +202,8 @@ class SurveyPump:
     def _check_tasks(self) -> None:
         for name, future in self._stages.items():
             _raise_if_failed(future, f"stage {name}")
-        _raise_if_failed(self._setup, "preparing the scene on the GPU workers")
+        for future in (self._setup, *self._prepared.values()):
+            _raise_if_failed(future, "preparing the scene on the GPU workers")
         for item in self._under_way:
             for future in (item.batch, item.frames):
                 _raise_if_failed(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from poolpart.fetch import fetch_available
 
 from ..sensor import Sensor
 from ..survey import ScanSpec, Survey
+from .failures import naming_scans
 from .messages import POINT, Batch, Delivery, Frame, FrameRun, Hello, Part
 from .setup import ray_directions
 from .stage_names import COLLECT, GENERATE, LIDAR, SORT
@@ -35,7 +37,9 @@ def generate(survey: Survey, outlet: Pipe) -> TaskRecord:
     try:
         while sent < survey.scan_count:
             stop = min(sent + outlet.advice, survey.scan_count)
-            outlet.put([survey.scan(index).wire() for index in range(sent, stop)])
+            with naming_scans(sent, stop - 1):
+                item = [survey.scan(index).wire() for index in range(sent, stop)]
+            outlet.put(item)
             sent = stop
         outlet.close()
     except PipeFailed:
@@ -70,7 +74,9 @@ def sort_frames(inlet: Pipe, outlet: Pipe) -> TaskRecord:
             while following in waiting:
                 ready.append(waiting.pop(following))
                 following += 1
-            for run in _frame_runs(ready, records):
+            with naming_scans(following):
+                runs = list(_frame_runs(ready, records))
+            for run in runs:
                 outlet.put(Delivery(SORT, run).wire())
     except (PipeClosed, PipeFailed):
         pass
@@ -88,11 +94,11 @@ def collect(
         outlet.put(Delivery(COLLECT, Hello()).wire())
         for _, results in _arrivals(inlet):
             batches: list[Batch] = results
-            tables = [
-                (spec.scan, points_of(sensor, spec, hits[::keep_every], precision_m))
-                for batch in batches
-                for spec, hits in _hits_by_scan(batch)
-            ]
+            tables = []
+            for spec, hits in chain.from_iterable(map(_hits_by_scan, batches)):
+                with naming_scans(spec.scan):
+                    points = points_of(sensor, spec, hits[::keep_every], precision_m)
+                tables.append((spec.scan, points))
             scans += len(tables)
             for part in _parts(tables):
                 outlet.put(Delivery(COLLECT, part).wire())
