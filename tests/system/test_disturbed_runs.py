@@ -82,14 +82,15 @@ def failing_intersect(setup, wire):
     raise ValueError("the lens is dirty")
 
 
-def test_an_error_in_the_callback_passes_through_and_stops_the_run(client):
+@pytest.mark.parametrize("kind", [ZeroDivisionError, OSError])
+def test_an_error_in_the_callback_passes_through_and_stops_the_run(client, kind):
     before = scheduler_state(client)
 
     def on_frame(frame: Frame) -> None:
         if frame.scan == 100:
-            raise ZeroDivisionError("mine")
+            raise kind("mine")
 
-    with pytest.raises(ZeroDivisionError, match="mine"):
+    with pytest.raises(kind, match="mine"):
         simulate(Scene.seed(), SURVEY, client=client, on_frame=on_frame)
     assert scheduler_state(client) == before
 

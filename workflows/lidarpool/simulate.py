@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from distributed import Client
@@ -17,6 +18,7 @@ from poolpart import (
     Partition,
     PipeClosed,
     PipeFailed,
+    PoolError,
     TaskRecord,
     assign_devices,
     local_cluster,
@@ -31,6 +33,8 @@ from .scan import GPU, LIDAR, OTHER, Frame, SurveyPump, SurveySetup
 from .scene import Scene
 from .survey import Survey
 from .trials import TrialPump
+
+T = TypeVar("T")
 
 PROGRESS_EVERY_S = 0.1
 WATCH_EVERY_S = 1.0
@@ -193,6 +197,7 @@ class _Run:
         self.hit_counts = np.zeros(len(scene.faces), np.int64)
         self.samples: list[NDArray[np.float32]] = []
         self.hits = 0
+        self.callers_error: BaseException | None = None  # raised by a callback
 
     def drive(
         self,
@@ -204,7 +209,7 @@ class _Run:
         def take(frame: Frame) -> None:
             self._take(frame)
             if on_frame:
-                on_frame(frame)
+                self._call(on_frame, frame)
 
         pumps: list[SurveyPump | TrialPump] = []
         trials = None
@@ -227,6 +232,10 @@ class _Run:
         except BaseException as error:
             reason = str(error) or type(error).__name__
             _stop(pumps, f"the run was stopped: {reason}")
+            if error is self.callers_error:
+                raise
+            if isinstance(error, PoolError):
+                raise LidarpoolError(str(error)) from error
             if isinstance(error, (OSError, CommClosedError, PipeClosed, PipeFailed)):
                 raise LidarpoolError(
                     f"The cluster at {self.client.scheduler.address} cannot be reached any more "
@@ -236,6 +245,14 @@ class _Run:
         for pump in pumps:
             pump.finish()
         return self._result(survey, trials, started, times)
+
+    def _call(self, callback: Callable[[T], None], argument: T) -> None:
+        """Call back the caller; an OSError of theirs must not be taken for the cluster's."""
+        try:
+            callback(argument)
+        except BaseException as error:
+            self.callers_error = error
+            raise
 
     def _loop(
         self,
@@ -261,7 +278,7 @@ class _Run:
             watch.look(now)
             if on_progress and (now - told >= PROGRESS_EVERY_S or len(times) == len(pumps)):
                 told = now
-                on_progress(self._progress(survey, trials, now - started))
+                self._call(on_progress, self._progress(survey, trials, now - started))
             if moved:
                 pause.reset()
             else:

@@ -15,8 +15,15 @@ from typing import Any
 import numpy as np
 from distributed import Client, get_client, secede
 
-from poolpart import Backoff, Pipe, PipeClosed, PipeFailed, Recorder, TaskRecord
-from poolpart.fetch import fetch_available
+from poolpart import (
+    Backoff,
+    Pipe,
+    PipeClosed,
+    PipeFailed,
+    Recorder,
+    TaskRecord,
+    fetch_available,
+)
 
 from ..sensor import Sensor
 from ..survey import ScanSpec, Survey
