@@ -112,7 +112,8 @@ def _cluster(cp: Any, kernels: Kernels, corners: Any, order: Any) -> _Binary:
         kernels.run("find_partners", left, boxes, ids, count, partners)
         sums, pairs = _sums(cp, kernels, partners, votes, left)
         if 16 * pairs < left:  # long chains of ever better partners: do not merge one by one
-            partners = cp.minimum(cp.arange(n, dtype=np.int32) ^ 1, left - 1)
+            partners = cp.arange(n, dtype=np.int32) ^ np.int32(1)
+            partners = cp.minimum(partners, np.int32(left - 1))
             sums, pairs = _sums(cp, kernels, partners, votes, left)
         made_now = (partners, sums, ids, count, np.int32(made), np.int32(n), boxes, children)
         kernels.run("merge", left, *made_now, spare)

@@ -13,7 +13,7 @@ from raybeam.mesh import local_mesh
 def everything(vertices, faces, origins, directions, t_min=0.0, t_max=np.inf):
     """Count every triangle of every ray, one by one and without a tree."""
     mesh = local_mesh(vertices, faces)
-    given = rays.check_rays(origins, directions, t_min, t_max)
+    given = rays.check_rays(origins, directions, t_min, t_max).part(0, len(directions))
     n, k = len(given), len(mesh.corners)
     starts = np.broadcast_to(mesh.to_local(given.origins), (n, 3))
     sheared = exact.shear(starts, given.directions)
