@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 _UNIT_SLACK = 1e-14
 
 
+# Rows that are checked at a time: what is needed beside the rays does not grow with them.
+_BLOCK = 1 << 18
+
+
 @dataclass(frozen=True)
 class Rays:
     """Rays that have been checked.
@@ -19,9 +25,9 @@ class Rays:
     Attributes
     ----------
     origins
-        float64 (n, 3), or (1, 3) when all rays share one, metres.
+        (n, 3), or (1, 3) when all rays share one, metres.
     directions
-        float64 (n, 3), unit vectors.
+        (n, 3), of any length but zero.
     t_min, t_max
         Hits nearer or farther than this are not reported, metres; both ends count.
     """
@@ -35,9 +41,14 @@ class Rays:
         return len(self.directions)
 
     def part(self, start: int, stop: int) -> Rays:
-        """Rays `start` to `stop`, without copying."""
+        """Rays `start` to `stop` as engines take them: in float64, directions as unit vectors.
+
+        This is done here and not for all rays at once, so that a part's memory is all that a
+        cast needs however many rays there are.
+        """
         origins = self.origins if len(self.origins) == 1 else self.origins[start:stop]
-        return Rays(origins, self.directions[start:stop], self.t_min, self.t_max)
+        directions = _float64(self.directions[start:stop])
+        return Rays(_float64(origins), _normalised(directions), self.t_min, self.t_max)
 
 
 class Pattern:
@@ -76,7 +87,7 @@ class Pattern:
 
 
 def check_rays(origins: ArrayLike, directions: ArrayLike, t_min: float, t_max: float) -> Rays:
-    """Rays in float64 with unit directions; raises ValueError for those that are none.
+    """Rays as they were given; raises ValueError for those that are none.
 
     Parameters
     ----------
@@ -87,20 +98,21 @@ def check_rays(origins: ArrayLike, directions: ArrayLike, t_min: float, t_max: f
     t_min, t_max
         Metres, ``0 <= t_min <= t_max``.
     """
-    unit = unit_directions(directions)
-    return Rays(check_origins(origins, len(unit)), unit, *check_interval(t_min, t_max))
+    table = _table("directions", directions)
+    _refuse_directions(table)
+    return Rays(check_origins(origins, len(table)), table, *check_interval(t_min, t_max))
 
 
-def check_origins(origins: ArrayLike, rays: int) -> NDArray[np.float64]:
-    """Origins as float64, one or one a ray; raises ValueError for what is neither."""
+def check_origins(origins: ArrayLike, rays: int) -> NDArray[Any]:
+    """Origins (n, 3) as given, or one (1, 3) in float64; raises ValueError for what is neither."""
     start = _table("origins", origins)
     if len(start) not in (1, rays):
         raise ValueError(
             f"There are {len(start)} origins and {rays} directions: "
             "give one origin for all rays, or one for each."
         )
-    _refuse("Origin", start, np.isfinite(start), "finite coordinates")
-    return start
+    _refuse("Origin", start, _finite, "finite coordinates")
+    return _float64(start) if len(start) == 1 else start
 
 
 def check_interval(t_min: float, t_max: float) -> tuple[float, float]:
@@ -119,21 +131,21 @@ def unit_directions(directions: ArrayLike) -> NDArray[np.float64]:
 
     Each row's result depends on that row alone, so that batches may be cut anywhere.
     """
-    table = _table("directions", directions)
+    table = _float64(_table("directions", directions))
+    _refuse_directions(table)
+    return _normalised(table)
+
+
+def _normalised(table: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Make unit vectors of checked directions; returns the same array if they are that already."""
     x, y, z = table.T
     # The order of these operations is the same in intersect.cu. No einsum or norm: those may
     # fuse multiply and add, and then the last bit would depend on the machine.
-    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+    with np.errstate(over="ignore", under="ignore"):
         squared = (x * x + y * y) + z * z
     off = np.abs(squared - 1) > _UNIT_SLACK
-    if not off.any() and not np.isnan(squared).any():
+    if not off.any():
         return table
-    _refuse(
-        "Direction",
-        table,
-        np.isfinite(table) & table.any(axis=1, keepdims=True),
-        "a finite vector that is not zero",
-    )
     rows = table[off]
     rows = rows / np.abs(rows).max(axis=1, keepdims=True)  # squares of 1e200 or 1e-200 are lost
     x, y, z = rows.T
@@ -171,8 +183,8 @@ def check_rotation(rotation: ArrayLike | None) -> NDArray[np.float64] | None:
     return matrix
 
 
-def _table(name: str, values: ArrayLike) -> NDArray[np.float64]:
-    """Values as float64 (n, 3); a single (3,) becomes one row."""
+def _table(name: str, values: ArrayLike) -> NDArray[Any]:
+    """Real numbers (n, 3), copied only if they are no array; a single (3,) becomes one row."""
     given = np.asarray(values)
     if given.dtype.kind not in "fiu":
         raise ValueError(f"{name} must be real numbers, not {given.dtype}.")
@@ -180,15 +192,40 @@ def _table(name: str, values: ArrayLike) -> NDArray[np.float64]:
         given = given[None, :]
     if given.ndim != 2 or given.shape[1] != 3:
         raise ValueError(f"{name} must have the shape (n, 3) or (3,), not {given.shape}.")
-    return np.ascontiguousarray(given, dtype=np.float64)
+    return given
 
 
-def _refuse(what: str, table: NDArray[np.float64], good: NDArray[np.bool_], expected: str) -> None:
-    """Raise ValueError for the first row that is not good in all its columns."""
-    if good.all():
-        return
-    bad = np.flatnonzero(~good.all(axis=1))
-    raise ValueError(
-        f"{what} {bad[0]} is {table[bad[0]].tolist()}: expected {expected} "
-        f"({len(bad)} of {len(table)} rows are like that)."
-    )
+def _float64(table: NDArray[Any]) -> NDArray[np.float64]:
+    return np.ascontiguousarray(table, dtype=np.float64)
+
+
+def _finite(block: NDArray[np.float64]) -> NDArray[np.bool_]:
+    x, y, z = np.isfinite(block).T
+    return x & y & z
+
+
+def _has_length(block: NDArray[np.float64]) -> NDArray[np.bool_]:
+    return _finite(block) & block.any(axis=1)
+
+
+def _refuse_directions(table: NDArray[Any]) -> None:
+    _refuse("Direction", table, _has_length, "a finite vector that is not zero")
+
+
+def _refuse(
+    what: str,
+    table: NDArray[Any],
+    good: Callable[[NDArray[np.float64]], NDArray[np.bool_]],
+    expected: str,
+) -> None:
+    """Raise ValueError for the first row that is not good."""
+    bad = [np.zeros(0, np.intp)]
+    for start in range(0, len(table), _BLOCK):
+        block = _float64(table[start : start + _BLOCK])
+        bad.append(np.flatnonzero(~good(block)) + start)
+    rows = np.concatenate(bad)
+    if len(rows):
+        raise ValueError(
+            f"{what} {rows[0]} is {_float64(table[rows[0]]).tolist()}: expected {expected} "
+            f"({len(rows)} of {len(table)} rows are like that)."
+        )

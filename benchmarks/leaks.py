@@ -1,0 +1,111 @@
+"""Rays that escape from closed meshes, backend by backend: `python -m benchmarks.leaks`.
+
+All are aimed from inside at edges and corners, where a test that rounds each triangle for itself
+lets some through. The numpy and cuda backends are built so that none does.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidarpool.shapes import revolve, seed_objects
+from lidarpool.terrain import terrain
+from raybeam import RayCaster, available_backends
+
+from .seams import escaped
+
+_PART = 250_000
+
+
+@dataclass(frozen=True, eq=False)
+class Closed:
+    """A closed mesh, a point inside it, and how far that may be moved."""
+
+    name: str
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.integer]
+    inside: NDArray[np.float64]
+    room: float
+
+
+def closed_meshes(triangles: int) -> Iterator[Closed]:
+    """Cube, sphere, the six objects of the default survey, a terrain box of so many triangles."""
+    x = np.stack(np.meshgrid([-1.0, 1], [-1.0, 1], [-1.0, 1], indexing="ij"), -1).reshape(-1, 3)
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    sides = np.array([f for a, b, c, d in quads for f in ((a, b, c), (a, c, d))])
+    yield Closed("cube", x, sides, np.array([0.05, 0.1, 0.4]), 0.05)
+    angle = np.linspace(-np.pi / 2, np.pi / 2, 82)
+    sphere = revolve(np.stack([np.cos(angle), np.sin(angle)], axis=1), 80)
+    yield Closed("unit sphere", sphere.vertices, sphere.faces, np.array([0.05, 0.1, 0.4]), 0.05)
+    for mesh in seed_objects():
+        corners = mesh.vertices[mesh.faces]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        widest = int(np.linalg.norm(normals, axis=1).argmax())
+        inwards = -normals[widest] / np.linalg.norm(normals[widest])
+        inside = corners[widest].mean(axis=0) + 0.04 * inwards
+        yield Closed(mesh.name.lower(), mesh.vertices, mesh.faces, inside, 0.01)
+    yield terrain_box(triangles)
+
+
+def terrain_box(triangles: int) -> Closed:
+    """Fractal ground under a lid of the same grid, with walls around."""
+    ground = terrain(triangles // 2)
+    points, faces = np.array(ground.vertices), np.array(ground.faces)
+    n = len(points)
+    lid = points.copy()
+    lid[:, 2] = points[:, 2].max() + 50
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    keys = edges.min(axis=1).astype(np.int64) * n + edges.max(axis=1)
+    _, first, times = np.unique(keys, return_index=True, return_counts=True)
+    a, b = edges[first[times == 1]].T  # the rim: edges of one triangle only
+    walls = np.concatenate([np.stack([b, a, a + n], -1), np.stack([b, a + n, b + n], -1)])
+    inside = np.array([0.0, 0.0, points[:, 2].max() + 20])
+    whole = np.concatenate([faces, faces[:, ::-1] + n, walls])
+    return Closed("terrain box", np.concatenate([points, lid]), whole, inside, 10.0)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run from the command line; 1 when a ray escapes from an exact backend."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--rays", type=int, default=10_000_000, help="for each backend, in all")
+    parser.add_argument("--triangles", type=int, default=2_000_000, help="of the terrain box")
+    parser.add_argument("--json", type=Path, help="write the results here")
+    chosen = parser.parse_args(arguments)
+    backends = [name for name, reason in available_backends().items() if not reason]
+    meshes = list(closed_meshes(chosen.triangles))
+    share = -(-chosen.rays // len(meshes))
+    results: dict[str, dict[str, dict[str, float]]] = {name: {} for name in backends}
+    for mesh in meshes:
+        for name in backends:
+            start = time.perf_counter()
+            caster = RayCaster(mesh.vertices, mesh.faces, name)
+            rng = np.random.default_rng(0)
+            cast = leaks = 0
+            while cast < share:
+                half = -(-min(_PART, share - cast) // 2)
+                pair = mesh.vertices, mesh.faces
+                leaks += escaped(caster, pair, mesh.inside, mesh.room, half, rng)
+                cast += 2 * half
+            took = time.perf_counter() - start
+            results[name][mesh.name] = {"rays": cast, "escaped": leaks, "seconds": took}
+            print(f"{mesh.name:<12} {name:<7} {leaks:>7,} of {cast:,} escaped  ({took:.1f} s)")
+    for name in backends:
+        rays, leaks = (sum(v[key] for v in results[name].values()) for key in ("rays", "escaped"))
+        print(f"{name}: {leaks:,.0f} of {rays:,.0f} escaped, {leaks / rays:.2g}")
+    if chosen.json:
+        chosen.json.write_text(json.dumps(results, indent=1) + "\n")
+    exact = [entry for name in backends if name != "embree" for entry in results[name].values()]
+    return int(any(entry["escaped"] for entry in exact))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,54 @@
+"""Rays where watertightness is hardest: at the edges and corners of a closed mesh, from inside."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from raybeam import RayCaster
+
+Float = NDArray[np.float64]
+Index = NDArray[np.integer]
+
+
+def seam_rays(
+    vertices: Float, faces: Index, origins: Float, count: int, rng: np.random.Generator
+) -> Float:
+    """Directions from origins to points of edges: corners, middles, and anywhere between."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    edge = vertices[edges[rng.integers(len(edges), size=count)]]
+    part = rng.choice([0.0, 0.5, 1.0, np.nan], count)
+    part = np.where(np.isnan(part), rng.random(count), part)[:, None]
+    return edge[:, 0] * (1 - part) + edge[:, 1] * part - origins
+
+
+def escaped(
+    caster: RayCaster,
+    mesh: tuple[Float, Index],
+    inside: Float,
+    room: float,
+    count: int,
+    rng: np.random.Generator,
+) -> int:
+    """Count the rays that hit nothing: of `count` from one point and as many from others.
+
+    Parameters
+    ----------
+    caster
+        Over the mesh.
+    mesh
+        Vertices and faces, closed.
+    inside
+        (3,): a point inside it.
+    room
+        How far it may be moved along each axis.
+    count
+        Rays of each half.
+    rng
+        Where the rays come from.
+    """
+    leaks = 0
+    for origins in (inside, inside + room * rng.uniform(-1, 1, (count, 3))):
+        directions = seam_rays(*mesh, origins, count, rng)
+        leaks += count - len(caster.returns(origins, directions))
+    return leaks
