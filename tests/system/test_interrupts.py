@@ -220,7 +220,9 @@ def test_the_scheduler_of_an_outside_cluster_is_killed(start, untouched, outside
     cluster.kill("scheduler")
     assert run.process.wait(60) == 2
     (message,) = said_besides_progress(run)
-    assert message.startswith(f"lidarpool: The cluster at {cluster.address} cannot be reached")
+    assert message.startswith(
+        f"lidarpool: The cluster at {cluster.address} cannot be reached any more"
+    )
     assert untouched()
 
 

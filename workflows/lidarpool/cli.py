@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import os
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -13,6 +12,7 @@ from typing import NoReturn
 
 import click
 from distributed import Client
+from distributed.client import FutureCancelledError
 from distributed.comm import connect
 
 from poolpart import Pool, PoolError, local_cluster
@@ -67,13 +67,13 @@ def cli() -> None:
 @_out
 @_quiet
 def demo(out: Path, quiet: bool) -> None:
-    r"""Run the default survey and path planning on a cluster on this machine.
+    """Run the default survey and path planning on a cluster on this machine.
 
     \b
     Examples:
       lidarpool demo
       lidarpool demo --out /tmp/demo
-    """
+    """  # noqa: D301 - click wants the character, not its name
     _run(Scenario(), out, quiet=quiet)
 
 
@@ -96,13 +96,13 @@ def run(
     no_plan: bool,
     quiet: bool,
 ) -> None:
-    r"""Run a survey from a scenario file, or of a mesh file from its middle.
+    """Run a survey from a scenario file, or of a mesh file from its middle.
 
     \b
     Examples:
       lidarpool run examples/seed.yaml --out seed
       lidarpool run hall.glb --no-plan --scheduler tcp://127.0.0.1:8786
-    """
+    """  # noqa: D301 - click wants the character, not its name
     _run(Scenario.load(scenario), out, scheduler, backend, no_plan, quiet)
 
 
@@ -173,13 +173,13 @@ def _tell(out: Path, result: Result, scene: Scene, survey: Survey, files: list[s
 @cli.command()
 @click.option("--scheduler", metavar="ADDRESS", help="Also show the workers of this cluster.")
 def info(scheduler: str | None) -> None:
-    r"""Show versions, ray-casting backends, GPUs and the workers by partition.
+    """Show versions, ray-casting backends, GPUs and the workers by partition.
 
     \b
     Examples:
       lidarpool info
       lidarpool info --scheduler tcp://127.0.0.1:8786
-    """
+    """  # noqa: D301 - click wants the character, not its name
     pool = None
     if scheduler is not None:
         with _connected(scheduler) as client:
@@ -215,8 +215,14 @@ def _connected(scheduler: str) -> Iterator[Client]:
             f"No Dask scheduler answers at {scheduler!r} ({type(error).__name__}): start one with "
             "dask scheduler, and give its address as tcp://host:8786."
         ) from error
-    with client:
-        yield client
+    try:
+        with client:
+            yield client
+    except FutureCancelledError as error:  # as Dask answers for a scheduler that has gone
+        raise LidarpoolError(
+            f"The cluster at {scheduler} cannot be reached any more, or somebody cancelled the "
+            "tasks of this run; it has ended without a result."
+        ) from error
 
 
 async def _knock(address: str) -> None:
@@ -252,7 +258,6 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     silence_logs()
     try:
         cli.main(args=arguments, prog_name="lidarpool", standalone_mode=False)
-        sys.stdout.flush()
     except (LidarpoolError, PoolError) as error:
         _die(str(error), 2)
     except click.UsageError as error:
@@ -263,8 +268,6 @@ def main(arguments: list[str] | None = None) -> NoReturn:
         )
     except MemoryError:
         _die("not enough memory: take a smaller scene, fewer scans or a larger keep_every.", 2)
-    except BrokenPipeError:  # whoever read the output has enough of it, as `head` may
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     sys.exit(0)
 
 

@@ -1,0 +1,392 @@
+"""The command as a user sees it when all goes well: files, report, what is printed."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import re
+import select
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from distributed import Client, Scheduler, SpecCluster, Worker
+
+import lidarpool.output
+from lidarpool import LidarpoolError, read_cloud, simulate
+from lidarpool.output import FILES, result_folder, write_result
+from lidarpool.progress import Progress
+from lidarpool.scenario import Scenario
+from lidarpool.terminal import PlainLines, time_in_words
+
+WAREHOUSE = Path(__file__).parents[3] / "shared" / "scenes" / "warehouse.glb"
+COMMAND = [sys.executable, "-c", "from lidarpool.cli import main; main()"]
+SHORT = "sensor: {layers: 8}\nplanning: {trials: 4}\n"
+
+
+def command(*arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), **environment}
+    return subprocess.run(
+        [*COMMAND, *map(str, arguments)], capture_output=True, text=True, env=env, check=False
+    )
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[str]:
+    """A cluster whose workers are threads of this process, for speed; its address."""
+    quiet = {"host": "127.0.0.1", "dashboard": False}
+    workers = {
+        name: {"cls": Worker, "options": {"resources": {name: n}, "nthreads": n, **quiet}}
+        for name, n in {"GPU": 1, "LIDAR": 4, "OTHER": 1}.items()
+    }
+    scheduler = {"cls": Scheduler, "options": {"port": 0, **quiet}}
+    with SpecCluster(workers=workers, scheduler=scheduler, silence_logs=50) as cluster:
+        yield cluster.scheduler_address
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory) -> tuple[Path, subprocess.CompletedProcess[str]]:
+    """The demo, run as a newcomer does, with a home that Matplotlib cannot write to."""
+    out = tmp_path_factory.mktemp("demo") / "made" / "here"
+    ended = command("demo", "--out", out, MPLCONFIGDIR="/dev/null/config")
+    return out, ended
+
+
+def test_the_demo_makes_six_files_and_says_so(demo):
+    out, ended = demo
+    assert ended.returncode == 0, ended.stderr
+    assert sorted(path.name for path in out.iterdir()) == sorted(FILES)
+    for name in FILES[1:5]:
+        assert (out / name).read_bytes().startswith(b"\x89PNG")
+    assert "108 scans, 120,000 rays" in ended.stdout
+    assert f"{len(read_cloud(out / 'cloud.ply')):,} points in the cloud" in ended.stdout
+    assert re.search(r"path of 71\.\d\d m, free of collisions; the shortest possible", ended.stdout)
+    assert ended.stdout.splitlines()[-1] == f"results in {out}: {', '.join(FILES)}"
+
+
+def test_progress_that_is_not_for_a_terminal_comes_as_short_lines(demo):
+    _, ended = demo
+    for line in ended.stderr.splitlines():
+        assert re.fullmatch(r"\d\d:\d\d:\d\d  [a-z].*", line), line  # and no log of a library
+        assert len(line) <= 120
+        assert not re.search(r"\bnan\b|\binf\b|\x1b", line)
+    assert "survey  done: 108 scans" in ended.stderr
+    assert "plan    done: 100 trials" in ended.stderr
+    assert "writing the cloud" in ended.stderr.splitlines()[-1]
+
+
+def test_the_report_has_all_that_is_promised(demo):
+    out, _ = demo
+    text = (out / "report.json").read_text()
+    report = json.loads(text, parse_constant=pytest.fail)  # NaN and Infinity are no JSON
+    assert report["files"] == list(FILES)
+    assert report["scans"] == 108 and report["rays"] == 120_000
+    assert report["hits"] > report["points"] > 0
+    assert sum(report["points_by_object"].values()) == report["points"]
+    assert report["backend"] in ("cuda", "embree", "numpy")
+    assert {"lidarpool", "python", "numpy", "dask", "distributed"} <= report["versions"].keys()
+    assert report["parameters"]["sensor"]["layers"] == 40
+    assert report["parameters"]["sensor"]["max_range_m"] is None  # infinite
+    assert list(report["stages"]) == ["generate", "intersect", "sort", "collect", "trial"]
+    for stage in ("generate", "intersect", "sort", "collect"):
+        assert report["stages"][stage]["items"] == 108
+    assert report["placement_violations"] == 0
+    assert report["seconds"]["survey_and_planning_overlap"] > 0
+    planning = report["planning"]
+    assert planning["trials"] == 100 and planning["collision_free"]
+    assert planning["shortest_possible"] <= planning["best_length"] * (1 + 1e-9)
+    assert planning["best_length"] <= 1.01 * planning["shortest_possible"]
+
+
+def test_times_in_the_report_are_rounded(demo):
+    report = json.loads((demo[0] / "report.json").read_text())
+    times = [*report["seconds"].values()]
+    times += [s[key] for s in report["stages"].values() for key in ("task_seconds", "span_seconds")]
+    assert all(time == round(time, 4) for time in times)
+
+
+@pytest.fixture
+def run(tmp_path, lidarpool, cluster) -> Callable[..., Any]:
+    """Run a scenario on the threads' cluster, into the folder `out`."""
+
+    def run(text: str, *options: str) -> Any:
+        (tmp_path / "s.yaml").write_text(text)
+        arguments = ["--out", tmp_path / "out", "--scheduler", cluster, *options]
+        return lidarpool("run", tmp_path / "s.yaml", *arguments)
+
+    return run
+
+
+def test_without_planning_an_earlier_path_is_removed(run, tmp_path, no_pictures):
+    (tmp_path / "out").mkdir()
+    for name in ("path.png", "mine.txt"):
+        (tmp_path / "out" / name).write_text("earlier")
+    outcome = run(SHORT, "--no-plan", "--quiet")
+    assert (outcome.code, outcome.err) == (0, "")
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert names == {*FILES, "mine.txt"} - {"path.png"}
+    assert "path of" not in outcome.out and "path.png" not in outcome.out
+    assert json.loads((tmp_path / "out" / "report.json").read_text())["planning"] is None
+
+
+def test_a_path_that_there_is_not(run, no_pictures):
+    ring = [f"{{centre: [{25 + 6 * np.cos(a):.3f}, {25 + 6 * np.sin(a):.3f}], radius_m: 3}}"
+            for a in np.arange(0, 6.28, 0.5)]  # fmt: skip
+    outcome = run(f"planning: {{trials: 2, iterations: 5, obstacles: [{', '.join(ring)}]}}\n")
+    assert outcome.code == 0, outcome.err
+    assert "no path free of collisions was found; none is possible" in outcome.out
+
+
+def test_nobody_reads_the_output(tmp_path, cluster):
+    (tmp_path / "s.yaml").write_text(SHORT)
+    arguments = ["run", "s.yaml", "--scheduler", cluster, "--no-plan", "--out", "out"]
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    reader, writer = os.pipe()
+    os.close(reader)
+    ended = subprocess.run(
+        [*COMMAND, *arguments, "-q"],
+        cwd=tmp_path,
+        stdout=writer,
+        stderr=subprocess.PIPE,
+        env=env,
+        check=False,
+    )
+    os.close(writer)
+    assert ended.stderr == b""
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {*FILES} - {"path.png"}
+
+
+@pytest.mark.parametrize("name", ["demo", "run", "info"])
+def test_help_shows_two_examples(name, lidarpool):
+    outcome = lidarpool(name, "--help")
+    assert outcome.code == 0
+    assert len(re.findall(rf"^ +lidarpool {name}\b", outcome.out, re.MULTILINE)) == 2
+    assert outcome.out.count(f"lidarpool {name}") == 3
+
+
+def test_version_and_help(lidarpool):
+    assert lidarpool("--version").out.startswith("lidarpool, version ")
+    assert {"demo", "run", "info"} <= set(lidarpool("--help").out.split())
+
+
+# -- on a terminal ------------------------------------------------------------------------------
+
+
+def on_a_terminal(arguments: list[str], **environment: str) -> tuple[int, str]:
+    """Run the command on a pseudo terminal; exit code and all that it drew."""
+    master, slave = pty.openpty()
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "TERM": "xterm-256color"}
+    process = subprocess.Popen(
+        [*COMMAND, *arguments], stdout=slave, stderr=slave, env={**env, **environment}
+    )
+    os.close(slave)
+    drawn = b""
+    stop = time.monotonic() + 90
+    while time.monotonic() < stop:
+        if select.select([master], [], [], 0.2)[0]:
+            try:
+                drawn += os.read(master, 65536)
+            except OSError:  # as Linux says that the other end was closed
+                break
+    os.close(master)
+    return process.wait(10), drawn.decode()
+
+
+@pytest.mark.parametrize("colour", [True, False])
+def test_bars_on_a_terminal(colour, tmp_path, cluster):
+    (tmp_path / "s.yaml").write_text(SHORT)
+    arguments = ["run", str(tmp_path / "s.yaml"), "--out", str(tmp_path / "o")]
+    extra = {"COLUMNS": "100"} | ({} if colour else {"NO_COLOR": "1"})
+    code, drawn = on_a_terminal([*arguments, "--scheduler", cluster], **extra)
+    assert code == 0, drawn
+    for label in ("1 generate", "2 intersect", "3 sort frames", "4 collect", "plan path"):
+        assert label in drawn
+    assert "108/108" in drawn and "4/4" in drawn
+    assert bool(re.search(r"\x1b\[[0-9;]*3[0-9]", drawn)) == colour
+
+
+def test_a_dumb_terminal_gets_lines(tmp_path, cluster):
+    (tmp_path / "s.yaml").write_text(SHORT)
+    arguments = ["run", str(tmp_path / "s.yaml"), "--out", str(tmp_path / "o"), "--no-plan"]
+    code, drawn = on_a_terminal([*arguments, "--scheduler", cluster], TERM="dumb")
+    assert code == 0
+    assert "survey  done: 108 scans" in drawn
+    assert "\x1b" not in drawn
+
+
+# -- lines ---------------------------------------------------------------------------------------
+
+
+def progress(seconds: float, scans: int, trials: int = 0) -> Progress:
+    return Progress(100, scans, scans, scans, scans, 7 * scans, 10, trials, seconds)
+
+
+def test_plain_lines_come_seldom_and_tell_rate_and_time_left():
+    stream = StringIO()
+    show = PlainLines(stream)
+    for tenth in range(0, 51):
+        show(progress(tenth / 10, 2 * tenth))
+    lines = [line[10:] for line in stream.getvalue().splitlines()]
+    assert lines == [
+        "survey  40 of 100 scans (generated 40, cast 40, sorted 40)  20/s  3 s left",
+        "plan    0 of 10 trials",
+        "survey  80 of 100 scans (generated 80, cast 80, sorted 80)  20/s  1 s left",
+        "plan    0 of 10 trials",
+        "survey  done: 100 scans, 700 points in 5.0 s",
+    ]
+
+
+def test_plain_lines_say_once_that_something_is_done():
+    stream = StringIO()
+    show = PlainLines(stream)
+    for second in range(600):
+        show(progress(float(second), 100, min(10, second // 60)))
+    text = stream.getvalue()
+    assert text.count("survey") == text.count("survey  done") == 1
+    assert text.count("plan    done") == 0 and 20 < text.count("plan") < 60  # once a minute at last
+    show(progress(600.0, 100, 10))
+    show(progress(601.0, 100, 10))
+    assert stream.getvalue().count("plan    done: 10 trials in 600.0 s") == 1
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"),
+    [(0, "0 s"), (99, "99 s"), (101, "2 min"), (5900, "98 min"), (7500, "2 h 05 min")],
+)
+def test_time_in_words(seconds, words):
+    assert time_in_words(seconds) == words
+
+
+# -- the output folder ---------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def made(cluster) -> tuple[Any, ...]:
+    """A result with scene, survey and planning, to be written."""
+    scenario = Scenario.from_data({"sensor": {"layers": 4}, "planning": {"trials": 2}})
+    scene = scenario.build_scene()
+    survey, planning = scenario.survey(scene), scenario.plan(scene)
+    with Client(cluster, set_as_default=False) as client:
+        return simulate(scene, survey, planning, client=client), scene, survey, planning
+
+
+def earlier(folder: Path) -> dict[str, bytes]:
+    folder.mkdir(exist_ok=True)
+    for name in FILES:
+        (folder / name).write_text(f"an earlier {name}")
+    return content(folder)
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+@pytest.mark.parametrize("failing", FILES)
+def test_a_file_that_cannot_be_written_leaves_the_earlier_result(
+    failing, made, tmp_path, monkeypatch, no_pictures
+):
+    before = earlier(tmp_path / "out")
+    flush = lidarpool.output._flush
+
+    def full(path: Path) -> None:
+        if path.name == failing:
+            raise OSError(28, "No space left on device")
+        flush(path)
+
+    monkeypatch.setattr(lidarpool.output, "_flush", full)
+    with pytest.raises(LidarpoolError, match=r"out \(No space left on device\): make room"):
+        write_result(tmp_path / "out", *made)
+    assert content(tmp_path / "out") == before
+    assert {path.name for path in (tmp_path / "out").iterdir()} == before.keys()
+
+
+@pytest.mark.slow
+def test_full_disks_of_every_size(made, tmp_path):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    fits = False
+    for kilobytes in range(40, 2000, 250):
+        size = ["-o", f"size={kilobytes}k"]
+        mounted = ["mount", "-t", "tmpfs", *size, "tmpfs", str(disk)]
+        if subprocess.run(mounted, capture_output=True, check=False).returncode:
+            pytest.skip("small disks can be mounted by root only")
+        try:
+            before = earlier(disk)
+            try:
+                write_result(disk, *made)
+                fits = True
+            except LidarpoolError as error:
+                assert str(disk) in str(error) and ".writing" not in str(error)
+                assert content(disk) == before
+        finally:
+            subprocess.run(["umount", str(disk)], check=True)
+        if fits:
+            break
+    assert fits and kilobytes > 300
+
+
+def test_a_crash_while_moving_into_place_is_made_good(made, tmp_path, monkeypatch, no_pictures):
+    out = tmp_path / "out"
+    earlier(out)
+    replace = Path.replace
+
+    def crash(self: Path, target: Path) -> Path:
+        if self.name == "cloud.png":
+            raise SystemExit("as if killed here")
+        return replace(self, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", crash)
+        with pytest.raises(SystemExit):
+            write_result(out, *made)
+    assert (out / "report.json").read_text() == "an earlier report.json"
+    with result_folder(out):  # as the next run begins
+        assert sorted(path.name for path in out.iterdir()) == sorted(FILES)
+        assert not any(b"an earlier" in data for data in content(out).values())
+
+
+def test_what_a_killed_run_left_is_removed(tmp_path):
+    out = tmp_path / "out"
+    before = earlier(out)
+    (out / ".writing-0123abcd").mkdir()
+    (out / ".writing-0123abcd" / "cloud.ply").write_text("half a cl")
+    (out / ".complete-0123abcd").mkdir()  # all of it was moved
+    with result_folder(out):
+        assert content(out) == before
+        assert {path.name for path in out.iterdir()} == before.keys()
+
+
+def test_folders_made_for_nothing_are_removed(tmp_path):
+    with pytest.raises(ZeroDivisionError), result_folder(tmp_path / "a" / "b"):
+        assert (tmp_path / "a" / "b").is_dir()
+        raise ZeroDivisionError
+    assert list(tmp_path.iterdir()) == []
+
+
+# -- a real scene --------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(not WAREHOUSE.exists(), reason="the warehouse is not there")
+def test_shelves_of_the_warehouse_stand_upright(lidarpool, cluster, tmp_path, no_pictures):
+    outcome = lidarpool("run", WAREHOUSE, "--out", tmp_path / "o", "--scheduler", cluster, "-q")
+    assert outcome.code == 0, outcome.err
+    scene = Scenario.load(WAREHOUSE).build_scene()
+    cloud = read_cloud(tmp_path / "o" / "cloud.ply")
+    by_object = json.loads((tmp_path / "o" / "report.json").read_text())["points_by_object"]
+    shelves = 0
+    for number, name in enumerate(scene.names):
+        points = cloud.positions[cloud.object == number]
+        assert len(points) == by_object[name]
+        low, high = scene.object_bounds[number] + scene.origin
+        assert (points >= low - 0.011).all() and (points <= high + 0.011).all()
+        if "Shelf" in name and len(points) > 50:
+            shelves += 1
+            assert np.ptp(points[:, 2]) > 1.5  # metres of height, seen from the middle of the hall
+    assert shelves >= 3
