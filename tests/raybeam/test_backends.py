@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from raybeam import BackendUnavailable, RayCaster, available_backends, registry
+from raybeam import BackendUnavailable, Pattern, RayCaster, available_backends, registry
 from raybeam.cuda_backend import CudaBackend
 from raybeam.embree_backend import EmbreeBackend
 from raybeam.mesh import local_mesh
@@ -132,3 +132,27 @@ def test_what_cuda_lacks(monkeypatch, devices, version, words):
     monkeypatch.setitem(sys.modules, "cupy", SimpleNamespace(cuda=cuda))
     monkeypatch.setattr("importlib.util.find_spec", lambda name: name)
     assert re.search(words, CudaBackend.missing())
+
+
+def test_embree_is_told_how_many_threads(shapes):
+    """Every call of Open3D takes as many as were given: it would take every core otherwise."""
+    if reason := available_backends()["embree"]:
+        pytest.skip(f"embree: {reason}")
+    caster = RayCaster(*shapes["vase"](), "embree", threads=1)
+    scene, told = caster._engine._scene, []
+
+    class Recorder:
+        def __getattr__(self, name):
+            def call(rays, nthreads):
+                told.append((name, nthreads))
+                return getattr(scene, name)(rays, nthreads=nthreads)
+
+            return call
+
+    caster._engine._scene = Recorder()
+    directions = np.random.default_rng(1).normal(size=(40_000, 3))
+    caster.cast([0.05, 0.1, 0.4], directions)
+    caster.scan(Pattern(directions), [0.05, 0.1, 0.4])
+    caster.count([0.05, 0.1, 0.4], directions, every=True)
+    assert {name for name, _ in told} == {"cast_rays", "list_intersections"}
+    assert {threads for _, threads in told} == {1}
