@@ -176,6 +176,14 @@ def test_version_and_help(lidarpool):
     assert {"demo", "run", "info"} <= set(lidarpool("--help").out.split())
 
 
+def test_info_tells_versions_backends_and_gpus(lidarpool):
+    outcome = lidarpool("info")
+    assert (outcome.code, outcome.err) == (0, "")
+    first_words = [line.split()[0] for line in outcome.out.splitlines()]
+    assert {"lidarpool", "python", "dask", "GPUs", "backends", "cuda", "embree"} <= {*first_words}
+    assert re.search(r"^  numpy +ready$", outcome.out, re.MULTILINE)
+
+
 # -- on a terminal ------------------------------------------------------------------------------
 
 

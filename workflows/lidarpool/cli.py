@@ -16,6 +16,7 @@ from distributed.client import FutureCancelledError
 from distributed.comm import connect
 
 from poolpart import Pool, PoolError, local_cluster
+from poolpart.probe import visible_gpus
 from raybeam import available_backends
 
 from ._version import __version__
@@ -186,6 +187,8 @@ def info(scheduler: str | None) -> None:
             pool = Pool.from_client(client)
     for name, number in versions().items():
         click.echo(f"{name:<14} {number}")
+    gpus = visible_gpus()
+    click.echo(f"{'GPUs here':<14} {', '.join(gpus) or 'none'}")
     click.echo("backends")
     for name, reason in available_backends().items():
         click.echo(f"  {name:<12} {reason or 'ready'}")
