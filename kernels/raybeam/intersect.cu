@@ -280,15 +280,21 @@ __device__ __forceinline__ int descend(
     float t3 = enter(w, nx.w, ny.w, nz.w, fx.w, fy.w, fz.w);
     int c0 = __float_as_int(codes.x), c1 = __float_as_int(codes.y);
     int c2 = __float_as_int(codes.z), c3 = __float_as_int(codes.w);
-    order(t0, c0, t1, c1);
-    order(t2, c2, t3, c3);
-    order(t0, c0, t2, c2);
-    order(t1, c1, t3, c3);
-    order(t1, c1, t2, c2);
-    push(stack, top, c3, t3);
-    push(stack, top, c2, t2);
-    push(stack, top, c1, t1);
-    return t0 < 1e30f ? c0 : pop(stack, top, w.to);
+    const bool met0 = t0 < 1e30f, met1 = t1 < 1e30f, met2 = t2 < 1e30f, met3 = t3 < 1e30f;
+    // Most often one child is met, or none, by all rays of a warp: then there is nothing to sort.
+    if (met0 + met1 + met2 + met3 > 1) {
+        order(t0, c0, t1, c1);
+        order(t2, c2, t3, c3);
+        order(t0, c0, t2, c2);
+        order(t1, c1, t3, c3);
+        order(t1, c1, t2, c2);
+        push(stack, top, c3, t3);
+        push(stack, top, c2, t2);
+        push(stack, top, c1, t1);
+        return c0;
+    }
+    if (met0 || met1 || met2 || met3) return met0 ? c0 : (met1 ? c1 : (met2 ? c2 : c3));
+    return pop(stack, top, w.to);
 }
 
 // What the test in float knows of a triangle that the ray may hit: bounds of the distance from the
@@ -412,8 +418,9 @@ struct Tally {
     }
 };
 
-// Offer the taker all triangles that the ray may hit and that may still be of use. A step is a
-// node or one triangle of a leaf.
+// Offer the taker all triangles that the ray may hit and that may still be of use. Nodes and
+// triangles have loops of their own (Aila and Laine, 2009), so that the rays of a warp do the same
+// work at a time.
 template <class Rays, class Taker>
 __device__ __forceinline__ void walk(
     const Scene& scene, const Rays& rays, Count i, double t_min, double t_max, Taker& taker)
@@ -425,9 +432,8 @@ __device__ __forceinline__ void walk(
     do {
         bool room = true;
         while (node != DONE && room) {
-            if (node >= 0) {
-                node = descend(scene.nodes, node, w, stack, top);
-            } else {
+            while (node >= 0) node = descend(scene.nodes, node, w, stack, top);
+            while (node < 0 && node != DONE && room) {
                 const int leaf = ~node, place = leaf >> LEAF_BITS;
                 Guess guess;
                 if (may_hit(scene.triangles + 3 * (Count)place, w, guess))
