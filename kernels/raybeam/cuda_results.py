@@ -104,7 +104,7 @@ class Packer:
         """
         cp, n = self._cupy, len(place)
         # Closed up by sums in ray order, not by atomics: the same bytes on every run.
-        ends = cp.cumsum(place >= 0, dtype=np.int32)
+        ends = cp.cumsum(place >= 0, dtype=np.int32) if n else place
         hits = tuple(cp.empty(int(ends[-1]) if n else 0, dtype) for dtype in _DTYPES)
         given = (self._faces, distance, place, ends, np.int64(n), np.int64(first))
         self._kernels.run("pack", n, *given, np.float64(scale), *hits)
