@@ -108,14 +108,17 @@ class EmbreeBackend(Backend):
         """See `Backend.scan`; rays are turned where Embree reads them, a chunk at a time."""
         origins, scale = self._mesh.to_local(origin), self._mesh.scale
         t_min, t_max = interval[0] * scale, interval[1] * scale
-        parts = [_Pairs(np.zeros(0, np.intp), np.zeros(0), np.zeros(0, np.intp))]
         first, last = window
-        for start in range(first, last, self.chunk):
+        parts = []
+        for start in range(first, max(last, first + 1), self.chunk):
             directions = pattern.directions[start : min(start + self.chunk, last)]
             hits = self._within(directions, rotation, origins, t_min, t_max)
-            parts.append(_Pairs(hits.ray + (start - first), hits.t, hits.place))
+            np.add(hits.ray, start - first, out=hits.ray)
+            parts.append(hits)
         hits = _joined(parts)
-        return Returns(hits.ray.astype(np.int64), hits.t / scale, self._mesh.index[hits.place])
+        np.divide(hits.t, scale, out=hits.t)
+        ray = hits.ray.astype(np.int64, copy=False)
+        return Returns(ray, hits.t, self._mesh.index.take(hits.place))
 
     def along(self, rays: Rays) -> NDArray[np.int32]:
         """See `Backend.along`; of triangles at one distance Open3D lists one."""
@@ -151,7 +154,7 @@ class EmbreeBackend(Backend):
         unit = desk.turn(directions, rotation)
         hits = self._cast(desk, unit, origins, 0.0)
         early = hits.t < t_min
-        if early.any():
+        if early.any():  # a refined distance may be just below 0 as well
             hits = self._beyond(desk, hits, early, unit, origins, t_min)
         return hits.only(hits.t <= t_max) if t_max < np.inf else hits
 
@@ -223,6 +226,8 @@ class EmbreeBackend(Backend):
 
 
 def _joined(parts: list[_Pairs]) -> _Pairs:
+    if len(parts) == 1:
+        return parts[0]
     return _Pairs(
         np.concatenate([part.ray for part in parts]),
         np.concatenate([part.t for part in parts]),
