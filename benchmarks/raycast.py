@@ -22,7 +22,8 @@ from typing import Any
 
 import numpy as np
 
-from .raycast_engines import ENGINES, Cast, Engine
+from .raycast_engines import Cast, Engine
+from .raycast_peers import ENGINES
 from .raycast_scenes import Job, jobs
 
 CLOCKS = {"wall": time.perf_counter, "cpu": time.process_time}

@@ -7,25 +7,20 @@ hit, so that no engine is fast by being wrong.
 
 from __future__ import annotations
 
-import importlib.util
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from raybeam import Pattern, RayCaster, available_backends
-from raybeam.embree_backend import EmbreeBackend
-from raybeam.mesh import local_mesh
 from raybeam.rays import rotated
 
 from .raycast_scenes import Job
 
 Float = NDArray[np.float64]
 Cast = Callable[[], int]
-
-_MISS = 0xFFFFFFFF
 
 
 class Engine(ABC):
@@ -89,145 +84,6 @@ class Cuda(_Ours):
     name = "cuda"
 
 
-class EmbreeAlone(Engine):
-    """The embree backend's cast without the making of rays and the gathering of hits."""
-
-    name = "embree, cast alone"
-    ours = True
-    peer = False
-
-    def missing(self) -> str:
-        """See `Engine.missing`."""
-        return available_backends()["embree"]
-
-    def prepare(self, job: Job) -> Cast:
-        """See `Engine.prepare`."""
-        mesh = local_mesh(job.vertices, job.faces)
-        engine = EmbreeBackend(mesh, self.threads)
-        origins = [mesh.to_local(origin[None]) for origin in job.origins]
-        return _cast_rays(engine._scene, job, origins, engine.chunk, self.threads)
-
-
-class Open3D(Engine):
-    """A bare loop over `RaycastingScene.cast_rays` with rays that were made before."""
-
-    name = "Open3D, bare"
-    chunk = 1 << 17
-
-    def missing(self) -> str:
-        """See `Engine.missing`."""
-        return available_backends()["embree"]
-
-    def prepare(self, job: Job) -> Cast:
-        """See `Engine.prepare`."""
-        scene = _open3d_scene(job, self.threads)
-        return _cast_rays(scene, job, job.origins[:, None], self.chunk, self.threads)
-
-
-class Open3DWhole(Open3D):
-    """The same, rays made and hits gathered in NumPy as one would write it down."""
-
-    name = "Open3D + NumPy"
-
-    def prepare(self, job: Job) -> Cast:
-        """See `Engine.prepare`."""
-        import open3d
-
-        scene = _open3d_scene(job, self.threads)
-
-        def one(origin: Float) -> int:
-            directions = job.directions @ job.rotation.T
-            rays = np.hstack([np.tile(origin, (len(directions), 1)), directions])
-            tensor = open3d.core.Tensor(rays.astype(np.float32))
-            answer = scene.cast_rays(tensor, nthreads=self.threads)
-            t, triangle = answer["t_hit"].numpy(), answer["primitive_ids"].numpy()
-            hit = np.isfinite(t)
-            points = origin + t[hit, None] * directions[hit]
-            return len(points) if len(triangle[hit]) == len(points) else -1
-
-        return lambda: sum(one(origin) for origin in job.origins)
-
-
-class Trimesh(Engine):
-    """The fastest query of trimesh with embreex: poses in, triangles out, no distances."""
-
-    name = "trimesh + embreex"
-
-    def missing(self) -> str:
-        """See `Engine.missing`."""
-        return "" if importlib.util.find_spec("embreex") else "pip install embreex"
-
-    def prepare(self, job: Job) -> Cast:
-        """See `Engine.prepare`."""
-        import trimesh
-        from trimesh.ray.ray_pyembree import RayMeshIntersector
-
-        scene = RayMeshIntersector(trimesh.Trimesh(job.vertices, job.faces, process=False))
-
-        def one(origin: Float) -> int:
-            directions = job.directions @ job.rotation.T
-            origins = np.tile(origin, (len(directions), 1))
-            return int((scene.intersects_first(origins, directions) >= 0).sum())
-
-        one(job.origins[0])  # builds the tree
-        return lambda: sum(one(origin) for origin in job.origins)
-
-
-class Warp(Engine):
-    """Warp's mesh_query_ray, rays that were made before, answers on the host."""
-
-    name = "Warp CPU"
-    device: ClassVar[str] = "cpu"
-    # Fastest first to build is not fastest to cast: the surface area heuristic is.
-    builder: ClassVar[str] = "sah"
-
-    def missing(self) -> str:
-        """See `Engine.missing`."""
-        if not importlib.util.find_spec("warp"):
-            return "pip install warp-lang"
-        return ""
-
-    def prepare(self, job: Job) -> Cast:
-        """See `Engine.prepare`."""
-        import warp
-
-        from .raycast_warp import first_hits
-
-        mesh = warp.Mesh(
-            points=warp.array(job.vertices.astype(np.float32), dtype=warp.vec3, device=self.device),
-            indices=warp.array(job.faces.reshape(-1), dtype=int, device=self.device),
-            bvh_constructor=self.builder,
-        )
-        turned = rotated(job.directions, job.rotation).astype(np.float32)
-        directions = warp.array(turned, dtype=warp.vec3, device=self.device)
-        n = len(turned)
-        t = warp.empty(n, dtype=float, device=self.device)
-        face = warp.empty(n, dtype=int, device=self.device)
-
-        def one(origin: Float) -> int:
-            inputs = [mesh.id, warp.vec3(*origin.tolist()), directions, t, face]
-            warp.launch(first_hits, dim=n, inputs=inputs, device=self.device)
-            return int((face.numpy() >= 0).sum()) if len(t.numpy()) == n else -1
-
-        return lambda: sum(one(origin) for origin in job.origins)
-
-
-class WarpCuda(Warp):
-    """The same on the device."""
-
-    name = "Warp CUDA"
-    device = "cuda:0"
-
-    def missing(self) -> str:
-        """See `Engine.missing`."""
-        import_error = super().missing()
-        if import_error:
-            return import_error
-        import warp
-
-        return "" if warp.is_cuda_available() else "no CUDA device"
-
-
 class BruteForce(Engine):
     """Every ray against every triangle in NumPy, on as many rays as a moment allows."""
 
@@ -265,45 +121,3 @@ class BruteForce(Engine):
             return bool(((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0)).any())
 
         return lambda: sum(map(one, some))
-
-
-def _open3d_scene(job: Job, threads: int) -> Any:
-    import open3d
-
-    scene = open3d.t.geometry.RaycastingScene(nthreads=threads)
-    tensor = open3d.core.Tensor
-    scene.add_triangles(
-        tensor(job.vertices.astype(np.float32)), tensor(job.faces.astype(np.uint32))
-    )
-    return scene
-
-
-def _cast_rays(scene: Any, job: Job, origins: Any, chunk: int, threads: int) -> Cast:
-    """Loop over chunks of rays that were made before."""
-    import open3d
-
-    directions = rotated(job.directions, job.rotation)
-    chunks = []
-    for origin in origins:
-        rays = np.empty((len(directions), 6), np.float32)
-        rays[:, :3], rays[:, 3:] = origin, directions
-        chunks += [
-            open3d.core.Tensor.from_numpy(rays[start : start + chunk])
-            for start in range(0, len(rays), chunk)
-        ]
-    hits = sum(
-        int((scene.cast_rays(part)["primitive_ids"].numpy() != _MISS).sum()) for part in chunks
-    )
-
-    def cast() -> int:
-        for part in chunks:
-            scene.cast_rays(part, nthreads=threads)
-        return hits  # counting them anew would be gathering
-
-    return cast
-
-
-ENGINES: tuple[type[Engine], ...] = (
-    Cuda, Embree, EmbreeAlone, Numpy,
-    Open3D, Open3DWhole, Trimesh, Warp, WarpCuda, BruteForce,
-)  # fmt: skip

@@ -7,7 +7,8 @@ import json
 import numpy as np
 import pytest
 from benchmarks import raycast
-from benchmarks.raycast_engines import BruteForce, Embree, EmbreeAlone, Numpy, Open3D
+from benchmarks.raycast_engines import BruteForce, Embree, Numpy
+from benchmarks.raycast_peers import EmbreeAlone, Open3D
 from benchmarks.raycast_scenes import jobs, survey_job
 
 from lidarpool.city import city
