@@ -12,7 +12,6 @@ from typing import NoReturn
 
 import click
 from distributed import Client
-from distributed.client import FutureCancelledError
 from distributed.comm import connect
 
 from poolpart import Pool, PoolError, local_cluster
@@ -28,6 +27,7 @@ from .quiet import QuietWorkers, silence_logs
 from .report import versions
 from .scenario import Scenario
 from .scene import Scene
+from .scene_commands import scene
 from .simulate import Result, simulate
 from .survey import Survey
 from .terminal import shown_progress, shown_status
@@ -62,6 +62,9 @@ class _Commands(click.Group):
 @click.version_option(__version__, prog_name="lidarpool")
 def cli() -> None:
     """Simulate lidar surveys on a partitioned Dask cluster."""
+
+
+cli.add_command(scene)
 
 
 @cli.command()
@@ -218,14 +221,8 @@ def _connected(scheduler: str) -> Iterator[Client]:
             f"No Dask scheduler answers at {scheduler!r} ({type(error).__name__}): start one with "
             "dask scheduler, and give its address as tcp://host:8786."
         ) from error
-    try:
-        with client:
-            yield client
-    except FutureCancelledError as error:  # as Dask answers for a scheduler that has gone
-        raise LidarpoolError(
-            f"The cluster at {scheduler} cannot be reached any more, or somebody cancelled the "
-            "tasks of this run; it has ended without a result."
-        ) from error
+    with client:
+        yield client
 
 
 async def _knock(address: str) -> None:

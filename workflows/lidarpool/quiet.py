@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import warnings
 from typing import Any
 
 from distributed.diagnostics.plugin import WorkerPlugin
@@ -11,6 +12,8 @@ from distributed.diagnostics.plugin import WorkerPlugin
 def silence_logs() -> None:
     """Drop all log messages of this process, whatever levels Dask gave its many loggers."""
     logging.disable(logging.CRITICAL)
+    # An interrupt may come between the making of one of Dask's coroutines and its first step.
+    warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)
 
 
 class QuietWorkers(WorkerPlugin):

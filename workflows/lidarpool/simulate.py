@@ -10,6 +10,7 @@ from typing import TypeVar
 
 import numpy as np
 from distributed import Client
+from distributed.client import FutureCancelledError
 from distributed.comm.core import CommClosedError
 from numpy.typing import NDArray
 
@@ -35,6 +36,9 @@ from .survey import Survey
 from .trials import TrialPump
 
 T = TypeVar("T")
+
+# What Dask raises, here or there, once the scheduler is gone.
+_CLUSTER_LOST = (OSError, CommClosedError, FutureCancelledError, PipeClosed, PipeFailed)
 
 PROGRESS_EVERY_S = 0.1
 WATCH_EVERY_S = 1.0
@@ -236,10 +240,10 @@ class _Run:
                 raise
             if isinstance(error, PoolError):
                 raise LidarpoolError(str(error)) from error
-            if isinstance(error, (OSError, CommClosedError, PipeClosed, PipeFailed)):
+            if isinstance(error, _CLUSTER_LOST):
                 raise LidarpoolError(
-                    f"The cluster at {self.client.scheduler.address} cannot be reached any more "
-                    f"({type(error).__name__}: {error}); the run has ended without a result."
+                    f"The cluster at {self.client.scheduler.address} cannot be reached any more, "
+                    "or somebody cancelled the tasks of this run; it has ended without a result."
                 ) from error
             raise
         for pump in pumps:
