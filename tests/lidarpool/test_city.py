@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import doctest
 import subprocess
 import sys
 from collections import Counter
@@ -14,6 +15,11 @@ from lidarpool.city import city
 from lidarpool.city.city import _catalogue
 from lidarpool.city.solids import box, gable, joined, loft, lying, rectangle, regular
 from raybeam import RayCaster
+
+
+def test_examples_in_the_docstrings():
+    found = doctest.testmod(sys.modules["lidarpool.city.city"])
+    assert found.failed == 0 < found.attempted
 
 
 def volume(solid):

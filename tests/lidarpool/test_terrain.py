@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import doctest
+
 import numpy as np
 import pytest
 
+import lidarpool.terrain
 from lidarpool import LidarpoolError
 from lidarpool.terrain import terrain
 from raybeam import RayCaster
+
+
+def test_examples_in_the_docstrings():
+    found = doctest.testmod(lidarpool.terrain)
+    assert found.failed == 0 < found.attempted
 
 
 @pytest.mark.parametrize("triangles", [2, 3, 7, 50, 1999, 20_000, 100_000])
