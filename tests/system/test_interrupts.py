@@ -231,7 +231,7 @@ def test_the_last_worker_of_a_partition_is_killed(start, untouched, outside):
     for name, slots in (("GPU", 1), ("LIDAR", 4), ("OTHER", 1)):
         cluster.add(name, slots=slots)
     cluster.wait()
-    patience = "import importlib; importlib.import_module('lidarpool.simulate').PATIENCE_S = 2\n"
+    patience = "import lidarpool.watch; lidarpool.watch.PATIENCE_S = 2\n"
     run = start(LONG, "--scheduler", cluster.address, prelude=patience).wait_for(SURVEYING)
     cluster.kill(next(name for name in cluster.processes if name.startswith("GPU")))
     assert run.process.wait(60) == 2

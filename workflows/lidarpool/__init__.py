@@ -5,10 +5,11 @@ from .cloud import Cloud
 from .errors import LidarpoolError
 from .plan import Plan, Planning
 from .ply import read_cloud, write_cloud
+from .result import Result
 from .scan import Frame
 from .scene import Scene
 from .sensor import Sensor
-from .simulate import Result, simulate
+from .simulate import simulate
 from .survey import Pose, ScanSpec, Survey
 
 __all__ = [

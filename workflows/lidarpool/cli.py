@@ -25,10 +25,11 @@ from .errors import LidarpoolError
 from .interrupts import INTERRUPTED, children_spared, deferred_interrupts, interrupt_on_signals
 from .quiet import QuietWorkers, silence_logs
 from .report import versions
+from .result import Result
 from .scenario import Scenario
 from .scene import Scene
 from .scene_commands import scene
-from .simulate import Result, simulate
+from .simulate import simulate
 from .survey import Survey
 from .terminal import shown_progress, shown_status
 

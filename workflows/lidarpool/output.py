@@ -21,8 +21,8 @@ from .interrupts import deferred_interrupts
 from .plan import Planning
 from .ply import write_cloud
 from .report import make_report
+from .result import Result
 from .scene import Scene
-from .simulate import Result
 from .survey import Survey
 from .view import draw_cloud, draw_intensity, draw_path, draw_scene, take_shot
 

@@ -15,9 +15,9 @@ from poolpart import TaskRecord, placement_violations
 
 from ._version import __version__
 from .plan import Planning
+from .result import Result
 from .scan import COLLECT, GENERATE, INTERSECT, SORT
 from .scene import Scene
-from .simulate import Result
 from .survey import Survey
 from .trials import TRIAL
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
@@ -20,20 +19,20 @@ from poolpart import (
     PipeClosed,
     PipeFailed,
     PoolError,
-    TaskRecord,
     assign_devices,
     local_cluster,
 )
 
 from .checks import check_backend_here, check_precision, common_backend, survey_pool
-from .cloud import Cloud
 from .errors import LidarpoolError
-from .plan import Plan, Planning, Trial
+from .plan import Planning
 from .progress import Progress
+from .result import Result
 from .scan import GPU, LIDAR, OTHER, Frame, SurveyPump, SurveySetup
 from .scene import Scene
 from .survey import Survey
 from .trials import TrialPump
+from .watch import Watch
 
 T = TypeVar("T")
 
@@ -41,54 +40,7 @@ T = TypeVar("T")
 _CLUSTER_LOST = (OSError, CommClosedError, FutureCancelledError, PipeClosed, PipeFailed)
 
 PROGRESS_EVERY_S = 0.1
-WATCH_EVERY_S = 1.0
-PATIENCE_S = 60.0  # how long a partition may be without workers; a nanny needs a few seconds
 SAMPLE_RAYS = 400  # kept for the pictures
-
-
-@dataclass(frozen=True, eq=False)
-class Result:
-    """What a run gives.
-
-    Parameters
-    ----------
-    cloud
-        The merged points.
-    hit_counts
-        int64 (f,): rays that hit each triangle of the scene.
-    sample_rays
-        float32 (k, 2, 3): first and last point of some rays, metres, local coordinates.
-    plan, trials
-        The best path and all trials; None and empty where nothing was planned.
-    backend
-        Name of the ray-casting backend that was used.
-    rays, hits
-        Rays fired, and those that hit something.
-    records
-        Each task of the run: where it ran and when.
-    seconds, survey_seconds, planning_seconds
-        Wall time of all, of the survey and of the planning.
-    replayed, duplicates_dropped
-        Batches that had to be sent again, and scans that came twice because of it.
-    notes
-        What a user should know, such as that the GPU partition had no GPU.
-    """
-
-    cloud: Cloud
-    hit_counts: NDArray[np.int64]
-    sample_rays: NDArray[np.float32]
-    plan: Plan | None
-    trials: tuple[Trial, ...]
-    backend: str
-    rays: int
-    hits: int
-    records: tuple[TaskRecord, ...]
-    seconds: float
-    survey_seconds: float
-    planning_seconds: float
-    replayed: int
-    duplicates_dropped: int
-    notes: tuple[str, ...]
 
 
 def simulate(
@@ -268,7 +220,7 @@ class _Run:
     ) -> dict[type, float]:
         """Step the pumps until all have finished; returns when each did, in seconds."""
         pause = Backoff(least_s=0.001, most_s=0.016)
-        watch = _Watch(self.client, {GPU, LIDAR} | ({OTHER} if trials else set()))
+        watch = Watch(self.client, {GPU, LIDAR} | ({OTHER} if trials else set()))
         times: dict[type, float] = {}
         told = float("-inf")
         while len(times) < len(pumps):
@@ -344,27 +296,3 @@ def _stop(pumps: list[SurveyPump | TrialPump], reason: str) -> None:
         except (OSError, CommClosedError, RuntimeError):
             # The first error is the one to tell of.
             continue
-
-
-class _Watch:
-    """Notices a partition that stays without workers: Dask would wait for ever."""
-
-    def __init__(self, client: Client, names: set[str]) -> None:
-        self.client, self.names = client, names
-        self._looked = time.monotonic()
-        self._seen = dict.fromkeys(names, self._looked)
-
-    def look(self, now: float) -> None:
-        """Check, once in a while; LidarpoolError if a partition has been empty for too long."""
-        if now - self._looked < WATCH_EVERY_S:
-            return
-        self._looked = now
-        for worker in self.client.scheduler_info(n_workers=-1)["workers"].values():
-            for name in self.names & set(worker["resources"]):
-                self._seen[name] = now
-        for name, seen in self._seen.items():
-            if now - seen > PATIENCE_S:
-                raise LidarpoolError(
-                    f"Partition {name!r} has had no workers for {PATIENCE_S:.0f} s, so the run "
-                    f'was ended: start some with --resources "{name}=1" and run it again.'
-                )
