@@ -4,7 +4,7 @@ BIN := $(VENV)/bin
 OUT ?= lidarpool-out
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format bench clean
+.PHONY: help demo test slow lint format bench clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /\1\t/' | expand -t 10
@@ -16,6 +16,10 @@ demo:  ## run the default survey on a local cluster; results in $(OUT)/
 test:  ## run the test suite
 	@VENV=$(VENV) sh .ci/setup dev
 	$(BIN)/python -m pytest
+
+slow:  ## the tests that take minutes, which `test` leaves out
+	@VENV=$(VENV) sh .ci/setup dev
+	$(BIN)/python -m pytest -m slow
 
 lint:  ## format check, lint, types, layer contracts
 	@VENV=$(VENV) sh .ci/setup dev
@@ -32,6 +36,8 @@ format:  ## rewrite the sources in the project's format
 bench:  ## benchmarks: pipeline throughput, ray casting
 	@VENV=$(VENV) sh .ci/setup dev
 	$(BIN)/python -m benchmarks.pipeline
+	$(BIN)/python -m benchmarks.planning
+	$(BIN)/python -m benchmarks.raycast
 
 clean:  ## remove the virtual environment and caches
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
