@@ -5,7 +5,7 @@ boxes in float32; pairs of a ray and an inner child make new blocks, pairs with 
 against its triangles. Blocks are taken last in, first out, and of a block that is too large the
 pairs that are nearest to their rays' starts go first: memory stays bounded whatever the scene,
 and hits found early spare later pairs the search behind them. To order the children of every
-node would test a fifth fewer boxes, but in many small blocks, which takes twice as long.
+node would test a sixth fewer boxes, but in many small blocks, which takes twice as long.
 """
 
 from __future__ import annotations
