@@ -34,13 +34,13 @@ def scene() -> None:
 @_triangles(100_000)
 @_seed
 def city(out: Path, triangles: int, seed: int) -> None:
-    r"""Make a city: streets, houses, towers, trees, cars; more triangles make it larger.
+    """Make a city: streets, houses, towers, trees, cars; more triangles make it larger.
 
     \b
     Examples:
       lidarpool scene city city.glb
       lidarpool scene city city.ply --triangles 10000000 --seed 7
-    """
+    """  # noqa: D301 - click wants the character, not its name
     from .city import city as make
 
     _write(out, lambda: make(triangles, seed))
@@ -54,13 +54,13 @@ def city(out: Path, triangles: int, seed: int) -> None:
     "--side", type=float, default=1000.0, show_default=True, help="Length of a side in metres."
 )
 def terrain(out: Path, triangles: int, seed: int, side: float) -> None:
-    r"""Make a square of hills and mountains; more triangles make it finer.
+    """Make a square of hills and mountains; more triangles make it finer.
 
     \b
     Examples:
       lidarpool scene terrain hills.ply
       lidarpool scene terrain small.obj --triangles 20000 --side 100
-    """
+    """  # noqa: D301 - click wants the character, not its name
     from .terrain import terrain as make
 
     _write(out, lambda: make(triangles, seed, side))
