@@ -10,6 +10,7 @@ from .pipe import Pipe
 from .pipe_parts import forget_pipes
 from .placement import Recorder, TaskRecord, placement_violations, recorded
 from .pool import Pool
+from .slots import Slots, look_at_slots
 from .worker_info import WorkerInfo, assign_devices
 
 __all__ = [
@@ -22,12 +23,14 @@ __all__ = [
     "Pool",
     "PoolError",
     "Recorder",
+    "Slots",
     "TaskRecord",
     "WorkerInfo",
     "assign_devices",
     "fetch_available",
     "forget_pipes",
     "local_cluster",
+    "look_at_slots",
     "placement_violations",
     "recorded",
 ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import replace
 
 from distributed import Client
@@ -41,8 +41,16 @@ class Pool:
         self.workers = tuple(workers)
 
     @classmethod
-    def from_client(cls, client: Client) -> Pool:
+    def from_client(cls, client: Client, declaring: Set[str] | None = None) -> Pool:
         """All workers that the client's cluster has now, with their GPUs.
+
+        Parameters
+        ----------
+        client
+            Client of the cluster.
+        declaring
+            Only workers that declare one of these resources; others are not asked anything,
+            and need not have this package.
 
         Raises
         ------
@@ -55,6 +63,10 @@ class Pool:
                 f"The cluster at {client.scheduler.address} has no workers: start some with "
                 f'dask worker {client.scheduler.address} --resources "GPU=1"'
             )
+        if declaring is not None:
+            identities = {a: i for a, i in identities.items() if declaring & set(i["resources"])}
+            if not identities:
+                return cls(client, [])
         facts = client.run(probe_worker, workers=list(identities), on_error="return")
         for address, fact in facts.items():
             if isinstance(fact, BaseException):

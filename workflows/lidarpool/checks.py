@@ -18,8 +18,23 @@ from .scene import Scene
 from .survey import Survey
 
 
-def check_versions(client: Client) -> None:
-    """Check that every worker has this version of lidarpool; LidarpoolError if not."""
+def check_counts(**counts: int | None) -> None:
+    """Check that numbers of tasks or workers are at least 1, or None; LidarpoolError if not."""
+    for name, count in counts.items():
+        if count is not None and count < 1:
+            raise LidarpoolError(f"{name} is {count}; it must be at least 1.")
+
+
+def check_versions(client: Client, workers: Sequence[str]) -> None:
+    """Check that these workers have this version of lidarpool; LidarpoolError if not.
+
+    Parameters
+    ----------
+    client
+        Client of the cluster.
+    workers
+        Their addresses.
+    """
 
     # Nested, so that it travels by value: a worker that lacks the package can still run it.
     def version() -> str:
@@ -27,7 +42,8 @@ def check_versions(client: Client) -> None:
 
         return __version__
 
-    for address, answer in client.run(version, on_error="return").items():
+    answers = client.run(version, workers=list(workers), on_error="return")
+    for address, answer in answers.items():
         if isinstance(answer, ModuleNotFoundError):
             raise LidarpoolError(
                 f"The worker at {address} does not have lidarpool: install lidarpool "
@@ -48,14 +64,20 @@ def survey_pool(client: Client, collectors: int, planning: bool) -> Pool:
     LidarpoolError
         If there are no workers, other versions, or too few slots in a partition.
     """
+    if client.asynchronous:
+        raise LidarpoolError("The client is asynchronous: give one made without asynchronous=True.")
+    names = {GPU, LIDAR, OTHER} if planning else {GPU, LIDAR}
     try:
-        if not client.scheduler_info(n_workers=-1)["workers"]:
+        workers = client.scheduler_info(n_workers=-1)["workers"]
+        if not workers:
             raise PoolError(
                 f"The cluster at {client.scheduler.address} has no workers: start some, for "
                 f'example dask worker {client.scheduler.address} --resources "GPU=1"'
             )
-        check_versions(client)
-        pool = Pool.from_client(client)
+        # Only those that are to work: a cluster may have others' workers, with other packages.
+        if members := [a for a, worker in workers.items() if names & set(worker["resources"])]:
+            check_versions(client, members)
+        pool = Pool.from_client(client, declaring=names)
         needs = {GPU: 1, LIDAR: 2 + collectors}
         purpose = {
             GPU: "stage 2 casts the rays",

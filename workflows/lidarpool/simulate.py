@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TypeVar
 
 import numpy as np
@@ -23,7 +23,7 @@ from poolpart import (
     local_cluster,
 )
 
-from .checks import check_backend_here, check_precision, common_backend, survey_pool
+from .checks import check_backend_here, check_counts, check_precision, common_backend, survey_pool
 from .errors import LidarpoolError
 from .plan import Planning
 from .progress import Progress
@@ -101,6 +101,12 @@ def simulate(
     ...     print(len(result.cloud), "points")
     """
     check_precision(scene, survey)
+    check_counts(
+        queue_capacity=queue_capacity,
+        collectors=collectors,
+        gpu_workers=gpu_workers,
+        other_workers=other_workers,
+    )
     if client is None:
         check_backend_here(backend)
     with _cluster(client, collectors, gpu_workers, other_workers) as client:
@@ -172,8 +178,8 @@ class _Run:
         try:
             if self.planning is not None:  # first, so that no slot of OTHER waits for the survey
                 trials = TrialPump(self.client, self.partitions[OTHER], self.planning)
-                trials.step()
                 pumps.append(trials)
+                trials.step()
             survey = SurveyPump(
                 self.client,
                 self.partitions,
@@ -184,7 +190,10 @@ class _Run:
                 self.collectors,
             )
             pumps.append(survey)
+            survey.start()
             times = self._loop(pumps, survey, trials, on_progress, started)
+            for pump in pumps:
+                pump.finish()
         except BaseException as error:
             reason = str(error) or type(error).__name__
             _stop(pumps, f"the run was stopped: {reason}")
@@ -198,8 +207,6 @@ class _Run:
                     "or somebody cancelled the tasks of this run; it has ended without a result."
                 ) from error
             raise
-        for pump in pumps:
-            pump.finish()
         return self._result(survey, trials, started, times)
 
     def _call(self, callback: Callable[[T], None], argument: T) -> None:
@@ -290,9 +297,7 @@ class _Run:
 def _stop(pumps: list[SurveyPump | TrialPump], reason: str) -> None:
     """Stop what can be stopped; the cluster may be gone, and then nothing can."""
     for pump in pumps:
-        try:
-            pump.stop(reason)
-            pump.finish()
-        except (OSError, CommClosedError, RuntimeError):
+        for step in (lambda pump=pump: pump.stop(reason), pump.finish):
             # The first error is the one to tell of.
-            continue
+            with suppress(OSError, CommClosedError, FutureCancelledError, RuntimeError):
+                step()

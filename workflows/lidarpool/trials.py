@@ -50,12 +50,16 @@ class TrialPump:
         LidarpoolError
             If a trial has failed.
         """
-        done = [future for future in self._running if future.status in ("finished", "error")]
+        done = [f for f in self._running if f.status in ("finished", "error", "cancelled")]
         for future in done:
             number = self._running.pop(future)
             if future.status == "error":
                 error = future.exception(timeout=10)
                 raise LidarpoolError(f"Planning trial {number} failed: {error}")
+            if future.status == "cancelled":
+                raise LidarpoolError(
+                    f"Planning trial {number} was cancelled from outside this run."
+                )
             trial, record = future.result(timeout=30)
             self.trials.append(trial)
             self.records.append(record)

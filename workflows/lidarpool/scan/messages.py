@@ -80,7 +80,12 @@ class Part:
 
 @dataclass(frozen=True)
 class Hello:
-    """A consumer stage has started, perhaps again on another worker with nothing in memory."""
+    """A consumer stage has started, perhaps again on another worker with nothing in memory.
+
+    `number` tells several consumers of one stage apart.
+    """
+
+    number: int
 
 
 @dataclass(frozen=True)

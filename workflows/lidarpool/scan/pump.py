@@ -11,14 +11,14 @@ from __future__ import annotations
 
 import time
 import uuid
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
 from distributed import Client, Future
 
-from poolpart import Ledger, Partition, Pipe, TaskRecord, forget_pipes
+from poolpart import Ledger, Partition, Pipe, PipeFailed, TaskRecord, fetch_available, forget_pipes
 
 from ..errors import LidarpoolError
 from ..survey import Survey
@@ -27,6 +27,7 @@ from .casting import frames_of, intersect
 from .messages import Delivery, Frame, FrameRun, Hello
 from .setup import SurveySetup
 from .stage_names import COLLECT, GENERATE, GPU, INTERSECT, LIDAR, SORT
+from .stage_tasks import Command, StageTasks, was_killed
 from .stages import collect, generate, sort_frames
 
 BATCH_SECONDS = 0.05  # casting time that makes a batch worth its overhead
@@ -97,45 +98,51 @@ class SurveyPump:
             1, min(BATCH_RAYS // rays_per_scan, survey.scan_count // (16 * slots))
         )
         self._under_way: list[_UnderWay] = []
-        self._greeted: Counter[str] = Counter()
-        self._consumers = {SORT: 1, COLLECT: collectors}
+        self._recorded: set[TaskRecord] = set()
+        self._greeted: set[tuple[str, int]] = set()  # consumers that have started, once or more
+        self._collectors = collectors
         self._moved_at = time.monotonic()  # when something was last handed on or delivered
         self._closed_at: float | None = None  # when all had arrived and the pipes were closed
 
         def pipe(name: str, capacity: int) -> Pipe:
-            return Pipe(f"lidarpool-{self.run_id}-{name}", capacity, client).create()
+            return Pipe(f"lidarpool-{self.run_id}-{name}", capacity, client)
 
+        # With room for what is under way, and for all of it once more: puts never wait.
+        room = 2 * (self._under_way_most + queue_capacity)
         self._scans = pipe("scans", queue_capacity)
-        self._inlets = {
-            stage: pipe(stage, self._under_way_most + queue_capacity) for stage in (SORT, COLLECT)
-        }
+        self._inlets = {stage: pipe(stage, room) for stage in (SORT, COLLECT)}
         self._deliveries = pipe("deliveries", DELIVERY_CAPACITY)
-        self._setup = partitions[GPU].submit(
-            _make_setup, *setup.__reduce__()[1], key=self._key("scene")
-        )
-        self._stages = self._start_stages()
+        self._pipes = (self._scans, self._deliveries, *self._inlets.values())
+        self._arguments = setup.__reduce__()[1]
+        self._setup: Future | None = None
         self._prepared: dict[str, Future] = {}  # {address of a GPU worker: task that readies it}
+        self._stages = StageTasks(client, partitions[LIDAR], self._key, self._commands())
+
+    def start(self) -> None:
+        """Make the pipes and start the stages; after this `stop` and `finish` must be called."""
+        for pipe in self._pipes:
+            pipe.create()
+        gpu = self.partitions[GPU]
+        self._setup = gpu.submit(_make_setup, *self._arguments, key=self._key("scene"))
+        self._stages.start()
         self._prepare_workers()
 
     def _key(self, name: str, number: int | None = None) -> str:
         return f"{name}-{self.run_id}" + ("" if number is None else f"-{number}")
 
-    def _start_stages(self) -> dict[str, Future]:
-        lidar, survey, sensor = self.partitions[LIDAR], self.survey, self.survey.sensor
-        out = self._deliveries
-        stages = {GENERATE: lidar.submit(generate, survey, self._scans, key=self._key(GENERATE))}
-        stages[SORT] = lidar.submit(sort_frames, self._inlets[SORT], out, key=self._key(SORT))
-        for number in range(self._consumers[COLLECT]):
-            stages[f"{COLLECT}-{number}"] = lidar.submit(
-                collect,
-                sensor,
-                survey.keep_every,
-                survey.precision_m,
-                self._inlets[COLLECT],
-                out,
-                key=self._key(COLLECT, number),
-            )
-        return stages
+    def _commands(self) -> dict[str, Command]:
+        survey, out = self.survey, self._deliveries
+        cloud = (survey.sensor, survey.keep_every, survey.precision_m)
+
+        def collector(number: int) -> Command:
+            return lambda: (collect, (number, *cloud, self._inlets[COLLECT], out))
+
+        commands: dict[str, Command] = {
+            GENERATE: lambda: (generate, (survey, self._scans, self.generated.first_missing)),
+            SORT: lambda: (sort_frames, (self._inlets[SORT], out)),
+        }
+        commands |= {f"{COLLECT}-{number}": collector(number) for number in range(self._collectors)}
+        return commands
 
     def _prepare_workers(self) -> None:
         """Have each GPU worker that is new fetch the scene and build its ray caster.
@@ -171,8 +178,7 @@ class SurveyPump:
         """
         if self._closed_at is None:
             return False
-        late = time.monotonic() - self._closed_at > LAST_WORDS_S
-        return late or all(future.done() for future in self._stages.values())
+        return self._stages.done or time.monotonic() - self._closed_at > LAST_WORDS_S
 
     def step(self) -> bool:
         """Do what can be done now; returns whether anything was.
@@ -183,11 +189,12 @@ class SurveyPump:
             If a task of the survey has failed, naming stage and scans.
         """
         self._check_tasks()
-        if self._closed_at is not None:
-            return False
+        moved = self._take_deliveries()
+        if self._closed_at is not None:  # last words only
+            return moved
         if time.monotonic() - self._looked_for_workers > LOOK_FOR_WORKERS_S:
             self._prepare_workers()
-        moved = self._take_deliveries()
+        self._stages.look(self.frames.delivered + self.cloud.ledger.delivered)
         moved |= self._hand_on()
         moved |= self._take_scans()
         if self.complete:
@@ -195,15 +202,19 @@ class SurveyPump:
                 inlet.close()
             self._closed_at = time.monotonic()
         elif self._under_way and time.monotonic() - self._moved_at > STALL_SECONDS:
-            for stage in self._inlets:
-                self._send_again(stage)
+            for stage, inlet in self._inlets.items():
+                if not inlet.depth:  # else it is not lost, but waits for a reader
+                    self._send_again(stage)
+            self._moved_at = time.monotonic()
         return moved
 
     def _check_tasks(self) -> None:
-        for name, future in self._stages.items():
-            _raise_if_failed(future, f"stage {name}")
+        for name, future in self._stages.futures.items():
+            if not (future.status == "error" and was_killed(future)):
+                _raise_if_failed(future, f"stage {name}")
         for future in (self._setup, *self._prepared.values()):
-            _raise_if_failed(future, "preparing the scene on the GPU workers")
+            if future is not None:
+                _raise_if_failed(future, "preparing the scene on the GPU workers")
         for item in self._under_way:
             for future in (item.batch, item.frames):
                 _raise_if_failed(
@@ -261,7 +272,7 @@ class SurveyPump:
             delivery = Delivery.from_wire(data)
             content = delivery.content
             if isinstance(content, Hello):
-                self._greet(delivery.stage)
+                self._greet(delivery.stage, content.number)
             elif isinstance(content, FrameRun):
                 self._take_frames(content)
             else:
@@ -272,7 +283,7 @@ class SurveyPump:
         return bool(deliveries)
 
     def _take_frames(self, run: FrameRun) -> None:
-        self.records.extend(run.records)
+        self._record(run.records)
         for frame in run.frames:
             if self.frames.accept(frame.scan):
                 self.on_frame(frame)
@@ -281,6 +292,13 @@ class SurveyPump:
             per_scan = max(last.seconds, 1e-6) / last.items
             wished = min(int(BATCH_SECONDS / per_scan), 2 * last.items, self._batch_most)
             self._scans.advise(max(1, wished))
+
+    def _record(self, records: Iterable[TaskRecord]) -> None:
+        """Keep records that are new: a batch that was fetched twice brings its own twice."""
+        for record in records:
+            if record not in self._recorded:
+                self._recorded.add(record)
+                self.records.append(record)
 
     def _release_arrived(self) -> None:
         still = []
@@ -295,11 +313,11 @@ class SurveyPump:
 
     # -- sending again -----------------------------------------------------------------
 
-    def _greet(self, stage: str) -> None:
-        """Note that a consumer has started; once more than there are means that one had died."""
-        self._greeted[stage] += 1
-        if self._greeted[stage] > self._consumers[stage]:
+    def _greet(self, stage: str, number: int) -> None:
+        """Note that a consumer has started; the second time means that it had died meanwhile."""
+        if (stage, number) in self._greeted:
             self._send_again(stage)
+        self._greeted.add((stage, number))
 
     def _send_again(self, stage: str) -> None:
         lost = [i for i in self._under_way if stage in i.handed_on and stage in i.waiting_for]
@@ -307,7 +325,6 @@ class SurveyPump:
         if lost:
             self.replayed += len(lost)
             self._put(stage, self._inlets[stage], lost)
-        self._moved_at = time.monotonic()
 
     # -- the end -----------------------------------------------------------------------
 
@@ -319,22 +336,29 @@ class SurveyPump:
 
     def stop(self, reason: str) -> None:
         """End every stage at once; `finish` does the rest."""
-        for pipe in (self._scans, self._deliveries, *self._inlets.values()):
-            pipe.fail(reason)
         self.client.cancel([f for item in self._under_way for f in (item.frames, item.batch)])
+        for pipe in self._pipes:
+            with suppress(PipeFailed):  # not made yet, or gone already
+                pipe.fail(reason)
 
-    def finish(self, timeout_s: float = LAST_WORDS_S) -> None:
-        """Wait for the stages to end, take their records, and leave nothing on the scheduler."""
-        deadline = time.monotonic() + timeout_s
-        while not all(f.done() for f in self._stages.values()) and time.monotonic() < deadline:
-            time.sleep(0.01)
-        for future in self._stages.values():
-            if future.status == "finished":
-                self.records.append(future.result(timeout=10))
-        pipes = (self._scans, self._deliveries, *self._inlets.values())
-        forget_pipes(self.client, [pipe.name for pipe in pipes])
-        self.client.cancel([*self._stages.values(), *self._prepared.values(), self._setup])
-        self._under_way.clear()
+    def finish(self) -> None:
+        """Wait a moment for the stages to end, and leave nothing on the scheduler."""
+        try:
+            deadline = (self._closed_at or time.monotonic()) + LAST_WORDS_S
+            while not self._stages.done and time.monotonic() < deadline:
+                time.sleep(0.01)
+            self._take_last_records()
+        finally:
+            forget_pipes(self.client, [pipe.name for pipe in self._pipes])
+            kept = [*self._stages.futures.values(), *self._prepared.values(), self._setup]
+            self.client.cancel([future for future in kept if future is not None])
+            self._under_way.clear()
+
+    def _take_last_records(self) -> None:
+        """Take the stages' own records; those whose worker cannot be reached are done without."""
+        ended = [f for f in self._stages.futures.values() if f.status == "finished"]
+        found = fetch_available(self.client, [future.key for future in ended])
+        self._record(found[future.key] for future in ended if future.key in found)
 
 
 def _make_setup(*arguments: Any) -> SurveySetup:

@@ -36,11 +36,11 @@ DELIVERY_BYTES = 4 << 20  # of points or frames in one message through the sched
 GIVE_UP_S = 120.0  # asking for a result; the driver sends what does not arrive again
 
 
-def generate(survey: Survey, outlet: Pipe) -> TaskRecord:
-    """Stage 1: describe every scan and send it on, as many in one item as is advised."""
+def generate(survey: Survey, outlet: Pipe, first: int = 0) -> TaskRecord:
+    """Stage 1: describe every scan from `first` on, as many in one item as is advised."""
     secede()
     recorder = Recorder(GENERATE, LIDAR)
-    sent = 0
+    sent = first
     try:
         while sent < survey.scan_count:
             stop = min(sent + outlet.advice, survey.scan_count)
@@ -53,7 +53,7 @@ def generate(survey: Survey, outlet: Pipe) -> TaskRecord:
         pass
     except PipeClosed:  # an earlier run of this task got as far as closing it
         sent = survey.scan_count
-    return recorder.done(sent)
+    return recorder.done(sent - first)
 
 
 def sort_frames(inlet: Pipe, outlet: Pipe) -> TaskRecord:
@@ -66,7 +66,7 @@ def sort_frames(inlet: Pipe, outlet: Pipe) -> TaskRecord:
     waiting: dict[int, Frame] = {}  # {scan: frame that came before its turn}
     following = 0  # the scan whose turn it is
     try:
-        outlet.put(Delivery(SORT, Hello()).wire())
+        outlet.put(Delivery(SORT, Hello(0)).wire())
         for base, results in _arrivals(inlet):
             # Everything before `base` has reached the driver: a sorter that was started again
             # with an empty memory must not wait for it.
@@ -81,7 +81,7 @@ def sort_frames(inlet: Pipe, outlet: Pipe) -> TaskRecord:
             while following in waiting:
                 ready.append(waiting.pop(following))
                 following += 1
-            with naming_scans(following):
+            with naming_scans(following - len(ready), following - 1):
                 runs = list(_frame_runs(ready, records))
             for run in runs:
                 outlet.put(Delivery(SORT, run).wire())
@@ -91,14 +91,14 @@ def sort_frames(inlet: Pipe, outlet: Pipe) -> TaskRecord:
 
 
 def collect(
-    sensor: Sensor, keep_every: int, precision_m: float, inlet: Pipe, outlet: Pipe
+    number: int, sensor: Sensor, keep_every: int, precision_m: float, inlet: Pipe, outlet: Pipe
 ) -> TaskRecord:
     """Stage 4: thin out the hits of each scan, turn them into points, gather and deliver."""
     secede()
     recorder = Recorder(COLLECT, LIDAR)
     scans = 0
     try:
-        outlet.put(Delivery(COLLECT, Hello()).wire())
+        outlet.put(Delivery(COLLECT, Hello(number)).wire())
         for _, results in _arrivals(inlet):
             batches: list[Batch] = results
             tables = []

@@ -1,0 +1,57 @@
+"""Which slots of a partition are free, as the scheduler sees it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Any
+
+from distributed import Client
+
+
+@dataclass(frozen=True)
+class Slots:
+    """Slots of a partition at one moment.
+
+    Parameters
+    ----------
+    free
+        Slots that no task holds or waits for, by address of the worker; below 0 where more
+        tasks were given to a worker than it has slots for. Workers that take no tasks at the
+        moment are left out.
+    present
+        Addresses of all workers of the partition.
+    running
+        Those of the keys asked for whose tasks run for long, that is, have seceded.
+    """
+
+    free: dict[str, int]
+    present: frozenset[str]
+    running: frozenset[str]
+
+
+def look_at_slots(client: Client, resource: str, keys: Collection[str] = ()) -> Slots:
+    """See which slots of a partition are free.
+
+    Dask places a task by a worker's total resources, not by what is free, and prefers the
+    worker with the least work ahead; one whose only slot is held by a task that has seceded
+    looks idle to it. A long-running task that lands there waits as long as the other runs.
+    Whoever starts several of them should choose their workers.
+    """
+    free, present, running = client.run_on_scheduler(_look, resource=resource, keys=list(keys))
+    return Slots(free, frozenset(present), frozenset(running))
+
+
+def _look(resource: str, keys: list[str], dask_scheduler: Any = None) -> tuple[Any, ...]:
+    members = [ws for ws in dask_scheduler.workers.values() if ws.resources.get(resource)]
+    free = {
+        ws.address: int(ws.resources[resource] - ws.used_resources.get(resource, 0))
+        for ws in members
+        if ws.status.name == "running"
+    }
+    running = []
+    for key in keys:
+        task = dask_scheduler.tasks.get(key)
+        if task is not None and task.processing_on and task in task.processing_on.long_running:
+            running.append(key)
+    return free, [ws.address for ws in members], running

@@ -1,0 +1,39 @@
+from __future__ import annotations
+
+import time
+
+from distributed import Event, secede
+
+from poolpart import Pool, look_at_slots
+
+
+def hold(name):
+    """A long-running task: frees its thread, keeps its slot."""
+    secede()
+    Event(name).wait(30)
+
+
+def test_slots_that_long_tasks_hold_are_not_free(client):
+    partition = Pool.from_client(client).partitions()["A"]
+    one, two = (worker.address for worker in partition.workers)
+    assert look_at_slots(client, "A").free == {one: 2, two: 2}
+    done = Event("slots-done", client=client)
+    futures = [partition.submit(hold, "slots-done", worker=one) for _ in range(3)]
+    keys = [future.key for future in futures]
+    try:
+        deadline = time.monotonic() + 10
+        while len((slots := look_at_slots(client, "A", keys)).running) < 2:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        assert slots.free == {one: -1, two: 2}
+        assert slots.present == {one, two}
+        assert slots.running < set(keys)
+    finally:
+        done.set()
+    client.gather(futures)
+    assert look_at_slots(client, "A", keys).running == frozenset()
+
+
+def test_a_partition_that_is_not_there_has_no_slots(client):
+    slots = look_at_slots(client, "C", ["no-such-key"])
+    assert (slots.free, slots.present, slots.running) == ({}, frozenset(), frozenset())
