@@ -6,6 +6,7 @@ import logging
 import multiprocessing
 import os
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 from distributed import Nanny, Scheduler, SpecCluster
@@ -88,22 +89,7 @@ def local_cluster(
     _check_count("gpu_workers", counts["GPU"])
     _check_count("other_workers", counts["OTHER"])
     _check_count("lidar_slots", lidar_slots)
-    # One thread for each worker's numerical libraries: the processes share the cores.
-    env = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-    env |= environment or {}
-
-    def spec(partition: str, slots: int) -> dict[str, Any]:
-        options = {
-            "nthreads": slots,
-            "resources": {partition: slots},
-            "host": host,
-            "dashboard": False,
-            "memory_limit": "auto",
-            "env": env,
-            "silence_logs": logging.ERROR,
-        }
-        return {"cls": Nanny, "options": options}
-
+    spec = partial(_worker_spec, host, environment or {})
     workers = {f"GPU-{i}": spec("GPU", 1) for i in range(counts["GPU"])}
     workers |= {"LIDAR-0": spec("LIDAR", lidar_slots)}
     workers |= {f"OTHER-{i}": spec("OTHER", 1) for i in range(counts["OTHER"])}
@@ -124,6 +110,24 @@ def local_cluster(
             f"The workers did not start ({error.__cause__ or error}). Each imports the script "
             "that starts the cluster: do that under `if __name__ == '__main__':` in it."
         ) from error
+
+
+def _worker_spec(
+    host: str, environment: Mapping[str, str], partition: str, slots: int
+) -> dict[str, Any]:
+    """Describe a worker of a partition as SpecCluster wants it."""
+    # One thread for each worker's numerical libraries: the processes share the cores.
+    env = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+    options = {
+        "nthreads": slots,
+        "resources": {partition: slots},
+        "host": host,
+        "dashboard": False,
+        "memory_limit": "auto",
+        "env": {**env, **environment},
+        "silence_logs": logging.ERROR,
+    }
+    return {"cls": Nanny, "options": options}
 
 
 class _NannyCluster(SpecCluster):

@@ -166,6 +166,7 @@ class _Run:
         on_frame: Callable[[Frame], None] | None,
         on_progress: Callable[[Progress], None] | None,
     ) -> Result:
+        """Run to the end; whatever is raised, everything has been stopped by then."""
         started = time.monotonic()
 
         def take(frame: Frame) -> None:

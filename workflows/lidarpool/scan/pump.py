@@ -42,7 +42,7 @@ DELIVERY_CAPACITY = 16  # messages of at most `stages.DELIVERY_BYTES` on their w
 class _UnderWay:
     """One batch between stage 1 and its arrival."""
 
-    scans: range | list[int]
+    scans: list[int]
     batch: Future
     frames: Future
     handed_on: set[str] = field(default_factory=set)  # stages whose pipe it was put into
@@ -173,8 +173,8 @@ class SurveyPump:
     def finished(self) -> bool:
         """Whether, after that, the stages have ended, or a moment has gone by.
 
-        One whose worker died in the last moment is run again by Dask; nobody needs that any
-        more, or waits for it long.
+        A stage whose worker died in the last moment has nothing left to do, and is not waited
+        for.
         """
         if self._closed_at is None:
             return False

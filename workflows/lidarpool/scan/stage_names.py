@@ -6,5 +6,3 @@ GENERATE = "generate"  # 1, on LIDAR: one long task
 INTERSECT = "intersect"  # 2, on GPU: a short task an item
 SORT = "sort"  # 3, on LIDAR: one long task
 COLLECT = "collect"  # 4, on LIDAR: two long tasks
-
-PARTITION_OF = {GENERATE: LIDAR, INTERSECT: GPU, SORT: LIDAR, COLLECT: LIDAR}
