@@ -30,6 +30,7 @@ class Theme:
     line: str
     ink: str
     muted: str
+    clay: str
     unseen: str
     sensor: str
     ray: str
@@ -46,6 +47,7 @@ LIGHT = Theme(
     line="#c3cad3",
     ink="#1c2430",
     muted="#5d6876",
+    clay="#d9dde2",
     unseen="#c9ccd1",
     sensor="#e0182d",
     ray="#e0182d",
@@ -56,6 +58,7 @@ DARK = Theme(
     line="#3a4655",
     ink="#e8edf3",
     muted="#9aa7b5",
+    clay="#4a545f",
     unseen="#59616b",
     sensor="#ff4d5e",
     ray="#ff6b78",
