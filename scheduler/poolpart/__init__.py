@@ -11,6 +11,7 @@ from .pipe_parts import forget_pipes
 from .placement import Recorder, TaskRecord, placement_violations, recorded
 from .pool import Pool
 from .slots import Slots, look_at_slots
+from .tracing import trace, trace_to
 from .worker_info import WorkerInfo, assign_devices
 
 __all__ = [
@@ -33,4 +34,6 @@ __all__ = [
     "look_at_slots",
     "placement_violations",
     "recorded",
+    "trace",
+    "trace_to",
 ]
