@@ -9,7 +9,7 @@ from lidarpool import Frame, Pose, ScanSpec, Sensor
 from lidarpool.scan import stages
 from lidarpool.scan.builder import CloudBuilder
 from lidarpool.scan.casting import _same_pose
-from lidarpool.scan.messages import HIT, POINT, Delivery, FrameRun, Part
+from lidarpool.scan.messages import HIT, POINT, Attempt, Delivery, FrameRun, Part
 from lidarpool.scan.setup import ray_directions
 from poolpart import TaskRecord
 
@@ -104,9 +104,10 @@ class TestSamePose:
 
 class TestMessages:
     def test_deliveries_travel_as_bytes(self):
-        delivery = Delivery("collect", part(3, 4))
+        delivery = Delivery(Attempt("1f3a", "collect-1", 7), part(3, 4))
         back = Delivery.from_wire(delivery.wire())
-        assert back.stage == "collect"
+        assert back.attempt == delivery.attempt
+        assert back.attempt.stage == "collect"
         assert back.content.scans == (3, 4)
         assert np.array_equal(back.content.points, delivery.content.points)
 

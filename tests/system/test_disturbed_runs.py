@@ -78,7 +78,7 @@ def test_a_failing_task_ends_the_run_with_stage_and_scan(client, monkeypatch):
     assert scheduler_state(client) == before
 
 
-def failing_intersect(setup, wire):
+def failing_intersect(setup, wire, run):
     raise ValueError("the lens is dirty")
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from poolpart import Recorder, TaskRecord
+from poolpart import Recorder, TaskRecord, trace
 from raybeam import Returns
 
 from ..survey import Pose, ScanSpec
@@ -19,7 +19,7 @@ from .stage_names import GPU, INTERSECT
 SAMPLES_PER_SCAN = 4  # rays of each scan that are shown in pictures
 
 
-def intersect(setup: SurveySetup, wire: Sequence[Sequence[float]]) -> Batch:
+def intersect(setup: SurveySetup, wire: Sequence[Sequence[float]], run: str = "") -> Batch:
     """Cast the rays of some scans; runs on a GPU worker.
 
     Parameters
@@ -28,6 +28,8 @@ def intersect(setup: SurveySetup, wire: Sequence[Sequence[float]]) -> Batch:
         Scene and sensor.
     wire
         The scans, as `ScanSpec.wire` describes them.
+    run
+        Id of the survey, for traces.
 
     Raises
     ------
@@ -36,6 +38,8 @@ def intersect(setup: SurveySetup, wire: Sequence[Sequence[float]]) -> Batch:
     """
     recorder = Recorder(INTERSECT, GPU)
     specs = tuple(ScanSpec.from_wire(numbers) for numbers in wire)
+    scans = [spec.scan for spec in specs]
+    trace("intersect.start", run=run, stage=INTERSECT, scans=scans)
     frames: list[Frame] = []
     tables: list[NDArray[np.void]] = []
     for pose, group in _same_pose(specs):
@@ -47,13 +51,16 @@ def intersect(setup: SurveySetup, wire: Sequence[Sequence[float]]) -> Batch:
             table["ray"], table["distance"] = part.ray, part.distance
             table["object"] = setup.scene.face_object[part.triangle]
             tables.append(table)
-    return Batch(
+    trace("intersect.cast", run=run, stage=INTERSECT, scans=scans)
+    batch = Batch(
         scans=specs,
         hits=np.concatenate(tables),
         hit_counts=tuple(len(table) for table in tables),
         frames=tuple(frames),
         record=recorder.done(len(specs)),
     )
+    trace("intersect.end", run=run, stage=INTERSECT, scans=scans)
+    return batch
 
 
 def frames_of(batch: Batch) -> tuple[tuple[Frame, ...], TaskRecord]:

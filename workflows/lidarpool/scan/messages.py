@@ -79,13 +79,37 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Hello:
-    """A consumer stage has started, perhaps again on another worker with nothing in memory.
+class Attempt:
+    """One start of a long-running stage.
 
-    `number` tells several consumers of one stage apart.
+    Parameters
+    ----------
+    run
+        Id of the survey.
+    name
+        Name of the stage's task; of several that share a stage, "stage-number".
+    number
+        Tasks of long stages that the run had started before.
     """
 
+    run: str
+    name: str
     number: int
+
+    @property
+    def stage(self) -> str:
+        """Name of the stage."""
+        return self.name.partition("-")[0]
+
+    @property
+    def fields(self) -> dict[str, Any]:
+        """What a trace tells of it."""
+        return {"run": self.run, "stage": self.stage, "attempt": self.number}
+
+
+@dataclass(frozen=True)
+class Hello:
+    """A consumer stage has started, perhaps again on another worker with nothing in memory."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +124,7 @@ class FrameRun:
 class Delivery:
     """What stages 3 and 4 send to the driver."""
 
-    stage: str
+    attempt: Attempt
     content: Hello | FrameRun | Part
 
     def wire(self) -> bytes:

@@ -18,13 +18,22 @@ from typing import Any
 
 from distributed import Client, Future
 
-from poolpart import Ledger, Partition, Pipe, PipeFailed, TaskRecord, fetch_available, forget_pipes
+from poolpart import (
+    Ledger,
+    Partition,
+    Pipe,
+    PipeFailed,
+    TaskRecord,
+    fetch_available,
+    forget_pipes,
+    trace,
+)
 
 from ..errors import LidarpoolError
 from ..survey import Survey
 from .builder import CloudBuilder
 from .casting import frames_of, intersect
-from .messages import Delivery, Frame, FrameRun, Hello
+from .messages import Attempt, Delivery, Frame, FrameRun, Hello, Part
 from .setup import SurveySetup
 from .stage_names import COLLECT, GENERATE, GPU, INTERSECT, LIDAR, SORT
 from .stage_tasks import Command, StageTasks, was_killed
@@ -99,7 +108,7 @@ class SurveyPump:
         )
         self._under_way: list[_UnderWay] = []
         self._recorded: set[TaskRecord] = set()
-        self._greeted: set[tuple[str, int]] = set()  # consumers that have started, once or more
+        self._greeted: set[str] = set()  # consumers that have started, once or more
         self._collectors = collectors
         self._moved_at = time.monotonic()  # when something was last handed on or delivered
         self._closed_at: float | None = None  # when all had arrived and the pipes were closed
@@ -134,13 +143,24 @@ class SurveyPump:
         survey, out = self.survey, self._deliveries
         cloud = (survey.sensor, survey.keep_every, survey.precision_m)
 
-        def collector(number: int) -> Command:
-            return lambda: (collect, (number, *cloud, self._inlets[COLLECT], out))
+        def attempt(name: str, number: int) -> Attempt:
+            return Attempt(self.run_id, name, number)
 
-        commands: dict[str, Command] = {
-            GENERATE: lambda: (generate, (survey, self._scans, self.generated.first_missing)),
-            SORT: lambda: (sort_frames, (self._inlets[SORT], out)),
-        }
+        def generator(number: int) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+            first = self.generated.first_missing
+            return generate, (attempt(GENERATE, number), survey, self._scans, first)
+
+        def sorter(number: int) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+            return sort_frames, (attempt(SORT, number), self._inlets[SORT], out)
+
+        def collector(which: int) -> Command:
+            name = f"{COLLECT}-{which}"
+            return lambda number: (
+                collect,
+                (attempt(name, number), *cloud, self._inlets[COLLECT], out),
+            )
+
+        commands: dict[str, Command] = {GENERATE: generator, SORT: sorter}
         commands |= {f"{COLLECT}-{number}": collector(number) for number in range(self._collectors)}
         return commands
 
@@ -229,16 +249,26 @@ class SurveyPump:
         items = self._scans.poll()
         for item in items:
             # A generator that was run again describes scans again.
-            wire = [numbers for numbers in item if self.generated.accept(int(numbers[0]))]
+            wire, known = [], []
+            for numbers in item:
+                scan = int(numbers[0])
+                if self.generated.accept(scan):
+                    wire.append(numbers)
+                else:
+                    known.append(scan)
+            self._trace("take", GENERATE, [int(numbers[0]) for numbers in wire])
+            self._trace_duplicates(GENERATE, known)
             if wire:
                 self._submit(wire)
         return bool(items)
 
     def _submit(self, wire: Sequence[Sequence[float]]) -> None:
         gpu, first = self.partitions[GPU], int(wire[0][0])
-        batch = gpu.submit(intersect, self._setup, wire, key=self._key(INTERSECT, first))
+        key = self._key(INTERSECT, first)
+        batch = gpu.submit(intersect, self._setup, wire, self.run_id, key=key)
         frames = gpu.submit(frames_of, batch, key=self._key("frames", first), priority=1)
         scans = [int(numbers[0]) for numbers in wire]
+        self._trace("submit", INTERSECT, scans)
         self._under_way.append(_UnderWay(scans, batch, frames))
 
     def _hand_on(self) -> bool:
@@ -262,7 +292,15 @@ class SurveyPump:
         inlet.put({"base": self.frames.first_missing, "keys": keys}, timeout_s=STALL_SECONDS)
         for item in items:
             item.handed_on.add(stage)
+            self._trace("handon", stage, item.scans)
         self._moved_at = time.monotonic()
+
+    def _trace(self, event: str, stage: str, scans: Sequence[int]) -> None:
+        trace(f"driver.{event}", run=self.run_id, stage=stage, scans=list(scans))
+
+    def _trace_duplicates(self, stage: str, scans: Sequence[int]) -> None:
+        if scans:
+            self._trace("duplicate", stage, scans)
 
     # -- what arrives ------------------------------------------------------------------
 
@@ -272,11 +310,11 @@ class SurveyPump:
             delivery = Delivery.from_wire(data)
             content = delivery.content
             if isinstance(content, Hello):
-                self._greet(delivery.stage, content.number)
+                self._greet(delivery.attempt)
             elif isinstance(content, FrameRun):
                 self._take_frames(content)
             else:
-                self.cloud.add(content)
+                self._take_points(content)
         if deliveries:
             self._moved_at = time.monotonic()
             self._release_arrived()
@@ -286,12 +324,21 @@ class SurveyPump:
         self._record(run.records)
         for frame in run.frames:
             if self.frames.accept(frame.scan):
+                self._trace("frame", SORT, [frame.scan])
                 self.on_frame(frame)
+            else:
+                self._trace_duplicates(SORT, [frame.scan])
         if run.records:
             last = run.records[-1]
             per_scan = max(last.seconds, 1e-6) / last.items
             wished = min(int(BATCH_SECONDS / per_scan), 2 * last.items, self._batch_most)
             self._scans.advise(max(1, wished))
+
+    def _take_points(self, part: Part) -> None:
+        new = self.cloud.add(part)
+        self._trace("points", COLLECT, new)
+        if len(new) < len(part.scans):
+            self._trace_duplicates(COLLECT, sorted(set(part.scans) - set(new)))
 
     def _record(self, records: Iterable[TaskRecord]) -> None:
         """Keep records that are new: a batch that was fetched twice brings its own twice."""
@@ -309,21 +356,24 @@ class SurveyPump:
                 item.waiting_for.discard(COLLECT)
             if item.waiting_for:
                 still.append(item)
+            else:
+                self._trace("release", "", item.scans)
         self._under_way = still
 
     # -- sending again -----------------------------------------------------------------
 
-    def _greet(self, stage: str, number: int) -> None:
+    def _greet(self, attempt: Attempt) -> None:
         """Note that a consumer has started; the second time means that it had died meanwhile."""
-        if (stage, number) in self._greeted:
-            self._send_again(stage)
-        self._greeted.add((stage, number))
+        if attempt.name in self._greeted:
+            self._send_again(attempt.stage)
+        self._greeted.add(attempt.name)
 
     def _send_again(self, stage: str) -> None:
         lost = [i for i in self._under_way if stage in i.handed_on and stage in i.waiting_for]
         lost = [item for item in lost if _result_of(item, stage).status == "finished"]
         if lost:
             self.replayed += len(lost)
+            self._trace("replay", stage, [scan for item in lost for scan in item.scans])
             self._put(stage, self._inlets[stage], lost)
 
     # -- the end -----------------------------------------------------------------------

@@ -21,8 +21,8 @@ LOOK_EVERY_S = 0.5
 SETTLE_S = 2.0  # for a task that was just submitted to start
 DEATHS_MOST = 5  # of one stage with nothing delivered in between
 
-# Makes what a stage is to do: a function and its arguments.
-Command = Callable[[], tuple[Callable[..., Any], tuple[Any, ...]]]
+# Makes what a stage is to do, from the attempt's number: a function and its arguments.
+Command = Callable[[int], tuple[Callable[..., Any], tuple[Any, ...]]]
 
 
 @dataclass(eq=False)
@@ -170,8 +170,8 @@ class StageTasks:
             )
         worker = max(free, key=lambda address: (free[address], address))
         free[worker] -= 1
-        function, arguments = self._commands[name]()
         number, self._submitted = self._submitted, self._submitted + 1
+        function, arguments = self._commands[name](number)
         earlier = self._tasks.get(name)
         future = self.partition.submit(
             function, *arguments, key=f"{self._key(name)}-{number}", worker=worker

@@ -23,12 +23,13 @@ from poolpart import (
     Recorder,
     TaskRecord,
     fetch_available,
+    trace,
 )
 
 from ..sensor import Sensor
 from ..survey import ScanSpec, Survey
 from .failures import naming_scans
-from .messages import POINT, Batch, Delivery, Frame, FrameRun, Hello, Part
+from .messages import POINT, Attempt, Batch, Delivery, Frame, FrameRun, Hello, Part
 from .setup import ray_directions
 from .stage_names import COLLECT, GENERATE, LIDAR, SORT
 
@@ -36,17 +37,20 @@ DELIVERY_BYTES = 4 << 20  # of points or frames in one message through the sched
 GIVE_UP_S = 120.0  # asking for a result; the driver sends what does not arrive again
 
 
-def generate(survey: Survey, outlet: Pipe, first: int = 0) -> TaskRecord:
+def generate(attempt: Attempt, survey: Survey, outlet: Pipe, first: int = 0) -> TaskRecord:
     """Stage 1: describe every scan from `first` on, as many in one item as is advised."""
     secede()
     recorder = Recorder(GENERATE, LIDAR)
     sent = first
+    trace("generate.start", **attempt.fields, first=first, scans=[])
     try:
         while sent < survey.scan_count:
             stop = min(sent + outlet.advice, survey.scan_count)
             with naming_scans(sent, stop - 1):
                 item = [survey.scan(index).wire() for index in range(sent, stop)]
+            trace("generate.put", **attempt.fields, scans=list(range(sent, stop)))
             outlet.put(item)
+            trace("generate.sent", **attempt.fields, scans=list(range(sent, stop)))
             sent = stop
         outlet.close()
     except PipeFailed:
@@ -56,7 +60,7 @@ def generate(survey: Survey, outlet: Pipe, first: int = 0) -> TaskRecord:
     return recorder.done(sent - first)
 
 
-def sort_frames(inlet: Pipe, outlet: Pipe) -> TaskRecord:
+def sort_frames(attempt: Attempt, inlet: Pipe, outlet: Pipe) -> TaskRecord:
     """Stage 3: put frames back into scan order.
 
     The driver has only so many scans under way, which bounds the frames waiting here.
@@ -66,8 +70,10 @@ def sort_frames(inlet: Pipe, outlet: Pipe) -> TaskRecord:
     waiting: dict[int, Frame] = {}  # {scan: frame that came before its turn}
     following = 0  # the scan whose turn it is
     try:
-        outlet.put(Delivery(SORT, Hello(0)).wire())
+        trace("sort.hello", **attempt.fields, scans=[])
+        outlet.put(Delivery(attempt, Hello()).wire())
         for base, results in _arrivals(inlet):
+            trace("sort.get", **attempt.fields, scans=_scans_of_frames(results))
             # Everything before `base` has reached the driver: a sorter that was started again
             # with an empty memory must not wait for it.
             following = max(following, base)
@@ -84,23 +90,33 @@ def sort_frames(inlet: Pipe, outlet: Pipe) -> TaskRecord:
             with naming_scans(following - len(ready), following - 1):
                 runs = list(_frame_runs(ready, records))
             for run in runs:
-                outlet.put(Delivery(SORT, run).wire())
+                scans = [frame.scan for frame in run.frames]
+                trace("sort.put", **attempt.fields, scans=scans)
+                outlet.put(Delivery(attempt, run).wire())
+                trace("sort.sent", **attempt.fields, scans=scans)
     except (PipeClosed, PipeFailed):
         pass
     return recorder.done(following)
 
 
 def collect(
-    number: int, sensor: Sensor, keep_every: int, precision_m: float, inlet: Pipe, outlet: Pipe
+    attempt: Attempt,
+    sensor: Sensor,
+    keep_every: int,
+    precision_m: float,
+    inlet: Pipe,
+    outlet: Pipe,
 ) -> TaskRecord:
     """Stage 4: thin out the hits of each scan, turn them into points, gather and deliver."""
     secede()
     recorder = Recorder(COLLECT, LIDAR)
     scans = 0
     try:
-        outlet.put(Delivery(COLLECT, Hello(number)).wire())
+        trace("collect.hello", **attempt.fields, scans=[])
+        outlet.put(Delivery(attempt, Hello()).wire())
         for _, results in _arrivals(inlet):
             batches: list[Batch] = results
+            trace("collect.get", **attempt.fields, scans=_scans_of_batches(batches))
             tables = []
             for spec, hits in chain.from_iterable(map(_hits_by_scan, batches)):
                 with naming_scans(spec.scan):
@@ -108,7 +124,9 @@ def collect(
                 tables.append((spec.scan, points))
             scans += len(tables)
             for part in _parts(tables):
-                outlet.put(Delivery(COLLECT, part).wire())
+                trace("collect.part", **attempt.fields, scans=list(part.scans))
+                outlet.put(Delivery(attempt, part).wire())
+                trace("collect.sent", **attempt.fields, scans=list(part.scans))
     except (PipeClosed, PipeFailed):
         pass
     return recorder.done(scans)
@@ -148,6 +166,14 @@ def _arrivals(inlet: Pipe) -> Iterator[tuple[int, list[Any]]]:
         if results or not missing:
             pause.reset()
         yield max((item["base"] for item in items), default=0), list(results.values())
+
+
+def _scans_of_frames(results: Sequence[tuple[Sequence[Frame], TaskRecord]]) -> list[int]:
+    return [frame.scan for frames, _ in results for frame in frames]
+
+
+def _scans_of_batches(batches: Sequence[Batch]) -> list[int]:
+    return [spec.scan for batch in batches for spec in batch.scans]
 
 
 def _hits_by_scan(batch: Batch) -> Iterator[tuple[ScanSpec, np.ndarray]]:
