@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import math
 import sys
 from collections.abc import Iterator
@@ -12,17 +11,17 @@ from typing import NoReturn
 
 import click
 from distributed import Client
-from distributed.comm import connect
 
-from poolpart import Pool, PoolError, local_cluster
+from poolpart import Pool, PoolError
 from poolpart.probe import visible_gpus
 from raybeam import available_backends
 
 from ._version import __version__
 from .checks import check_backend_here, check_backend_name, check_precision
 from .complaints import did_you_mean
+from .connection import connected, local_client
 from .errors import LidarpoolError
-from .interrupts import INTERRUPTED, children_spared, deferred_interrupts, interrupt_on_signals
+from .interrupts import INTERRUPTED, interrupt_on_signals
 from .quiet import QuietWorkers, silence_logs
 from .report import versions
 from .result import Result
@@ -32,8 +31,6 @@ from .scene_commands import scene
 from .simulate import simulate
 from .survey import Survey
 from .terminal import shown_progress, shown_status
-
-CONNECT_TIMEOUT_S = 10
 
 _out = click.option(
     "--out",
@@ -132,9 +129,7 @@ def _run(
     pool = scenario.pool
     with result_folder(out):
         with (
-            _local_client(scenario, quiet)
-            if scheduler is None
-            else _connected(scheduler) as client,
+            _local_client(scenario, quiet) if scheduler is None else connected(scheduler) as client,
             shown_progress(quiet) as show,
         ):
             result = simulate(
@@ -188,7 +183,7 @@ def info(scheduler: str | None) -> None:
     """  # noqa: D301 - click wants the character, not its name
     pool = None
     if scheduler is not None:
-        with _connected(scheduler) as client:
+        with connected(scheduler) as client:
             pool = Pool.from_client(client)
     for name, number in versions().items():
         click.echo(f"{name:<14} {number}")
@@ -212,44 +207,17 @@ def _tell_workers(pool: Pool) -> None:
 
 
 @contextmanager
-def _connected(scheduler: str) -> Iterator[Client]:
-    """Client of a cluster that is running already."""
-    try:
-        asyncio.run(asyncio.wait_for(_knock(scheduler), CONNECT_TIMEOUT_S))
-        client = Client(scheduler, timeout=CONNECT_TIMEOUT_S, set_as_default=False)
-    except Exception as error:
-        # What is there may be no scheduler, and what it answers may make any error.
-        raise LidarpoolError(
-            f"No Dask scheduler answers at {scheduler!r} ({type(error).__name__}): start one with "
-            "dask scheduler, and give its address as tcp://host:8786."
-        ) from error
-    with client:
-        yield client
-
-
-async def _knock(address: str) -> None:
-    """See whether a scheduler answers; a client waits for ever for one that says nothing."""
-    comm = await connect(address, timeout=CONNECT_TIMEOUT_S)
-    comm.abort()
-
-
-@contextmanager
 def _local_client(scenario: Scenario, quiet: bool) -> Iterator[Client]:
-    """Client of a cluster on this machine that lasts as long as the body."""
+    """Client of a cluster on this machine whose workers say nothing of their own."""
     with ExitStack() as stack:
-        # Half a cluster cannot be stopped in good order: an interrupt has to wait until it is up.
-        with (
-            shown_status("starting the workers", quiet),
-            deferred_interrupts(),
-            children_spared(),
-        ):
-            cluster = local_cluster(
-                gpu_workers=scenario.pool.gpu,
-                lidar_slots=2 + scenario.pool.collectors,
-                other_workers=scenario.pool.other,
+        with shown_status("starting the workers", quiet):
+            client = stack.enter_context(
+                local_client(
+                    gpu_workers=scenario.pool.gpu,
+                    collectors=scenario.pool.collectors,
+                    other_workers=scenario.pool.other,
+                )
             )
-            stack.callback(cluster.close)
-            client = stack.enter_context(Client(cluster, set_as_default=False))
             client.register_plugin(QuietWorkers())
         yield client
 

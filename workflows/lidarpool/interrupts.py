@@ -17,18 +17,24 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)  # from the keyboard, and from a job 
 _IMPATIENT_S = 1.0  # a second signal sooner than this is the first one's twin
 
 
-def interrupt_on_signals() -> None:
-    """Turn SIGINT and SIGTERM into KeyboardInterrupt; a second one ends the process at once."""
-    first: list[float] = []
+class _Interrupt:
+    """A signal handler: KeyboardInterrupt the first time, the end of the process the next."""
 
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        if not first:
-            first.append(time.monotonic())
+    def __init__(self) -> None:
+        self.first_at: float | None = None
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        if self.first_at is None:
+            self.first_at = time.monotonic()
             raise KeyboardInterrupt
-        if time.monotonic() - first[0] > _IMPATIENT_S:
+        if time.monotonic() - self.first_at > _IMPATIENT_S:
             os.write(2, b"lidarpool: stopped at once; workers of this machine end by themselves.\n")
             os._exit(INTERRUPTED)
 
+
+def interrupt_on_signals() -> None:
+    """Turn SIGINT and SIGTERM into KeyboardInterrupt; a second one ends the process at once."""
+    interrupt = _Interrupt()
     for number in _SIGNALS:
         signal.signal(number, interrupt)
 
@@ -37,19 +43,24 @@ def interrupt_on_signals() -> None:
 def deferred_interrupts() -> Iterator[None]:
     """Hold signals back while the body runs, then raise KeyboardInterrupt if there was one.
 
-    For what must be done whole or not at all: starting processes, moving a result into place.
-    Only the main thread of a program gets signals; elsewhere this does nothing.
+    For what must be done whole or not at all: starting processes, stopping them, moving a
+    result into place. Only the main thread of a program gets signals; elsewhere this does
+    nothing. A second signal to a program that was interrupted by a first is not held back.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     seen: list[int] = []
-    before = {n: signal.signal(n, lambda number, _: seen.append(number)) for n in _SIGNALS}
+    before = {n: signal.getsignal(n) for n in _SIGNALS}
+    # What raises nothing any more cannot break the body, and somebody is impatient.
+    held = [n for n in before if getattr(before[n], "first_at", None) is None]
+    for number in held:
+        signal.signal(number, lambda number, _: seen.append(number))
     try:
         yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for number in held:
+            signal.signal(number, before[number])
         if seen:
             signal.raise_signal(seen[0])
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import nullcontext, suppress
 from typing import TypeVar
 
 import numpy as np
@@ -20,10 +20,10 @@ from poolpart import (
     PipeFailed,
     PoolError,
     assign_devices,
-    local_cluster,
 )
 
 from .checks import check_backend_here, check_counts, check_precision, common_backend, survey_pool
+from .connection import local_client
 from .errors import LidarpoolError
 from .plan import Planning
 from .progress import Progress
@@ -109,25 +109,13 @@ def simulate(
     )
     if client is None:
         check_backend_here(backend)
-    with _cluster(client, collectors, gpu_workers, other_workers) as client:
+    with (
+        local_client(gpu_workers=gpu_workers, collectors=collectors, other_workers=other_workers)
+        if client is None
+        else nullcontext(client) as client
+    ):
         run = _Run(client, scene, survey, planning, backend, queue_capacity, collectors)
         return run.drive(on_frame, on_progress)
-
-
-@contextmanager
-def _cluster(
-    client: Client | None, collectors: int, gpu_workers: int | None, other_workers: int | None
-) -> Iterator[Client]:
-    if client is not None:
-        yield client
-        return
-    with (
-        local_cluster(
-            gpu_workers=gpu_workers, lidar_slots=2 + collectors, other_workers=other_workers
-        ) as cluster,
-        Client(cluster) as own,
-    ):
-        yield own
 
 
 class _Run:
