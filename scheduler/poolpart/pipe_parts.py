@@ -8,13 +8,13 @@ moment; and a write after the pipe was deleted would bring half of it back.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 from distributed import Client, Queue
 
-from .errors import PoolError
+from .remote import on_scheduler
 
 _LATE_WORD_S = 2.0  # clients send such words every few milliseconds
 
@@ -42,28 +42,18 @@ class AttachedQueue(Queue):
 
 def open_pipe(client: Client, name: str) -> bool:
     """Make both parts; False if there is a pipe of that name."""
-    return bool(_on_scheduler(client, _open, name=name, state=asdict(PipeState())))
+    return bool(on_scheduler(client, _open, name=name, state=asdict(PipeState())))
 
 
 def change_pipe(client: Client, name: str, **changes: Any) -> PipeState | None:
     """Change fields of the state; returns what it is now, or None if there is no such pipe."""
-    state = _on_scheduler(client, _change, name=name, changes=changes)
+    state = on_scheduler(client, _change, name=name, changes=changes)
     return None if state is None else PipeState(**state)
 
 
 def forget_pipes(client: Client, names: Sequence[str]) -> None:
     """Remove these pipes from the scheduler, with what is in them; those unknown are skipped."""
-    _on_scheduler(client, _forget, names=list(names))
-
-
-def _on_scheduler(client: Client, function: Callable[..., Any], **kwargs: Any) -> Any:
-    try:
-        return client.run_on_scheduler(function, **kwargs)
-    except ModuleNotFoundError as error:
-        raise PoolError(
-            f"The scheduler at {client.scheduler.address} has no module {error.name!r}: start "
-            "it in the environment that is used here."
-        ) from error
+    on_scheduler(client, _forget, names=list(names))
 
 
 async def _open(name: str, state: dict[str, Any], dask_scheduler: Any = None) -> bool:

@@ -1,0 +1,301 @@
+"""The scheduler's side of fences.
+
+A fence is a rule that is asked whenever the scheduler decides where a task goes: the methods
+that decide are overridden on the running scheduler, and nothing is written on tasks or
+workers. Two ways that need no overriding were tried, on two workers, one of them fenced:
+
+- *A resource that all workers outside declare, put on every task without one
+  (`update_graph`).* The scheduler marks each such task, workers must hold enough of the
+  resource, declare it again after a restart and take part in its accounting; and tasks that
+  were there before, or that are given `workers=`, need care of their own.
+- *`worker_restrictions` that name the workers outside, one set that all tasks share.* An
+  empty set means "no restriction", user-given restrictions must be merged and put back.
+
+Both make every task a restricted one, and Dask holds no restricted tasks back: of 200 root
+tasks all 200 were given to the open worker at once, whose memory then holds all their results,
+where without restrictions 2 are given and 198 stay in the scheduler's queue. With the rule of
+this module it is 2 and 198.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import pickle
+import time
+from collections.abc import Callable, Iterable
+from functools import partial
+from typing import Any
+
+import distributed
+from distributed.core import Status
+from distributed.diagnostics.plugin import SchedulerPlugin
+from distributed.scheduler import WorkerState
+from distributed.shuffle._core import barrier_key
+
+from .errors import PoolError
+
+logger = logging.getLogger(__name__)
+
+NAME = "poolpart-fences"
+COMPLAIN_EVERY_S = 10.0
+_SETTLE_S = 5.0  # longest wait for workers to give up tasks that they have not started
+_DECIDING = (
+    "valid_workers",
+    "decide_worker_non_rootish",
+    "decide_worker_rootish_queuing_disabled",
+    "add_resources",
+)
+
+
+async def raise_(scheduler: Any, name: str) -> None:
+    """Raise a fence, and wait a moment for tasks to leave."""
+    fences: Fences | None = scheduler.plugins.get(NAME)
+    if fences is None:
+        fences = Fences(scheduler)
+        fences.install()
+    fences.names.add(name)
+    fences.look_again()
+    await fences.settle()
+
+
+def lower(scheduler: Any, name: str) -> None:
+    """Lower a fence; the last one takes the rule with it."""
+    fences: Fences | None = scheduler.plugins.get(NAME)
+    if fences is None or name not in fences.names:
+        return
+    fences.names.discard(name)
+    if not fences.names:
+        fences.uninstall()
+    fences.look_again()
+
+
+def fences_of(scheduler: Any) -> frozenset[str]:
+    """Names of the fences that are raised."""
+    fences: Fences | None = scheduler.plugins.get(NAME)
+    return frozenset(fences.names) if fences else frozenset()
+
+
+def kept_out(scheduler: Any) -> int:
+    """Tasks that wait because only workers behind fences could take them."""
+    fences: Fences | None = scheduler.plugins.get(NAME)
+    if fences is None:
+        return 0
+    waiting = sum(1 for task in scheduler.unrunnable if fences.stop(task))
+    return waiting + (0 if fences.remainder else len(scheduler.queued))
+
+
+class Fences(SchedulerPlugin):
+    """The rule: a worker behind a fence takes tasks only that ask for the fence's resource."""
+
+    name = NAME
+
+    def __init__(self, scheduler: Any) -> None:
+        self.scheduler = scheduler
+        self.names: set[str] = set()
+        self.closed: set[Any] = set()  # states of the workers behind fences
+        self._overridden: list[tuple[Any, str]] = []
+        self._complained_at = float("-inf")
+
+    # -- coming and going --------------------------------------------------------------
+
+    def install(self) -> None:
+        """Override what decides.
+
+        Raises
+        ------
+        PoolError
+            If this version of Dask decides by other means.
+        """
+        scheduler, extensions = self.scheduler, self.scheduler.extensions
+        stealing, shuffle = extensions.get("stealing"), extensions.get("shuffle")
+        places = [(scheduler, method) for method in _DECIDING]
+        places += [(stealing, "_get_thief")] if stealing else []
+        places += [(shuffle, "_calculate_worker_for")] if shuffle else []
+        if lacking := [method for owner, method in places if not hasattr(owner, method)]:
+            raise PoolError(
+                f"distributed {distributed.__version__} has no {', '.join(lacking)}, which "
+                "exclusive partitions need; use the version that this package asks for."
+            )
+        for owner, method in places:
+            mine = getattr(self, f"_{method.lstrip('_')}")
+            setattr(owner, method, partial(mine, getattr(owner, method)))
+            self._overridden.append((owner, method))
+        scheduler.handlers["set_resources"] = scheduler.add_resources
+        scheduler.idle_task_count = _OpenWorkers(self.closed, scheduler.idle_task_count)
+        scheduler.add_plugin(self)
+
+    def uninstall(self) -> None:
+        """Take everything back."""
+        for owner, method in self._overridden:
+            delattr(owner, method)
+        self._overridden.clear()
+        self.scheduler.handlers["set_resources"] = self.scheduler.add_resources
+        self.scheduler.idle_task_count = set(self.scheduler.idle_task_count)
+        if stealing := self.scheduler.extensions.get("stealing"):
+            stealing.in_flight_tasks.pop(_departed(self.scheduler), None)
+        self.scheduler.remove_plugin(NAME)
+
+    # -- who is behind a fence ---------------------------------------------------------
+
+    @property
+    def remainder(self) -> set[Any]:
+        """Workers that all tasks may run on now."""
+        remainder: set[Any] = self.scheduler.running - self.closed
+        return remainder
+
+    def look_again(self) -> None:
+        """Find out which workers are behind fences."""
+        for worker in self.scheduler.workers.values():
+            self._look_at(worker)
+
+    def _look_at(self, worker: Any) -> None:
+        """Enclose a worker, or open it, by what it declares."""
+        declares = any(worker.resources.get(name) for name in self.names)
+        if declares:
+            self.closed.add(worker)
+            self.scheduler.idle_task_count.discard(worker)
+            self._turn_out(worker)
+        elif worker in self.closed:
+            self.closed.discard(worker)
+            self.scheduler.check_idle_saturated(worker)
+            if worker.status is Status.running:
+                stimulus = f"{NAME}-opened-{time.time()}"
+                self.scheduler.transitions(
+                    self.scheduler.bulk_schedule_unrunnable_after_adding_worker(worker), stimulus
+                )
+                self.scheduler.stimulus_queue_slots_maybe_opened(stimulus_id=stimulus)
+
+    def _turn_out(self, worker: Any) -> None:
+        """Ask a worker for tasks that it should not have.
+
+        By the protocol of work stealing: a worker gives up what it has not started, and the
+        scheduler decides anew, since the thief is one that has left.
+        """
+        if stealing := self.scheduler.extensions.get("stealing"):
+            for task in list(worker.processing - worker.long_running):
+                if self.stop(task) and not task.actor:
+                    stealing.move_task_request(task, worker, _departed(self.scheduler))
+
+    async def settle(self) -> None:
+        """Wait until workers behind fences have answered, those that answer."""
+        stealing = self.scheduler.extensions.get("stealing")
+        deadline = time.monotonic() + _SETTLE_S
+        while stealing and time.monotonic() < deadline:
+            moves = stealing.in_flight.values()
+            if not any(move["thief"] in self.closed or _is_departed(move) for move in moves):
+                # A thief's booty that was under way when the fence went up is turned out too.
+                self.look_again()
+                if not any(_is_departed(move) for move in stealing.in_flight.values()):
+                    return
+            await asyncio.sleep(0.005)
+
+    def remove_worker(self, scheduler: Any, worker: str, **kwargs: Any) -> None:
+        """Forget a worker that has left."""
+        self.closed.intersection_update(scheduler.workers.values())
+
+    # -- the rule ----------------------------------------------------------------------
+
+    def stop(self, task: Any) -> bool:
+        """Whether fences keep a task out: it asks for none of their resources."""
+        asked = task.resource_restrictions
+        return not asked or self.names.isdisjoint(asked)
+
+    def _add_resources(self, original: Callable[..., Any], worker: str, resources: Any) -> Any:
+        answer = original(worker, resources)
+        self._look_at(self.scheduler.workers[worker])
+        return answer
+
+    def _valid_workers(self, original: Callable[..., Any], task: Any) -> Any:
+        valid = original(task)
+        if not self.stop(task):
+            return valid
+        if valid is None:
+            return self.remainder
+        allowed = valid - self.closed
+        # Restrictions that are mere wishes; without this Dask would then take any worker.
+        return allowed or (self.remainder if task.loose_restrictions else allowed)
+
+    def _decide_worker_non_rootish(self, original: Callable[..., Any], task: Any) -> Any:
+        worker = original(task)
+        return None if worker in self.closed and self.stop(task) else worker
+
+    def _decide_worker_rootish_queuing_disabled(
+        self, original: Callable[..., Any], task: Any
+    ) -> Any:
+        return self.scheduler.decide_worker_non_rootish(task)
+
+    def _get_thief(
+        self, original: Callable[..., Any], scheduler: Any, task: Any, *args: Any, **kwargs: Any
+    ) -> Any:
+        thief = original(scheduler, task, *args, **kwargs)
+        return None if thief in self.closed and self.stop(task) else thief
+
+    def _calculate_worker_for(self, original: Callable[..., Any], spec: Any) -> Any:
+        """Have a shuffle choose the workers of its outputs among those that may take them."""
+        barrier = self.scheduler.tasks[barrier_key(spec.id)]
+        given = barrier.worker_restrictions
+        allowed = self.scheduler.valid_workers(barrier)
+        try:
+            if not given and allowed:
+                barrier.worker_restrictions = {worker.address for worker in allowed}
+            return original(spec)
+        finally:
+            barrier.worker_restrictions = given
+
+    # -- never silently ----------------------------------------------------------------
+
+    def transition(self, key: Any, start: str, finish: str, *args: Any, **kwargs: Any) -> None:
+        """Say so when a task waits because of fences."""
+        if finish not in ("no-worker", "queued") or (self.remainder and finish == "queued"):
+            return
+        now = time.monotonic()
+        task = self.scheduler.tasks[key]
+        if now - self._complained_at < COMPLAIN_EVERY_S or not self.stop(task):
+            return
+        # `valid_workers` as Dask has it: a task that nobody could take is not our affair.
+        valid = type(self.scheduler).valid_workers(self.scheduler, task)
+        if self.closed.isdisjoint(self.scheduler.running if valid is None else valid):
+            return
+        self._complained_at = now
+        fences = ", ".join(sorted(self.names))
+        complaint = (
+            f"Tasks wait, such as {key!r}: all workers that could take them are kept for "
+            f"exclusive partitions ({fences}). Start more workers, submit to a partition, or "
+            "make a partition that is not exclusive."
+        )
+        logger.warning(complaint)
+        self.scheduler.log_event("warn", {"message": pickle.dumps(complaint)})
+
+
+class _OpenWorkers(set[Any]):
+    """Workers with room for tasks from the queue, without those behind fences."""
+
+    def __init__(self, closed: set[Any], workers: Iterable[Any]) -> None:
+        super().__init__(workers)
+        self.difference_update(closed)
+        self._closed = closed
+
+    def add(self, worker: Any) -> None:
+        if worker not in self._closed:
+            super().add(worker)
+
+
+def _departed(scheduler: Any) -> Any:
+    """State of a worker that is not there; what is moved to it is scheduled anew."""
+    return WorkerState(
+        address="tcp://0.0.0.0:0",
+        status=Status.closed,
+        pid=0,
+        name=NAME,
+        nthreads=1,
+        memory_limit=0,
+        local_directory="",
+        nanny=None,
+        server_id=NAME,
+        scheduler=scheduler,
+    )
+
+
+def _is_departed(move: Any) -> bool:
+    return bool(move["thief"].server_id == NAME)
