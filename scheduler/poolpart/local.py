@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
-from distributed import Nanny, Scheduler, SpecCluster
+from distributed import Nanny, Scheduler, Security, SpecCluster
 
 from .errors import PoolError
 from .probe import visible_gpus
@@ -47,6 +47,7 @@ def local_cluster(
     host: str = LOOPBACK,
     dashboard_port: int | None = 0,
     environment: Mapping[str, str] | None = None,
+    security: Security | bool = False,
 ) -> SpecCluster:
     """Start a Dask cluster on this machine, divided into GPU, LIDAR and OTHER.
 
@@ -69,6 +70,10 @@ def local_cluster(
         Port of Dask's dashboard, 0 for any free one, None for none.
     environment
         Variables to set in the workers.
+    security
+        True encrypts what the processes say to each other, with a certificate that is made
+        for this cluster and kept in memory; nobody without it can connect. A
+        `distributed.Security` brings certificates of one's own. The dashboard stays http.
 
     Returns
     -------
@@ -78,7 +83,8 @@ def local_cluster(
     Raises
     ------
     PoolError
-        If a number is below 1, or the workers do not start.
+        If a number is below 1, the workers do not start, or a certificate is asked for and
+        the package cryptography is missing.
     """
     _refuse_in_import()
     defaults = default_workers(usable_cores(), len(visible_gpus()))
@@ -89,7 +95,8 @@ def local_cluster(
     _check_count("gpu_workers", counts["GPU"])
     _check_count("other_workers", counts["OTHER"])
     _check_count("lidar_slots", lidar_slots)
-    spec = partial(_worker_spec, host, environment or {})
+    security = _security(security)
+    spec = partial(_worker_spec, host, environment or {}, security)
     workers = {f"GPU-{i}": spec("GPU", 1) for i in range(counts["GPU"])}
     workers |= {"LIDAR-0": spec("LIDAR", lidar_slots)}
     workers |= {f"OTHER-{i}": spec("OTHER", 1) for i in range(counts["OTHER"])}
@@ -98,13 +105,16 @@ def local_cluster(
         "options": {
             "host": host,
             "port": 0,
+            "security": security,
             "dashboard": dashboard_port is not None,
             # Also without a dashboard there is an HTTP server, else on port 8787.
             "dashboard_address": f"{host}:{dashboard_port or 0}",
         },
     }
     try:
-        return _NannyCluster(workers=workers, scheduler=scheduler, silence_logs=logging.ERROR)
+        return _NannyCluster(
+            workers=workers, scheduler=scheduler, security=security, silence_logs=logging.ERROR
+        )
     except RuntimeError as error:
         raise PoolError(
             f"The workers did not start ({error.__cause__ or error}). Each imports the script "
@@ -112,8 +122,23 @@ def local_cluster(
         ) from error
 
 
+def _security(wanted: Security | bool) -> Security:
+    """Certificates to use: those given, new ones, or none but for Dask's configuration."""
+    if isinstance(wanted, Security):
+        return wanted
+    if not wanted:
+        return Security()
+    try:
+        return Security.temporary()
+    except ImportError as error:
+        raise PoolError(
+            "A certificate for the cluster cannot be made, the package cryptography is "
+            "missing: pip install cryptography, or start the cluster without encryption."
+        ) from error
+
+
 def _worker_spec(
-    host: str, environment: Mapping[str, str], partition: str, slots: int
+    host: str, environment: Mapping[str, str], security: Security, partition: str, slots: int
 ) -> dict[str, Any]:
     """Describe a worker of a partition as SpecCluster wants it."""
     # One thread for each worker's numerical libraries: the processes share the cores.
@@ -122,6 +147,7 @@ def _worker_spec(
         "nthreads": slots,
         "resources": {partition: slots},
         "host": host,
+        "security": security,
         "dashboard": False,
         "memory_limit": "auto",
         "env": {**env, **environment},

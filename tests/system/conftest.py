@@ -55,8 +55,8 @@ def same_cloud() -> Callable[[Cloud, Cloud], bool]:
 class OutsideCluster:
     """A scheduler and workers from the `dask` command line, each a process of its own."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, *options: str) -> None:
+        self.folder, self.options = folder, options  # of scheduler and workers
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
         file = folder / "scheduler.json"
         self._start(
@@ -68,7 +68,13 @@ class OutsideCluster:
     def _start(self, name: str, *arguments: str) -> None:
         log = (self.folder / f"{name}.log").open("wb")
         self.processes[name] = subprocess.Popen(
-            [Path(sys.executable).with_name("dask"), *arguments, "--host", "127.0.0.1"],
+            [
+                Path(sys.executable).with_name("dask"),
+                *arguments,
+                *self.options,
+                "--host",
+                "127.0.0.1",
+            ],
             stdout=log,
             stderr=log,
             env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
@@ -113,12 +119,12 @@ class OutsideCluster:
 @pytest.fixture(scope="module")
 def outside(
     tmp_path_factory: pytest.TempPathFactory,
-) -> Iterator[Callable[[], OutsideCluster]]:
+) -> Iterator[Callable[..., OutsideCluster]]:
     """Start clusters from the `dask` command line that end with the module."""
     clusters: list[OutsideCluster] = []
 
-    def start() -> OutsideCluster:
-        clusters.append(OutsideCluster(tmp_path_factory.mktemp("cluster")))
+    def start(*options: str) -> OutsideCluster:
+        clusters.append(OutsideCluster(tmp_path_factory.mktemp("cluster"), *options))
         return clusters[-1]
 
     yield start

@@ -17,7 +17,7 @@ import pytest
 import trimesh
 from distributed import Scheduler, SpecCluster, Worker
 
-import lidarpool.cli
+import lidarpool.connection
 from raybeam import available_backends
 
 BOX = trimesh.creation.box((2, 4, 6))
@@ -176,7 +176,7 @@ OPTIONS: dict[str, tuple[list[str], str]] = {
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A working folder with a good scenario and an earlier result."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(lidarpool.cli, "CONNECT_TIMEOUT_S", 1)
+    monkeypatch.setattr(lidarpool.connection, "CONNECT_TIMEOUT_S", 1)
     (tmp_path / "good.yaml").write_text("sensor: {layers: 2}\nsteps: 2\n")
     (tmp_path / "a.stl").write_bytes(exported("stl"))
     (tmp_path / "lidarpool-out").mkdir()

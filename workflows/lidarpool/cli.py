@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import NoReturn
@@ -31,6 +31,7 @@ from .scene_commands import scene
 from .simulate import simulate
 from .survey import Survey
 from .terminal import shown_progress, shown_status
+from .tls import NO_FILES, TlsFiles
 
 _out = click.option(
     "--out",
@@ -40,6 +41,19 @@ _out = click.option(
     help="Folder for the results; made if it is not there.",
 )
 _quiet = click.option("--quiet", "-q", is_flag=True, help="No progress, only the result.")
+
+_tls = click.option("--tls", is_flag=True, help="Encrypt the traffic of the local cluster.")
+
+
+def _tls_files(command: Callable[..., None]) -> Callable[..., None]:
+    """Options for the certificates of an encrypted cluster."""
+    for name, what in (
+        ("key", "Private key of that certificate, if its file does not hold it."),
+        ("cert", "Certificate to show to an encrypted cluster, a PEM file."),
+        ("ca", "Certificates of the authority of an encrypted cluster, a PEM file."),
+    ):
+        command = click.option(f"--tls-{name}", type=click.Path(path_type=Path), help=what)(command)
+    return command
 
 
 class _Commands(click.Group):
@@ -68,8 +82,9 @@ cli.add_command(scene)
 
 @cli.command()
 @_out
+@_tls
 @_quiet
-def demo(out: Path, quiet: bool) -> None:
+def demo(out: Path, tls: bool, quiet: bool) -> None:
     """Run the default survey and path planning on a cluster on this machine.
 
     \b
@@ -77,13 +92,15 @@ def demo(out: Path, quiet: bool) -> None:
       lidarpool demo
       lidarpool demo --out /tmp/demo
     """  # noqa: D301 - click wants the character, not its name
-    _run(Scenario(), out, quiet=quiet)
+    _run(Scenario(), out, tls=tls, quiet=quiet)
 
 
 @cli.command()
 @click.argument("scenario", type=click.Path(path_type=Path))
 @_out
 @click.option("--scheduler", metavar="ADDRESS", help="Use this Dask cluster, tcp://host:8786.")
+@_tls_files
+@_tls
 @click.option(
     "--backend",
     metavar="[auto|cuda|embree|numpy]",
@@ -98,6 +115,10 @@ def run(
     backend: str | None,
     no_plan: bool,
     quiet: bool,
+    tls: bool,
+    tls_ca: Path | None,
+    tls_cert: Path | None,
+    tls_key: Path | None,
 ) -> None:
     """Run a survey from a scenario file, or of a mesh file from its middle.
 
@@ -106,7 +127,23 @@ def run(
       lidarpool run examples/seed.yaml --out seed
       lidarpool run hall.glb --no-plan --scheduler tcp://127.0.0.1:8786
     """  # noqa: D301 - click wants the character, not its name
-    _run(Scenario.load(scenario), out, scheduler, backend, no_plan, quiet)
+    files = _files_for(scheduler, tls_ca, tls_cert, tls_key)
+    if tls and scheduler is not None:
+        raise click.UsageError(
+            "--tls is for a cluster of this machine; that of --scheduler is encrypted if its "
+            "address begins with tls://."
+        )
+    _run(Scenario.load(scenario), out, scheduler, backend, no_plan, quiet, tls, files)
+
+
+def _files_for(scheduler: str | None, *files: Path | None) -> TlsFiles:
+    """Certificates as one; an error if there is no scheduler to use them with."""
+    if any(files) and scheduler is None:
+        raise click.UsageError(
+            "--tls-ca, --tls-cert and --tls-key are for the cluster of --scheduler: give its "
+            "address, tls://host:8786, or --tls for an encrypted cluster of this machine."
+        )
+    return TlsFiles(*files)
 
 
 def _run(
@@ -116,6 +153,8 @@ def _run(
     backend: str | None = None,
     no_plan: bool = False,
     quiet: bool = False,
+    tls: bool = False,
+    files: TlsFiles = NO_FILES,
 ) -> None:
     # Matplotlib is a third of the time that --help would take.
     from .output import result_folder, write_result
@@ -129,7 +168,9 @@ def _run(
     pool = scenario.pool
     with result_folder(out):
         with (
-            _local_client(scenario, quiet) if scheduler is None else connected(scheduler) as client,
+            _local_client(scenario, quiet, tls)
+            if scheduler is None
+            else connected(scheduler, files) as client,
             shown_progress(quiet) as show,
         ):
             result = simulate(
@@ -173,7 +214,10 @@ def _tell(out: Path, result: Result, scene: Scene, survey: Survey, files: list[s
 
 @cli.command()
 @click.option("--scheduler", metavar="ADDRESS", help="Also show the workers of this cluster.")
-def info(scheduler: str | None) -> None:
+@_tls_files
+def info(
+    scheduler: str | None, tls_ca: Path | None, tls_cert: Path | None, tls_key: Path | None
+) -> None:
     """Show versions, ray-casting backends, GPUs and the workers by partition.
 
     \b
@@ -182,8 +226,9 @@ def info(scheduler: str | None) -> None:
       lidarpool info --scheduler tcp://127.0.0.1:8786
     """  # noqa: D301 - click wants the character, not its name
     pool = None
+    files = _files_for(scheduler, tls_ca, tls_cert, tls_key)
     if scheduler is not None:
-        with connected(scheduler) as client:
+        with connected(scheduler, files) as client:
             pool = Pool.from_client(client)
     for name, number in versions().items():
         click.echo(f"{name:<14} {number}")
@@ -207,7 +252,7 @@ def _tell_workers(pool: Pool) -> None:
 
 
 @contextmanager
-def _local_client(scenario: Scenario, quiet: bool) -> Iterator[Client]:
+def _local_client(scenario: Scenario, quiet: bool, tls: bool) -> Iterator[Client]:
     """Client of a cluster on this machine whose workers say nothing of their own."""
     with ExitStack() as stack:
         with shown_status("starting the workers", quiet):
@@ -216,6 +261,7 @@ def _local_client(scenario: Scenario, quiet: bool) -> Iterator[Client]:
                     gpu_workers=scenario.pool.gpu,
                     collectors=scenario.pool.collectors,
                     other_workers=scenario.pool.other,
+                    tls=tls,
                 )
             )
             client.register_plugin(QuietWorkers())

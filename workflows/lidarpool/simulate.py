@@ -56,6 +56,7 @@ def simulate(
     collectors: int = 2,
     gpu_workers: int | None = None,
     other_workers: int | None = None,
+    tls: bool = False,
 ) -> Result:
     """Scan a scene on a partitioned cluster and plan a path meanwhile.
 
@@ -81,6 +82,8 @@ def simulate(
         Tasks of stage 4.
     gpu_workers, other_workers
         Workers of a local cluster; by default what suits the machine.
+    tls
+        Encrypt the traffic of a local cluster, with a certificate made for it.
 
     Returns
     -------
@@ -110,7 +113,9 @@ def simulate(
     if client is None:
         check_backend_here(backend)
     with (
-        local_client(gpu_workers=gpu_workers, collectors=collectors, other_workers=other_workers)
+        local_client(
+            gpu_workers=gpu_workers, collectors=collectors, other_workers=other_workers, tls=tls
+        )
         if client is None
         else nullcontext(client) as client
     ):
