@@ -24,28 +24,20 @@ import logging
 import pickle
 import time
 from collections.abc import Callable, Iterable
-from functools import partial
 from typing import Any
 
-import distributed
 from distributed.core import Status
 from distributed.diagnostics.plugin import SchedulerPlugin
 from distributed.scheduler import WorkerState
 from distributed.shuffle._core import barrier_key
 
-from .errors import PoolError
+from .override import Overrides
 
 logger = logging.getLogger(__name__)
 
 NAME = "poolpart-fences"
 COMPLAIN_EVERY_S = 10.0
 _SETTLE_S = 5.0  # longest wait for workers to give up tasks that they have not started
-_DECIDING = (
-    "valid_workers",
-    "decide_worker_non_rootish",
-    "decide_worker_rootish_queuing_disabled",
-    "add_resources",
-)
 
 
 async def raise_(scheduler: Any, name: str) -> None:
@@ -94,7 +86,7 @@ class Fences(SchedulerPlugin):
         self.scheduler = scheduler
         self.names: set[str] = set()
         self.closed: set[Any] = set()  # states of the workers behind fences
-        self._overridden: list[tuple[Any, str]] = []
+        self._overrides = Overrides()
         self._complained_at = float("-inf")
 
     # -- coming and going --------------------------------------------------------------
@@ -107,29 +99,25 @@ class Fences(SchedulerPlugin):
         PoolError
             If this version of Dask decides by other means.
         """
-        scheduler, extensions = self.scheduler, self.scheduler.extensions
-        stealing, shuffle = extensions.get("stealing"), extensions.get("shuffle")
-        places = [(scheduler, method) for method in _DECIDING]
-        places += [(stealing, "_get_thief")] if stealing else []
-        places += [(shuffle, "_calculate_worker_for")] if shuffle else []
-        if lacking := [method for owner, method in places if not hasattr(owner, method)]:
-            raise PoolError(
-                f"distributed {distributed.__version__} has no {', '.join(lacking)}, which "
-                "exclusive partitions need; use the version that this package asks for."
-            )
-        for owner, method in places:
-            mine = getattr(self, f"_{method.lstrip('_')}")
-            setattr(owner, method, partial(mine, getattr(owner, method)))
-            self._overridden.append((owner, method))
+        scheduler, put = self.scheduler, self._overrides.put
+        rule: dict[str, Callable[..., Any]] = {
+            "valid_workers": self._valid_workers,
+            "decide_worker_non_rootish": self._non_rootish,
+            "decide_worker_rootish_queuing_disabled": self._rootish_not_queued,
+            "add_resources": self._add_resources,
+        }
+        put(scheduler, rule)
+        if stealing := scheduler.extensions.get("stealing"):
+            put(stealing, {"_get_thief": self._get_thief})
+        if shuffle := scheduler.extensions.get("shuffle"):
+            put(shuffle, {"_calculate_worker_for": self._outputs_of_shuffle})
         scheduler.handlers["set_resources"] = scheduler.add_resources
         scheduler.idle_task_count = _OpenWorkers(self.closed, scheduler.idle_task_count)
         scheduler.add_plugin(self)
 
     def uninstall(self) -> None:
         """Take everything back."""
-        for owner, method in self._overridden:
-            delattr(owner, method)
-        self._overridden.clear()
+        self._overrides.take_back()
         self.scheduler.handlers["set_resources"] = self.scheduler.add_resources
         self.scheduler.idle_task_count = set(self.scheduler.idle_task_count)
         if stealing := self.scheduler.extensions.get("stealing"):
@@ -216,13 +204,11 @@ class Fences(SchedulerPlugin):
         # Restrictions that are mere wishes; without this Dask would then take any worker.
         return allowed or (self.remainder if task.loose_restrictions else allowed)
 
-    def _decide_worker_non_rootish(self, original: Callable[..., Any], task: Any) -> Any:
+    def _non_rootish(self, original: Callable[..., Any], task: Any) -> Any:
         worker = original(task)
         return None if worker in self.closed and self.stop(task) else worker
 
-    def _decide_worker_rootish_queuing_disabled(
-        self, original: Callable[..., Any], task: Any
-    ) -> Any:
+    def _rootish_not_queued(self, original: Callable[..., Any], task: Any) -> Any:
         return self.scheduler.decide_worker_non_rootish(task)
 
     def _get_thief(
@@ -231,7 +217,7 @@ class Fences(SchedulerPlugin):
         thief = original(scheduler, task, *args, **kwargs)
         return None if thief in self.closed and self.stop(task) else thief
 
-    def _calculate_worker_for(self, original: Callable[..., Any], spec: Any) -> Any:
+    def _outputs_of_shuffle(self, original: Callable[..., Any], spec: Any) -> Any:
         """Have a shuffle choose the workers of its outputs among those that may take them."""
         barrier = self.scheduler.tasks[barrier_key(spec.id)]
         given = barrier.worker_restrictions
