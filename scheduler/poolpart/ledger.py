@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 
 class Ledger:
@@ -57,6 +57,18 @@ class Ledger:
         self._seen[item] = 1
         self.delivered += 1
         return True
+
+    def restore(self, items: Iterable[int]) -> None:
+        """Enter items that an earlier run had delivered; what is there already is no duplicate.
+
+        Raises
+        ------
+        IndexError
+            If there is no such item.
+        """
+        for item in items:
+            if item not in self:
+                self.accept(item)
 
     @property
     def complete(self) -> bool:

@@ -145,7 +145,7 @@ def test_a_disk_too_small_is_noticed_before_writing(tmp_path, monkeypatch):
     path, untouched = existing(tmp_path)
     usage = type("Usage", (), {"free": 1000})
     monkeypatch.setattr(ply.shutil, "disk_usage", lambda _: usage)
-    with pytest.raises(LidarpoolError, match=r"needs 22,\d{3} bytes and its disk has 1,000 free"):
+    with pytest.raises(LidarpoolError, match=r"needs 44,\d{3} bytes and its disk has 1,000 free"):
         write_cloud(path, **sample(1000))
     assert untouched()
 

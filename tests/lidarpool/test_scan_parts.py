@@ -136,7 +136,7 @@ class TestCloudBuilder:
         builder = CloudBuilder(4)
         for p in (part(2), part(3, 0), part(1)):
             builder.add(p)
-        cloud = builder.merge(0.5, np.array([100.0, 0, 0]))
+        cloud = builder.merge(0.5, np.array([100.0, 0, 0])).load()
         assert cloud.scan.tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
         assert cloud.positions[:, 0].tolist() == [100, 100.5, 100.5, 101, 101, 101.5, 101.5, 102]
 
@@ -159,7 +159,7 @@ class TestCloudBuilder:
         table = points(0, 1000)
         table["cell"] = np.arange(1000)[:, None]
         builder.add(Part((0,), (1000,), table))
-        cloud = builder.merge(0.01, np.zeros(3))
+        cloud = builder.merge(0.01, np.zeros(3)).load()
         assert [repr(float(x)) for x in cloud.positions[:, 0]] == [
             repr(round(i * 0.01, 2)) for i in range(1000)
         ]

@@ -4,7 +4,7 @@ from ._version import __version__
 from .cloud import Cloud
 from .errors import LidarpoolError
 from .plan import Plan, Planning
-from .ply import read_cloud, write_cloud
+from .ply import read_cloud, save_cloud, write_cloud
 from .result import Result
 from .scan import Frame
 from .scene import Scene
@@ -26,6 +26,7 @@ __all__ = [
     "Survey",
     "__version__",
     "read_cloud",
+    "save_cloud",
     "simulate",
     "write_cloud",
 ]

@@ -2,13 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import LidarpoolError
+
+CHUNK_POINTS = 1_000_000  # in memory at a time where a cloud is read in order
+
+
+class CloudLike(Protocol):
+    """A cloud in memory or on disk, to be read in order, a part at a time."""
+
+    def __len__(self) -> int: ...
+
+    @property
+    def bounds(self) -> NDArray[np.floating]:
+        """Lowest and highest coordinates, (2, 3), metres, in the positions' type."""
+
+    def chunks(self, points: int = CHUNK_POINTS) -> Iterator[Cloud]:
+        """Give the points in order, at most so many at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +76,39 @@ class Cloud:
 
     def __len__(self) -> int:
         return len(self.positions)
+
+    @property
+    def bounds(self) -> NDArray[np.floating]:
+        """Lowest and highest coordinates, (2, 3), metres; zeros where there are no points."""
+        if not len(self):
+            return np.zeros((2, 3), self.positions.dtype)
+        return np.stack([self.positions.min(axis=0), self.positions.max(axis=0)])
+
+    def chunks(self, points: int = CHUNK_POINTS) -> Iterator[Cloud]:
+        """Give the points in order, at most so many at a time, as views."""
+        for first in range(0, len(self), points):
+            part = slice(first, first + points)
+            yield Cloud(self.positions[part], self.scan[part], self.ring[part], self.object[part])
+
+
+def counts_by_object(cloud: CloudLike, objects: int) -> NDArray[np.int64]:
+    """Count the points of each object: (objects,)."""
+    counts = np.zeros(objects, np.int64)
+    for chunk in cloud.chunks():
+        counts += np.bincount(chunk.object, minlength=objects)
+    return counts
+
+
+def even_choice(cloud: CloudLike, most: int) -> NDArray[np.float64]:
+    """Positions (k, 3) of at most so many points, evenly chosen; of all, where there are fewer."""
+    chosen = np.linspace(0, len(cloud) - 1, min(len(cloud), most)).astype(np.int64)
+    positions = np.empty((len(chosen), 3))
+    first = 0
+    for chunk in cloud.chunks():
+        low, high = np.searchsorted(chosen, [first, first + len(chunk)])
+        positions[low:high] = chunk.positions[chosen[low:high] - first]
+        first += len(chunk)
+    return positions
 
 
 def _whole(name: str, values: ArrayLike, kind: type[np.integer[Any]]) -> NDArray[Any]:

@@ -16,15 +16,16 @@ from typing import Any
 
 import numpy as np
 
+from .cloud import even_choice
 from .errors import LidarpoolError
 from .interrupts import deferred_interrupts
 from .plan import Planning
-from .ply import write_cloud
+from .ply import save_cloud
 from .report import make_report
 from .result import Result
 from .scene import Scene
 from .survey import Survey
-from .view import draw_cloud, draw_intensity, draw_path, draw_scene, take_shot
+from .view import MOST_POINTS, draw_cloud, draw_intensity, draw_path, draw_scene, take_shot
 
 if sys.platform != "win32":
     import fcntl
@@ -114,21 +115,16 @@ def _makers(
     """Functions that write each file but the report."""
     poses = np.array([pose.position for pose in survey.poses]) + scene.origin
     shot = take_shot(scene, poses)
-    cloud = result.cloud
+    cloud = result.points
     makers: dict[str, Callable[[Path], object]] = {
-        "cloud.ply": lambda path: write_cloud(
-            path,
-            cloud.positions,
-            cloud.scan,
-            cloud.ring,
-            cloud.object,
-            precision_m=survey.precision_m,
-        ),
+        "cloud.ply": lambda path: save_cloud(path, cloud, precision_m=survey.precision_m),
         "scene.png": lambda path: draw_scene(path, scene, poses, shot=shot),
         "intensity.png": lambda path: draw_intensity(
             path, scene, result.hit_counts, poses, result.sample_rays + scene.origin, shot=shot
         ),
-        "cloud.png": lambda path: draw_cloud(path, cloud.positions, poses, scene=scene, shot=shot),
+        "cloud.png": lambda path: draw_cloud(
+            path, even_choice(cloud, MOST_POINTS), poses, count=len(cloud), scene=scene, shot=shot
+        ),
     }
     if planning is not None and result.plan is not None:
         plan = result.plan

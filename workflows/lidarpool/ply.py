@@ -1,31 +1,23 @@
-"""Point clouds as binary PLY: written whole or not at all."""
+"""Point clouds as binary PLY: written whole or not at all, whatever their size."""
 
 from __future__ import annotations
 
 import os
 import secrets
 import shutil
+import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .cloud import Cloud
+from .cloud import CHUNK_POINTS, Cloud, CloudLike
 from .errors import LidarpoolError
+from .ply_format import header, layout, row_type
 
 # Single precision positions are kept where they err by less than this part of the precision.
 _ROUNDING_SHARE = 0.05
-
-_MAGIC = "ply\nformat binary_little_endian 1.0\n"
-_HEADER_LIMIT = 65_536
-_CHUNK = 1_000_000  # rows compared at a time
-_PLY_TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
-    "short": "<i2", "int16": "<i2", "ushort": "<u2", "uint16": "<u2",
-    "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4",
-    "float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8",
-}  # fmt: skip
 
 
 def write_cloud(
@@ -37,19 +29,48 @@ def write_cloud(
     *,
     precision_m: float = 0.01,
 ) -> int:
-    """Write points to a binary PLY file through Open3D.
-
-    The file is written under a temporary name in the same folder, read back and compared,
-    flushed to the disk, and only then given its name: there is either the whole new file or
-    what was there before. The same points give the same bytes.
+    """Write points to a binary PLY file through Open3D; see `save_cloud`.
 
     Parameters
     ----------
     path
         The file; its folder must exist.
     positions, scan, ring, object_id
-        As in `Cloud`. float64 positions are stored in single precision where that errs by
-        less than a twentieth of `precision_m`, else in double.
+        As in `Cloud`.
+    precision_m
+        What the positions were rounded to, in metres.
+
+    Returns
+    -------
+    Size of the file in bytes.
+
+    Raises
+    ------
+    LidarpoolError
+        If it cannot be written whole; no temporary file is left.
+    """
+    cloud = Cloud(np.asarray(positions), np.asarray(scan), np.asarray(ring), np.asarray(object_id))
+    return save_cloud(path, cloud, precision_m=precision_m)
+
+
+def save_cloud(path: str | Path, cloud: CloudLike, *, precision_m: float = 0.01) -> int:
+    """Write a cloud, in memory or on disk, to a binary PLY file through Open3D.
+
+    About a million points are in memory at a time: Open3D writes each such piece to a file of
+    its own, which is read back, compared and appended to the others below one header. The
+    bytes are those that Open3D would write at once.
+
+    The file is written under a temporary name in the same folder, read back, flushed to the
+    disk, and only then given its name: there is either the whole new file or what was there
+    before. The same points give the same bytes.
+
+    Parameters
+    ----------
+    path
+        The file; its folder must exist.
+    cloud
+        A `Cloud`, or the `points` of a `Result`. float64 positions are stored in single
+        precision where that errs by less than a twentieth of `precision_m`, else in double.
     precision_m
         What the positions were rounded to, in metres.
 
@@ -63,24 +84,14 @@ def write_cloud(
         If it cannot be written whole; no temporary file is left.
     """
     path = Path(path)
-    cloud = Cloud(
-        _narrowed(np.asarray(positions), precision_m),
-        np.asarray(scan),
-        np.asarray(ring),
-        np.asarray(object_id),
-    )
+    real = _real_type(cloud.bounds, precision_m)
     # The ending stays, since Open3D picks the format by it.
     temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.tmp.ply")
     try:
-        _check_target(path, cloud)
-        # Made first, with the permissions that the user's umask gives.
-        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+        _check_target(path, len(cloud), real)
         try:
-            if len(cloud):
-                _write_open3d(temporary, cloud)
-            else:
-                temporary.write_bytes(_empty_file(cloud))
-            size = _verify(temporary, path, cloud)
+            checksum = _write(temporary, path, cloud, real)
+            size = _check_whole(temporary, path, len(cloud), checksum)
             _flush(temporary)
             temporary.replace(path)
             _flush(path.parent)
@@ -101,7 +112,7 @@ def read_cloud(path: str | Path) -> Cloud:
     """
     path = Path(path)
     try:
-        start, count, dtype = _layout(path)
+        start, count, dtype = layout(path)
         rows = np.fromfile(path, dtype=dtype, count=count, offset=start)
     except OSError as error:
         raise LidarpoolError(f"{path} cannot be read: {error.strerror or error}.") from error
@@ -111,18 +122,16 @@ def read_cloud(path: str | Path) -> Cloud:
     return Cloud(positions, rows["scan"], rows["ring"], rows["object"])
 
 
-def _narrowed(positions: NDArray[np.generic], precision_m: float) -> NDArray[np.floating]:
-    """Positions in the least precise type that is precise enough."""
-    if positions.dtype == np.float32:
-        return positions.astype(np.float32, copy=False)
-    exact = positions.astype(np.float64, copy=False)
-    farthest = np.float32(np.abs(exact).max(initial=0.0))
-    if np.isfinite(farthest) and np.spacing(farthest) / 2 < _ROUNDING_SHARE * precision_m:
-        return exact.astype(np.float32)
-    return exact
+def _real_type(bounds: NDArray[np.floating], precision_m: float) -> np.dtype[np.floating]:
+    """Least precise type that is precise enough for positions between these bounds."""
+    if bounds.dtype == np.float32:
+        return bounds.dtype
+    farthest = np.float32(np.abs(bounds).max(initial=0.0))
+    enough = np.isfinite(farthest) and np.spacing(farthest) / 2 < _ROUNDING_SHARE * precision_m
+    return np.dtype(np.float32 if enough else np.float64)
 
 
-def _check_target(path: Path, cloud: Cloud) -> None:
+def _check_target(path: Path, count: int, real: np.dtype[np.floating]) -> None:
     """Ask before writing: the name, the folder, the room on the disk; OSError if it cannot."""
     if path.is_dir():
         raise LidarpoolError(f"{path} is a folder: give the name of a .ply file.")
@@ -130,7 +139,8 @@ def _check_target(path: Path, cloud: Cloud) -> None:
         raise LidarpoolError(f"{path} must end in .ply, the format that is written.")
     if not path.parent.is_dir():
         raise LidarpoolError(f"The folder {path.parent} does not exist: make it first.")
-    needed = len(_empty_file(cloud)) + len(cloud) * _dtype(cloud).itemsize
+    piece = min(count, CHUNK_POINTS)
+    needed = sum(len(header(real, n)) + n * row_type(real).itemsize for n in (count, piece))
     free = shutil.disk_usage(path.parent).free
     if free < needed:
         raise LidarpoolError(
@@ -139,21 +149,29 @@ def _check_target(path: Path, cloud: Cloud) -> None:
         )
 
 
-def _dtype(cloud: Cloud) -> np.dtype[np.void]:
-    """Row of the file that holds `cloud`, in the order in which Open3D writes."""
-    real = "<f8" if cloud.positions.dtype == np.float64 else "<f4"
-    return np.dtype(
-        [(axis, real) for axis in "xyz"] + [("scan", "<i4"), ("ring", "<u2"), ("object", "<i4")]
-    )
-
-
-def _empty_file(cloud: Cloud) -> bytes:
-    """File with the properties of `cloud` and no points, which Open3D refuses to write."""
-    real = "double" if cloud.positions.dtype == np.float64 else "float"
-    lines = [f"property {real} {axis}" for axis in "xyz"]
-    lines += ["property int scan", "property uint16 ring", "property int object"]
-    body = "\n".join(["comment Created by Open3D", "element vertex 0", *lines, "end_header\n"])
-    return (_MAGIC + body).encode("ascii")
+def _write(temporary: Path, path: Path, cloud: CloudLike, real: np.dtype[np.floating]) -> int:
+    """Write all pieces to `temporary`; returns the checksum of the rows."""
+    piece = temporary.with_name(temporary.name.replace(".tmp.", ".piece."))
+    checksum = written = 0
+    with temporary.open("xb") as file:
+        try:
+            for chunk in cloud.chunks():
+                narrow = Cloud(
+                    chunk.positions.astype(real, copy=False), chunk.scan, chunk.ring, chunk.object
+                )
+                _write_open3d(piece, narrow)
+                head, rows = _read_back(piece, path, narrow)
+                if not written:
+                    own = b"element vertex %d\n" % len(chunk)
+                    file.write(head.replace(own, b"element vertex %d\n" % len(cloud)))
+                file.write(rows)
+                checksum = zlib.crc32(rows, checksum)
+                written += len(chunk)
+        finally:
+            piece.unlink(missing_ok=True)
+        if not written:  # which Open3D refuses to write
+            file.write(header(real, 0))
+    return checksum
 
 
 def _write_open3d(path: Path, cloud: Cloud) -> None:
@@ -176,70 +194,49 @@ def _write_open3d(path: Path, cloud: Cloud) -> None:
         raise LidarpoolError(f"Open3D cannot write to {path.parent}: check folder and disk.")
 
 
-def _verify(temporary: Path, path: Path, cloud: Cloud) -> int:
-    """Read a written file back and compare it with `cloud`, bit by bit; returns its size.
+def _read_back(piece: Path, path: Path, cloud: Cloud) -> tuple[bytes, memoryview]:
+    """Read a piece of `path` back, compare it with `cloud` bit by bit; its header and rows.
 
     Open3D says True also when the disk was full and the file is cut.
     """
+    start, dtype = _layout_of(piece, path, len(cloud))
+    rows = np.fromfile(piece, dtype=dtype, offset=start)
+    columns = {axis: cloud.positions[:, i] for i, axis in enumerate("xyz")}
+    columns |= {name: getattr(cloud, name) for name in ("scan", "ring", "object")}
+    for name, column in columns.items():
+        if rows[name].tobytes() != column.tobytes():
+            raise LidarpoolError(f"{path} came back from the disk with another {name}: try again.")
+    with piece.open("rb") as file:
+        return file.read(start), rows.view(np.uint8).data
+
+
+def _check_whole(temporary: Path, path: Path, count: int, checksum: int) -> int:
+    """Read the whole file back and compare its checksum; returns its size."""
+    start, _ = _layout_of(temporary, path, count)
+    found = 0
+    with temporary.open("rb") as file:
+        file.seek(start)
+        while data := file.read(1 << 24):
+            found = zlib.crc32(data, found)
+        size = file.tell()
+    if found != checksum:
+        raise LidarpoolError(f"{path} came back from the disk with other bytes: try again.")
+    return size
+
+
+def _layout_of(file: Path, path: Path, count: int) -> tuple[int, np.dtype[np.void]]:
+    """Where the rows of a file begin and their type, if it holds so many points."""
     try:
-        start, count, dtype = _layout(temporary)
-        if count != len(cloud):
-            raise ValueError(f"{count:,} of {len(cloud):,} points")
+        start, found, dtype = layout(file)
+        if found != count:
+            raise ValueError(f"{found:,} of {count:,} points")
     except ValueError as error:
         free = shutil.disk_usage(path.parent).free
         raise LidarpoolError(
             f"{path} could not be written whole ({error}); the disk has {free:,} bytes free. "
             "Make room, or write to another folder."
         ) from error
-    columns = {axis: cloud.positions[:, i] for i, axis in enumerate("xyz")}
-    columns |= {name: getattr(cloud, name) for name in ("scan", "ring", "object")}
-    for first in range(0, count, _CHUNK):
-        offset = start + first * dtype.itemsize
-        rows = np.fromfile(temporary, dtype=dtype, count=min(_CHUNK, count - first), offset=offset)
-        for name, column in columns.items():
-            if rows[name].tobytes() != column[first : first + len(rows)].tobytes():
-                raise LidarpoolError(
-                    f"{path} came back from the disk with another {name}: try again."
-                )
-    return start + count * dtype.itemsize
-
-
-def _layout(path: Path) -> tuple[int, int, np.dtype[np.void]]:
-    """Find where the points of a PLY file begin, how many there are, and the type of a row.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be read.
-    ValueError
-        If it is not a whole binary PLY file with our properties; the message is a clause.
-    """
-    with path.open("rb") as file:
-        head, found, _ = file.read(_HEADER_LIMIT).partition(b"end_header\n")
-    text = head.decode("ascii", errors="replace")
-    if not found or not text.startswith(_MAGIC):
-        raise ValueError("it has no header of a binary little-endian PLY file")
-    count, dtype = _parse_header(text)
-    start = len(head) + len(found)
-    announced, size = start + count * dtype.itemsize, path.stat().st_size
-    if size != announced:
-        raise ValueError(f"{count:,} points in {announced:,} bytes announced, {size:,} bytes there")
-    return start, count, dtype
-
-
-def _parse_header(text: str) -> tuple[int, np.dtype[np.void]]:
-    """Take number and type of the rows from a header; ValueError if they are not ours."""
-    elements = [line.split() for line in text.splitlines() if line.startswith("element")]
-    properties = [line.split() for line in text.splitlines() if line.startswith("property")]
-    if len(elements) != 1 or elements[0][1] != "vertex" or not elements[0][-1].isdigit():
-        raise ValueError("it holds more than points, or no points")
-    if any(len(entry) != 3 or entry[1] not in _PLY_TYPES for entry in properties):
-        raise ValueError("it has list properties or unknown types")
-    dtype = np.dtype([(name, _PLY_TYPES[kind]) for _, kind, name in properties])
-    missing = {"x", "y", "z", "scan", "ring", "object"} - set(dtype.names or ())
-    if missing:
-        raise ValueError(f"it lacks {', '.join(sorted(missing))}")
-    return int(elements[0][-1]), dtype
+    return start, dtype
 
 
 def _flush(path: Path) -> None:

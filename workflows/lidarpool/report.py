@@ -9,11 +9,10 @@ from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-import numpy as np
-
 from poolpart import TaskRecord, placement_violations
 
 from ._version import __version__
+from .cloud import counts_by_object
 from .plan import Planning
 from .result import Result
 from .scan import COLLECT, GENERATE, INTERSECT, SORT
@@ -68,7 +67,7 @@ def make_report(
         "scans": survey.scan_count,
         "rays": result.rays,
         "hits": result.hits,
-        "points": len(result.cloud),
+        "points": len(result.points),
         "points_by_object": _points_by_object(result, scene),
         "seconds": {
             "total": round(result.seconds, 3),
@@ -82,6 +81,7 @@ def make_report(
         "misplaced_tasks": [asdict(record) for record in violations[:20]],
         "replayed": result.replayed,
         "duplicates_dropped": result.duplicates_dropped,
+        "resumed_scans": result.resumed,
         "planning": _planning(result, planning),
         "files": list(files),
     }
@@ -104,7 +104,7 @@ def _parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
 
 
 def _points_by_object(result: Result, scene: Scene) -> dict[str, int]:
-    counts = np.bincount(result.cloud.object, minlength=len(scene.names))
+    counts = counts_by_object(result.points, len(scene.names))
     return {name: int(count) for name, count in zip(scene.names, counts, strict=True)}
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from poolpart import TaskRecord
 
 from .cloud import Cloud
 from .plan import Plan, Trial
+from .scan import StoredCloud
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,8 +21,9 @@ class Result:
 
     Parameters
     ----------
-    cloud
-        The merged points.
+    points
+        The merged points, on disk: to be read in order a part at a time, or written with
+        `save_cloud`.
     hit_counts
         int64 (f,): rays that hit each triangle of the scene.
     sample_rays
@@ -37,11 +40,14 @@ class Result:
         Wall time of all, of the survey and of the planning.
     replayed, duplicates_dropped
         Batches that had to be sent again, and scans that came twice because of it.
+    resumed
+        Scans whose points an earlier run had left in the journal. `records` and seconds are of
+        this run only.
     notes
         What a user should know, such as that the GPU partition had no GPU.
     """
 
-    cloud: Cloud
+    points: StoredCloud
     hit_counts: NDArray[np.int64]
     sample_rays: NDArray[np.float32]
     plan: Plan | None
@@ -55,4 +61,10 @@ class Result:
     planning_seconds: float
     replayed: int
     duplicates_dropped: int
+    resumed: int
     notes: tuple[str, ...]
+
+    @cached_property
+    def cloud(self) -> Cloud:
+        """The merged points in memory, 34 bytes each; read from disk when first asked for."""
+        return self.points.load()

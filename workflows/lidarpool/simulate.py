@@ -270,7 +270,7 @@ class _Run:
     ) -> Result:
         samples = np.concatenate(self.samples) if self.samples else np.empty((0, 2, 3), np.float32)
         return Result(
-            cloud=survey.cloud.merge(self.survey.precision_m, self.scene.origin),
+            points=survey.cloud.merge(self.survey.precision_m, self.scene.origin),
             hit_counts=self.hit_counts,
             sample_rays=samples,
             plan=trials.plan() if trials else None,
@@ -284,6 +284,7 @@ class _Run:
             planning_seconds=times.get(TrialPump, 0.0),
             replayed=survey.replayed,
             duplicates_dropped=survey.duplicates_dropped,
+            resumed=0,
             notes=tuple(self.notes),
         )
 

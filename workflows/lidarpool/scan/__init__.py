@@ -1,6 +1,7 @@
 """The survey pipeline: four stages on the partitions of a cluster."""
 
 from .builder import CloudBuilder
+from .merged import StoredCloud
 from .messages import Frame
 from .pump import SurveyPump
 from .setup import SurveySetup
@@ -16,6 +17,7 @@ __all__ = [
     "SORT",
     "CloudBuilder",
     "Frame",
+    "StoredCloud",
     "SurveyPump",
     "SurveySetup",
 ]

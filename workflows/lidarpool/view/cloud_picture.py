@@ -31,6 +31,7 @@ def draw_cloud(
     poses: ArrayLike = (),
     *,
     objects: ArrayLike | None = None,
+    count: int | None = None,
     scene: Scene | None = None,
     shot: Shot | None = None,
     size: tuple[int, int] = SIZE,
@@ -48,6 +49,8 @@ def draw_cloud(
         million an even choice is drawn.
     objects
         (n,) the object of each point, an index into `scene.names`.
+    count
+        Points of the whole cloud, for the title, where `positions` are a choice of them.
     scene
         Drawn pale under the points and hides those behind it. Without it: the points alone.
 
@@ -57,7 +60,7 @@ def draw_cloud(
         If `objects` does not fit the positions, or the file cannot be written.
     """
     sensors = finite_points(poses)
-    points, owners, count = _thinned(positions, objects)
+    points, owners, given = _thinned(positions, objects)
     shot = shot or take_shot(scene, sensors, points=points, size=size, backend=backend)
     points = points - shot.stage.origin
     theme = theme_for(dark)
@@ -79,7 +82,10 @@ def draw_cloud(
         page.colour_bar(HEIGHT_COLOURS, world, "height z (m)")
     if not len(points):
         page.note(axes, "no points")
-    page.title("Point cloud", facts((count, "point"), (len(sensors), "sensor position")))
+    page.title(
+        "Point cloud",
+        facts((given if count is None else count, "point"), (len(sensors), "sensor position")),
+    )
     return page.save(path)
 
 

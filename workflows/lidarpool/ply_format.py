@@ -1,0 +1,71 @@
+"""The layout of our point clouds as binary PLY: the header, and a row for each point."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+_MAGIC = "ply\nformat binary_little_endian 1.0\n"
+_HEADER_LIMIT = 65_536
+_PLY_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
+    "short": "<i2", "int16": "<i2", "ushort": "<u2", "uint16": "<u2",
+    "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4",
+    "float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8",
+}  # fmt: skip
+
+
+def row_type(real: np.dtype[np.floating]) -> np.dtype[np.void]:
+    """Row of a file whose positions are of type `real`, in the order in which Open3D writes."""
+    kind = "<f8" if real == np.float64 else "<f4"
+    return np.dtype(
+        [(axis, kind) for axis in "xyz"] + [("scan", "<i4"), ("ring", "<u2"), ("object", "<i4")]
+    )
+
+
+def header(real: np.dtype[np.floating], count: int) -> bytes:
+    """Header of a file of `count` points, as Open3D writes it."""
+    kind = "double" if real == np.float64 else "float"
+    lines = [f"property {kind} {axis}" for axis in "xyz"]
+    lines += ["property int scan", "property uint16 ring", "property int object"]
+    lines = ["comment Created by Open3D", f"element vertex {count}", *lines, "end_header\n"]
+    return (_MAGIC + "\n".join(lines)).encode("ascii")
+
+
+def layout(path: Path) -> tuple[int, int, np.dtype[np.void]]:
+    """Find where the points of a PLY file begin, how many there are, and the type of a row.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be read.
+    ValueError
+        If it is not a whole binary PLY file with our properties; the message is a clause.
+    """
+    with path.open("rb") as file:
+        head, found, _ = file.read(_HEADER_LIMIT).partition(b"end_header\n")
+    text = head.decode("ascii", errors="replace")
+    if not found or not text.startswith(_MAGIC):
+        raise ValueError("it has no header of a binary little-endian PLY file")
+    count, dtype = _parse_header(text)
+    start = len(head) + len(found)
+    announced, size = start + count * dtype.itemsize, path.stat().st_size
+    if size != announced:
+        raise ValueError(f"{count:,} points in {announced:,} bytes announced, {size:,} bytes there")
+    return start, count, dtype
+
+
+def _parse_header(text: str) -> tuple[int, np.dtype[np.void]]:
+    """Take number and type of the rows from a header; ValueError if they are not ours."""
+    elements = [line.split() for line in text.splitlines() if line.startswith("element")]
+    properties = [line.split() for line in text.splitlines() if line.startswith("property")]
+    if len(elements) != 1 or elements[0][1] != "vertex" or not elements[0][-1].isdigit():
+        raise ValueError("it holds more than points, or no points")
+    if any(len(entry) != 3 or entry[1] not in _PLY_TYPES for entry in properties):
+        raise ValueError("it has list properties or unknown types")
+    dtype = np.dtype([(name, _PLY_TYPES[kind]) for _, kind, name in properties])
+    missing = {"x", "y", "z", "scan", "ring", "object"} - set(dtype.names or ())
+    if missing:
+        raise ValueError(f"it lacks {', '.join(sorted(missing))}")
+    return int(elements[0][-1]), dtype
