@@ -9,7 +9,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from .hits import Hits, Returns
+from .hits import RAY_BYTES, Gathering, Hits, Returns
+from .memory import require
 from .mesh import LocalMesh
 from .rays import Pattern, Rays, rotated
 
@@ -74,6 +75,7 @@ class Backend(ABC):
     def cast(self, rays: Rays) -> Hits:
         """Closest hit of every ray."""
         n = len(rays)
+        require(RAY_BYTES * n, f"The answer for {n:,} rays", "cast fewer at a time")
         hits = Hits(np.full(n, np.inf), np.full(n, -1, np.int32), np.zeros(n), np.zeros(n))
         for start in range(0, n, self.chunk):
             found = self.closest(rays.part(start, start + self.chunk), weights=True)
@@ -86,15 +88,12 @@ class Backend(ABC):
 
     def returns(self, rays: Rays) -> Returns:
         """Closest hits of the rays that have one."""
-        ray: list[NDArray[np.int64]] = [np.zeros(0, np.int64)]
-        distance: list[NDArray[np.float64]] = [np.zeros(0)]
-        triangle: list[NDArray[np.int32]] = [np.zeros(0, np.int32)]
+        gathering = Gathering()
         for start in range(0, len(rays), self.chunk):
             found = self.closest(rays.part(start, start + self.chunk), weights=False)
-            ray.append(found.ray + start)
-            distance.append(found.t / self._mesh.scale)
-            triangle.append(found.triangle)
-        return Returns(np.concatenate(ray), np.concatenate(distance), np.concatenate(triangle))
+            ray = found.ray.astype(np.int64) + start
+            gathering.add(Returns(ray, found.t / self._mesh.scale, found.triangle))
+        return gathering.returns()
 
     def scan(
         self,

@@ -4,31 +4,42 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, ClassVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
-from . import cuda_build
+from . import cuda_scene
 from .backend import Backend, Found
 from .cuda_module import Kernels, options
 from .cuda_results import Packer, PinnedRoom
+from .cuda_scene import WORK, free, sent
 from .hits import Returns
-from .layout import lay_out
+from .memory import lacking
 from .mesh import LocalMesh
 from .rays import Pattern, Rays
 
 _STACK_STEP = 32
-_WORK = 1 << 28  # bytes on the device for a chunk of rays and its hits
+_RAY_BYTES = 104  # a ray of a chunk: origin, direction, hit with its weights, sums; 101 and room
 _KEEP = 1 << 30  # bytes of hits that wait on the device, at most
 
 
 class CudaBackend(Backend):
-    """The walk of intersect.cu, one thread a ray; only hits come back from the device."""
+    """The walk of intersect.cu, one thread a ray; only hits come back from the device.
+
+    Kernels and copies are in the order of the thread's current stream, and every call ends with
+    a copy to the host, for which CuPy waits: when it returns, the device has done with all that
+    the call used. What outlives a call, tables and patterns, is waited for when it is made, so
+    threads with streams of their own may use it. All calls switch to the caster's device and
+    back, whatever device the thread is on.
+    """
 
     name: ClassVar[str] = "cuda"
-    chunk: ClassVar[int] = 1 << 22  # rays: some 150 MB on the device
+    # Rays: some 430 MB on the device. The grid, the sums of hits and the places in a chunk's
+    # arrays are far from 2**31 with it; only the number of a ray needs 64 bits.
+    chunk: ClassVar[int] = 1 << 22
     device_build: ClassVar[int] = 4096  # triangles from which the device builds the tree faster
 
     @classmethod
@@ -60,11 +71,12 @@ class CudaBackend(Backend):
         self._cupy = cupy = self._library()
         self._device = _device(cupy, device)
         with self._device:
-            tables = self._tables(mesh)
+            tables = cuda_scene.make(cupy, self._device.id, mesh, self.device_build)
             # In steps, so that scenes share what is compiled.
             self._stack = -(-max(tables.stack, 1) // _STACK_STEP) * _STACK_STEP
             self._kernels = Kernels(cupy, self._device.id, "intersect.cu", flags(self._stack))
-            self._keep = min(_KEEP, _free(cupy) // 4)
+            self._keep = max(0, min(_KEEP, (free(cupy) - WORK) // 4))
+            cupy.cuda.get_current_stream().synchronize()
         self._corners, self._faces, self._frame = tables.corners, tables.faces, tables.frame
         self._scene = (tables.nodes, tables.triangles, tables.corners, tables.faces, tables.frame)
         self._room = PinnedRoom(cupy)
@@ -78,34 +90,22 @@ class CudaBackend(Backend):
 
         return cupy
 
-    def _tables(self, mesh: LocalMesh) -> cuda_build.Tables:
-        """Build the scene where that is faster, and where there is memory for it."""
-        cupy, n = self._cupy, len(mesh.corners)
-        free = _free(cupy)
-        if n >= max(self.device_build, 1) and cuda_build.BYTES * n + _WORK <= free:
-            tables = cuda_build.build(cupy, self._device.id, mesh)
-            cupy.get_default_memory_pool().free_all_blocks()  # several times what is kept
-            return tables
-        layout = lay_out(mesh)
-        need = layout.nbytes + _WORK
-        if need > free:
-            raise MemoryError(
-                f"The mesh needs {need / 2**20:.0f} MiB on the CUDA device and "
-                f"{free / 2**20:.0f} MiB are free: use a smaller mesh or backend 'embree'."
-            )
-        return cuda_build.Tables(
-            cupy.asarray(layout.nodes),
-            cupy.asarray(layout.triangles),
-            cupy.asarray(layout.corners),
-            cupy.asarray(layout.faces),
-            cupy.asarray(layout.frame),
-            layout.stack,
-        )
+    @contextmanager
+    def _on_device(self, rays: int) -> Iterator[None]:
+        """Switch to the device; what it has no memory for is told in both numbers."""
+        with self._device:
+            try:
+                yield
+            except self._cupy.cuda.memory.OutOfMemoryError as error:
+                need = _RAY_BYTES * min(rays, self.chunk) + 8 * self._mesh.face_count + self._keep
+                what = f"On CUDA device {self._device.id} a cast of {rays:,} rays"
+                instead = "free some, or use another device or backend 'embree'"
+                raise MemoryError(lacking(need, free(self._cupy), what, instead)) from error
 
     def closest(self, rays: Rays, weights: bool) -> Found:
         """See `Backend.closest`."""
         cp = self._cupy
-        with self._device:
+        with self._on_device(len(rays)):
             table = self._table(rays)
             t, place = self._cast("cast_table", len(rays), self._limited(table, rays))
             ray, *hits = self._packer().add(t, place, 0, 1.0)
@@ -123,7 +123,7 @@ class CudaBackend(Backend):
 
     def returns(self, rays: Rays) -> Returns:
         """See `Backend.returns`."""
-        with self._device:
+        with self._on_device(len(rays)):
             packer = self._packer()
             for start in range(0, len(rays), self.chunk):
                 part = rays.part(start, start + self.chunk)
@@ -140,7 +140,7 @@ class CudaBackend(Backend):
         interval: tuple[float, float],
     ) -> Returns:
         """See `Backend.scan`; the rays are made on the device."""
-        with self._device:
+        with self._on_device(window[1] - window[0]):
             packer = self._packer()
             for start, n, rays in self._turned(pattern, window, origin, rotation, interval):
                 packer.add(*self._cast("cast_pattern", n, rays), start, self._mesh.scale)
@@ -148,7 +148,7 @@ class CudaBackend(Backend):
 
     def count(self, rays: Rays, every: bool) -> NDArray[np.int64]:
         """See `Backend.count`; only the counts leave the device."""
-        with self._device:
+        with self._on_device(len(rays)):
             counts = self._cupy.zeros(self._mesh.face_count, np.int64)
             for start in range(0, len(rays), self.chunk):
                 part = rays.part(start, start + self.chunk)
@@ -166,7 +166,7 @@ class CudaBackend(Backend):
         every: bool,
     ) -> NDArray[np.int64]:
         """See `Backend.count_scan`; the rays are made on the device."""
-        with self._device:
+        with self._on_device(window[1] - window[0]):
             counts = self._cupy.zeros(self._mesh.face_count, np.int64)
             for _, n, rays in self._turned(pattern, window, origin, rotation, interval):
                 self._tally("pattern", n, rays, every, counts)
@@ -203,11 +203,14 @@ class CudaBackend(Backend):
 
     def _directions(self, pattern: Pattern) -> Any:
         """Directions of a pattern: on the device, if there is room for all of them."""
-        if pattern not in self._patterns:
-            if pattern.directions.nbytes + _WORK > _free(self._cupy):
+        cupy, kept = self._cupy, self._patterns.get(pattern)
+        if kept is None:
+            if pattern.directions.nbytes + self._keep + WORK > free(cupy):
                 return pattern.directions
-            self._patterns[pattern] = self._cupy.asarray(pattern.directions)
-        return self._patterns[pattern]
+            # Two threads may both come here: then the second copy is kept, and both are right.
+            kept = self._patterns[pattern] = sent(cupy, pattern.directions)
+            cupy.cuda.get_current_stream().synchronize()
+        return kept
 
     # ---- casts ----
 
@@ -240,9 +243,3 @@ def _device(cupy: Any, number: int | None) -> Any:
     if number is not None and not 0 <= number < count:
         raise ValueError(f"There is no CUDA device {number}: this process sees {count}, from 0.")
     return cupy.cuda.Device(number)
-
-
-def _free(cupy: Any) -> int:
-    """Bytes that can be had on the current device."""
-    free = cupy.cuda.runtime.memGetInfo()[0] + cupy.get_default_memory_pool().free_bytes()
-    return int(free)

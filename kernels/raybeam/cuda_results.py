@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .cuda_module import Kernels
-from .hits import Returns
+from .hits import Gathering, Returns
 
 _PINNED = 1 << 30  # bytes that are page-locked, at most
 _LEAST = 1 << 16
@@ -31,6 +31,7 @@ class PinnedRoom:
 
     def __init__(self, cupy: Any, limit: int = _PINNED) -> None:
         self._allocate = cupy.cuda.PinnedMemory
+        self._refused = cupy.cuda.runtime.CUDARuntimeError
         self._limit = limit
         self._held = 0  # bytes, free ones included
         self._free: dict[int, list[Any]] = {}  # {bytes: blocks of that size}
@@ -63,7 +64,12 @@ class PinnedRoom:
             if not size or self._held + size > self._limit:
                 return None
             self._held += size
-        return self._allocate(size)
+        try:
+            return self._allocate(size)
+        except self._refused:  # the system locks no more pages: ordinary ones will do
+            with self._lock:
+                self._held -= size
+            return None
 
     def _give_back(self, size: int, block: Any) -> None:
         with self._lock:
@@ -94,7 +100,7 @@ class Packer:
         self._limit = limit
         self._waiting: list[tuple[Any, ...]] = []  # on the device: ray, distance, triangle
         self._bytes = 0
-        self._fetched: list[tuple[NDArray[Any], ...]] = []
+        self._fetched = Gathering()
 
     def add(self, distance: Any, place: Any, first: int, scale: float) -> tuple[Any, ...]:
         """Take the results of a cast, one entry a ray; distances are divided by `scale`.
@@ -117,9 +123,7 @@ class Packer:
     def returns(self) -> Returns:
         """Everything taken, on the host."""
         self._fetch()
-        if len(self._fetched) == 1:
-            return Returns(*self._fetched[0])
-        return Returns(*(np.concatenate(parts) for parts in zip(*self._fetched, strict=True)))
+        return self._fetched.returns()
 
     def _fetch(self) -> None:
         total = sum(len(ray) for ray, _, _ in self._waiting)
@@ -129,7 +133,9 @@ class Packer:
             stop = start + len(parts[0])
             if stop > start:
                 for part, array in zip(parts, arrays, strict=True):
+                    # Waits for the copy: page-locked memory may be lent again, and the device's
+                    # used by another stream, once this returns.
                     part.get(out=array[start:stop])
             start = stop
-        self._fetched.append(arrays)
+        self._fetched.add(Returns(*arrays))
         self._waiting, self._bytes = [], 0

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from .backend import Backend, Found
 from .clip import clip
 from .hits import Returns
+from .memory import Meter, require
 from .mesh import LocalMesh
 from .rays import Pattern, Rays
 from .refine import Refiner
@@ -28,6 +29,12 @@ _NUDGE = 2.0**-20
 # A ray that starts farther from zero than this, in local units, is begun at the scene's box:
 # then float32 rounds by the scene's size, not by the way to it.
 _NEAR = 2.0
+
+_PAIR_BYTES = 24  # a hit in _Pairs
+
+# A triangle, at the peak of a build, the mesh apart: some 110 of them are Embree's own, which
+# Open3D 0.20 was seen to take.
+_BYTES = 300
 
 
 @dataclass(frozen=True)
@@ -74,6 +81,8 @@ class EmbreeBackend(Backend):
         import open3d
 
         super().__init__(mesh, threads, device)
+        n = len(mesh.corners)
+        require(_BYTES * n, f"Embree's tree over {n:,} triangles", "use a smaller mesh")
         self._threads = threads or 0  # 0: Open3D takes every core
         self._tensor = open3d.core.Tensor.from_numpy
         self._scene: Any = None
@@ -109,12 +118,13 @@ class EmbreeBackend(Backend):
         origins, scale = self._mesh.to_local(origin), self._mesh.scale
         t_min, t_max = interval[0] * scale, interval[1] * scale
         first, last = window
-        parts = []
+        parts, meter = [], Meter("Joining the hits", "scan a smaller window at a time")
         for start in range(first, max(last, first + 1), self.chunk):
             directions = pattern.directions[start : min(start + self.chunk, last)]
             hits = self._within(directions, rotation, origins, t_min, t_max)
             np.add(hits.ray, start - first, out=hits.ray)
             parts.append(hits)
+            meter.add(_PAIR_BYTES * len(hits.ray))
         hits = _joined(parts)
         np.divide(hits.t, scale, out=hits.t)
         ray = hits.ray.astype(np.int64, copy=False)

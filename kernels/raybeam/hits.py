@@ -7,6 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .memory import Meter
+
+RAY_BYTES = 28  # a ray in `Hits`
+HIT_BYTES = 20  # a hit in `Returns`
+
 
 @dataclass(frozen=True)
 class Hits:
@@ -59,3 +64,27 @@ class Returns:
 
     def __len__(self) -> int:
         return len(self.ray)
+
+
+class Gathering:
+    """Hits found part after part, to be joined when all are there."""
+
+    def __init__(self) -> None:
+        self._parts: list[Returns] = []
+        self._meter = Meter("Joining the hits", "cast fewer rays at a time")
+
+    def add(self, part: Returns) -> None:
+        """Take in the next hits; raises MemoryError when they could not be joined any more."""
+        self._parts.append(part)
+        self._meter.add(HIT_BYTES * len(part))
+
+    def returns(self) -> Returns:
+        """All hits, in the order in which they were added."""
+        if len(self._parts) == 1:
+            return self._parts[0]
+        parts = [Returns(np.zeros(0, np.int64), np.zeros(0), np.zeros(0, np.int32)), *self._parts]
+        return Returns(
+            np.concatenate([part.ray for part in parts]),
+            np.concatenate([part.distance for part in parts]),
+            np.concatenate([part.triangle for part in parts]),
+        )

@@ -8,6 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .memory import require
+
+_BLOCK = 1 << 16  # triangles that are looked at together
+_VERTEX_BYTES, _FACE_BYTES = 48, 180  # while a mesh is checked, at most
+
 
 @dataclass(frozen=True)
 class LocalMesh:
@@ -65,13 +70,16 @@ def local_mesh(vertices: ArrayLike, faces: ArrayLike) -> LocalMesh:
     ------
     ValueError
         For anything else, saying which row is wrong.
+    MemoryError
+        If there is not enough memory to do that.
     """
     points = _check_vertices(vertices)
     rows = _check_faces(faces, len(points))
-    used = points[np.unique(rows)]
-    low, high = used.min(axis=0), used.max(axis=0)
+    used = np.zeros(len(points), np.bool_)
+    used[rows.reshape(-1)] = True
+    low, high = points[used].min(axis=0), points[used].max(axis=0)
     centre = low / 2 + high / 2
-    half = float(np.abs(used - centre).max())
+    half = float(np.maximum(high - centre, centre - low).max())
     if half > 0 and not 1e-100 < half < 1e100:
         raise ValueError(
             f"The mesh reaches from {low.tolist()} to {high.tolist()}: "
@@ -79,10 +87,20 @@ def local_mesh(vertices: ArrayLike, faces: ArrayLike) -> LocalMesh:
         )
     scale = math.ldexp(1.0, -math.frexp(half)[1]) if half > 0 else 1.0
     corners = ((points - centre) * scale)[rows]
-    edges = corners[:, 1:] - corners[:, :1]
-    solid = np.cross(edges[:, 0], edges[:, 1]).any(axis=1)
+    solid = np.concatenate(
+        [_solid(corners[start : start + _BLOCK]) for start in range(0, len(corners), _BLOCK)]
+    )
     index = np.flatnonzero(solid).astype(np.int32)
-    return LocalMesh(centre, scale, corners[solid], index, len(rows))
+    return LocalMesh(
+        centre, scale, corners if len(index) == len(rows) else corners[solid], index, len(rows)
+    )
+
+
+def _solid(corners: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which triangles have an area."""
+    edges = corners[:, 1:] - corners[:, :1]
+    x, y, z = np.cross(edges[:, 0], edges[:, 1]).astype(np.bool_).T
+    return x | y | z
 
 
 def _check_vertices(vertices: ArrayLike) -> NDArray[np.float64]:
@@ -113,6 +131,8 @@ def _check_faces(faces: ArrayLike, vertex_count: int) -> NDArray[np.int64]:
         raise ValueError(f"faces must be integers (rows of vertices), not {given.dtype}.")
     if len(given) >= 2**28:
         raise ValueError(f"{len(given)} triangles are too many: the limit is {2**28 - 1}.")
+    need = _VERTEX_BYTES * vertex_count + _FACE_BYTES * len(given)
+    require(need, f"A mesh of {len(given):,} triangles", "use a smaller mesh")
     bad = ((given < 0) | (given >= vertex_count)).any(axis=1)
     if bad.any():
         row = int(np.argmax(bad))
@@ -120,4 +140,4 @@ def _check_faces(faces: ArrayLike, vertex_count: int) -> NDArray[np.int64]:
             f"Face {row} is {given[row].tolist()}, but there are {vertex_count} vertices: "
             f"indices must be 0 to {vertex_count - 1}."
         )
-    return given.astype(np.int64)
+    return given.astype(np.int64, copy=False)

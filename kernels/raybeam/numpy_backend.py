@@ -9,12 +9,14 @@ from numpy.typing import NDArray
 
 from .backend import Backend, Found
 from .crossings import Crossings
+from .memory import require
 from .mesh import LocalMesh
 from .rays import Rays
 from .tree import build_tree
 
 _WIDTH = 8
 _LEAF_SIZE = 4
+_BYTES = 260  # a triangle, at the peak of a build, the mesh apart
 
 
 class NumpyBackend(Backend):
@@ -32,6 +34,8 @@ class NumpyBackend(Backend):
         self, mesh: LocalMesh, threads: int | None = None, device: int | None = None
     ) -> None:
         super().__init__(mesh, threads, device)
+        n = len(mesh.corners)
+        require(_BYTES * n, f"The tree over {n:,} triangles", "use a smaller mesh")
         self._walker = Crossings(mesh, build_tree(mesh.corners, _WIDTH, _LEAF_SIZE))
 
     def closest(self, rays: Rays, weights: bool) -> Found:

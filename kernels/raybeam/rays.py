@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .memory import require
+
 # A squared length this close to 1 is a unit vector up to rounding and is left as it is, so that
 # directions which are normalised already are not moved by another last bit.
 _UNIT_SLACK = 1e-14
@@ -65,10 +67,12 @@ class Pattern:
     ------
     ValueError
         For a wrong shape, or a direction that is zero or not finite.
+    MemoryError
+        If there is no room for them.
     """
 
     def __init__(self, directions: ArrayLike) -> None:
-        self.directions = unit_directions(directions).copy()
+        self.directions = unit_directions(directions)
         self.directions.flags.writeable = False
 
     def __len__(self) -> int:
@@ -127,13 +131,19 @@ def check_interval(t_min: float, t_max: float) -> tuple[float, float]:
 
 
 def unit_directions(directions: ArrayLike) -> NDArray[np.float64]:
-    """Directions as float64 unit vectors (n, 3); raises ValueError for zero, NaN and inf.
+    """Directions as new float64 unit vectors (n, 3); raises ValueError for zero, NaN and inf.
 
-    Each row's result depends on that row alone, so that batches may be cut anywhere.
+    Each row's result depends on that row alone, so that batches may be cut anywhere. Raises
+    MemoryError when there is no room for them.
     """
-    table = _float64(_table("directions", directions))
+    table = _table("directions", directions)
     _refuse_directions(table)
-    return _normalised(table)
+    need = 24 * len(table)
+    require(need, f"A pattern of {len(table):,} directions", "cast it in several patterns")
+    out = np.empty((len(table), 3))
+    for start in range(0, len(table), _BLOCK):
+        out[start : start + _BLOCK] = _normalised(_float64(table[start : start + _BLOCK]))
+    return out
 
 
 def _normalised(table: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -106,6 +106,14 @@ class Kernels:
         return launch
 
 
+class DeviceFullError(MemoryError):
+    """What CuPy raises when the device has no memory left."""
+
+
+class CudaError(RuntimeError):
+    """What CuPy raises when a call of CUDA fails."""
+
+
 class Module(SimpleNamespace):
     __hash__ = object.__hash__
 
@@ -134,7 +142,13 @@ HOST = Module(
     cuda=SimpleNamespace(
         Device=Device,
         PinnedMemory=Pinned,
-        runtime=SimpleNamespace(getDeviceCount=lambda: 1, memGetInfo=lambda: (1 << 34, 1 << 35)),
+        get_current_stream=lambda: SimpleNamespace(synchronize=lambda: None),
+        memory=SimpleNamespace(OutOfMemoryError=DeviceFullError),
+        runtime=SimpleNamespace(
+            getDeviceCount=lambda: 1,
+            memGetInfo=lambda: (1 << 34, 1 << 35),
+            CUDARuntimeError=CudaError,
+        ),
     ),
 )
 

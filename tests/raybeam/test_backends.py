@@ -105,7 +105,7 @@ def test_device_that_is_not_there(source_backend, device):
 def test_mesh_that_does_not_fit_the_device(source_backend, monkeypatch):
     runtime = source_backend._library().cuda.runtime
     monkeypatch.setattr(runtime, "memGetInfo", lambda: (200 << 20, 1 << 30))
-    with pytest.raises(MemoryError, match=r"needs 256 MiB .* and 200 MiB are free"):
+    with pytest.raises(MemoryError, match=r"needs 768 MiB .* and 200 MiB are free"):
         source_backend(local_mesh(*MESH))
 
 

@@ -66,7 +66,6 @@ def test_runs_at_toy_size(source_backend, monkeypatch, tmp_path, capsys):
     cuda.nvrtc = SimpleNamespace(getVersion=lambda: (0, 0))
     cuda.runtime = SimpleNamespace(
         **vars(host.cuda.runtime),
-        CUDARuntimeError=RuntimeError,
         getDeviceProperties=lambda number: {"name": b"none"},
         driverGetVersion=lambda: 0,
         runtimeGetVersion=lambda: 0,

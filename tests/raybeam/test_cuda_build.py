@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from raybeam import RayCaster, cuda_build
+from raybeam import RayCaster, cuda_build, cuda_scene
 from raybeam.layout import lay_out
 from raybeam.mesh import local_mesh
 
@@ -115,8 +115,8 @@ def test_device_builds_where_it_pays(source_backend, shapes, monkeypatch, triang
 
 def test_host_builds_where_only_the_tables_fit(source_backend, shapes, monkeypatch):
     mesh = local_mesh(*shapes["soup"]("random", count=4000))
-    need = lay_out(mesh).nbytes + (1 << 28)
-    assert need < cuda_build.BYTES * len(mesh.corners) + (1 << 28)
+    need = lay_out(mesh).nbytes + cuda_scene.WORK
+    assert need < cuda_build.BYTES * len(mesh.corners) + cuda_scene.WORK
     runtime = source_backend._library().cuda.runtime
     monkeypatch.setattr(runtime, "memGetInfo", lambda: (need, 1 << 35))
     monkeypatch.setattr(cuda_build, "build", None)

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from raybeam import Pattern
+from raybeam import Pattern, cuda_scene
 from raybeam.cuda_results import PinnedRoom
 from raybeam.mesh import local_mesh
 
@@ -26,10 +26,20 @@ class Locked:
         Locked.now -= self.size
 
 
+class RefusedError(RuntimeError):
+    pass
+
+
 @pytest.fixture
 def room():
     Locked.now = 0
-    return PinnedRoom(SimpleNamespace(cuda=SimpleNamespace(PinnedMemory=Locked)), limit=1 << 20)
+    return made(Locked)
+
+
+def made(memory):
+    runtime = SimpleNamespace(CUDARuntimeError=RefusedError)
+    cuda = SimpleNamespace(PinnedMemory=memory, runtime=runtime)
+    return PinnedRoom(SimpleNamespace(cuda=cuda), limit=1 << 20)
 
 
 def is_locked(array):
@@ -91,6 +101,16 @@ def test_nothing_needs_no_room(room):
     assert Locked.now == 0
 
 
+def test_ordinary_memory_when_the_system_locks_no_more():
+    def refuse(size):
+        raise RefusedError(size)
+
+    room = made(refuse)
+    array = room.empty(100, np.int64)
+    assert not is_locked(array)
+    assert repr(room) == f"PinnedRoom(0 of {1 << 20} bytes held)"
+
+
 def test_repr(room):
     room.empty(1, np.int32)
     assert repr(room) == f"PinnedRoom({1 << 16} of {1 << 20} bytes held)"
@@ -120,9 +140,10 @@ def test_pattern_that_does_not_fit_goes_chunk_by_chunk(source_backend, shapes, m
     pattern = Pattern(np.random.default_rng(0).normal(size=(3000, 3)))
     given = ((5, 2990), np.array([[0.05, 0.1, 0.4]]), None, (0.0, np.inf))
     runtime = source_backend._library().cuda.runtime
+    room = cuda_scene.WORK + engine._keep
     monkeypatch.setattr(source_backend, "chunk", 500)
     with monkeypatch.context() as patch:
-        patch.setattr(runtime, "memGetInfo", lambda: ((1 << 28) + 3000 * 24 - 1, 1 << 30))
+        patch.setattr(runtime, "memGetInfo", lambda: (room + 3000 * 24 - 1, 1 << 35))
         got = engine.scan(pattern, *given)
         assert pattern not in engine._patterns
     want = engine.scan(pattern, *given)
