@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import uuid
+from collections import deque
+from collections.abc import Sequence
 
 from distributed import Client, Future
 
@@ -25,14 +27,23 @@ class TrialPump:
         Where the trials run.
     planning
         What to plan.
+    done
+        Trials that an earlier run has finished.
     """
 
-    def __init__(self, client: Client, partition: Partition, planning: Planning) -> None:
+    def __init__(
+        self,
+        client: Client,
+        partition: Partition,
+        planning: Planning,
+        done: Sequence[Trial] = (),
+    ) -> None:
         self.client, self.partition, self.planning = client, partition, planning
-        self.trials: list[Trial] = []
+        self.trials: list[Trial] = list(done)
         self.records: list[TaskRecord] = []
         self._run_id = uuid.uuid4().hex[:8]
-        self._submitted = 0
+        known = {trial.trial for trial in done}
+        self._waiting = deque(n for n in range(planning.trials) if n not in known)  # numbers
         self._running: dict[Future, int] = {}  # {future: number of the trial}
         # One waits behind each that runs: no slot idles, and a dying worker takes few along.
         self._most = 2 * max(1, partition.slots)
@@ -63,19 +74,19 @@ class TrialPump:
             trial, record = future.result(timeout=30)
             self.trials.append(trial)
             self.records.append(record)
-        room = min(self._most - len(self._running), self.planning.trials - self._submitted)
+        room = min(self._most - len(self._running), len(self._waiting))
         for _ in range(room):
+            number = self._waiting.popleft()
             future = self.partition.submit(
                 recorded,
                 TRIAL,
                 self.partition.name,
                 run_trial,
                 self.planning,
-                self._submitted,
-                key=f"{TRIAL}-{self._run_id}-{self._submitted}",
+                number,
+                key=f"{TRIAL}-{self._run_id}-{number}",
             )
-            self._running[future] = self._submitted
-            self._submitted += 1
+            self._running[future] = number
         return bool(done or room > 0)
 
     def stop(self, reason: str) -> None:

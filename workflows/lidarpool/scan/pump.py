@@ -77,6 +77,10 @@ class SurveyPump:
         Items that stage 1 may be ahead.
     collectors
         Number of tasks of stage 4.
+    cloud
+        Where the points go, with those that an earlier run has delivered.
+    frames_done
+        Frames that an earlier run has delivered: those of scans 0 to frames_done - 1.
     """
 
     def __init__(
@@ -88,14 +92,20 @@ class SurveyPump:
         on_frame: Callable[[Frame], None],
         queue_capacity: int = 10,
         collectors: int = 2,
+        cloud: CloudBuilder | None = None,
+        frames_done: int = 0,
     ) -> None:
         self.client, self.partitions, self.survey = client, partitions, survey
         self.on_frame = on_frame
         self.run_id = uuid.uuid4().hex[:8]
-        self.cloud = CloudBuilder(survey.scan_count)
+        self.cloud = CloudBuilder(survey.scan_count) if cloud is None else cloud
         self.frames = Ledger(survey.scan_count)
         self.generated = Ledger(survey.scan_count)
-        self.cast = 0  # scans that stage 2 has finished
+        self.frames.restore(range(frames_done))
+        self._resumed = Ledger(survey.scan_count)  # scans that an earlier run has done both ways
+        self._resumed.restore(s for s in range(frames_done) if s in self.cloud.ledger)
+        self.generated.restore(s for s in range(frames_done) if s in self._resumed)
+        self.cast = self._resumed.delivered  # scans that stage 2 has finished
         self.replayed = 0  # batches that were put into a pipe once more
         self.records: list[TaskRecord] = []
 
@@ -252,6 +262,8 @@ class SurveyPump:
             wire, known = [], []
             for numbers in item:
                 scan = int(numbers[0])
+                if scan in self._resumed:
+                    continue  # it is described all the same: the generator knows only a start
                 if self.generated.accept(scan):
                     wire.append(numbers)
                 else:
