@@ -5,14 +5,21 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from contextlib import suppress
 from dataclasses import replace
+from typing import Any
 
 from distributed import Client
 
 from .declare import declare
+from .dissolve import dissolve
 from .errors import PoolError
+from .fence import raise_fence
+from .moves import follow, unfollow
 from .partition import Partition
 from .probe import probe_worker
+from .rebalancing import Help
+from .rules import Count, Named, PerGpu, PerHost, Rule, check_rule, check_rules, divide
 from .selection import check_request, choose
 from .worker_info import WorkerInfo
 
@@ -143,6 +150,45 @@ class Pool:
 
     # -- dividing ----------------------------------------------------------------------
 
+    def divide(self, rules: Mapping[str, Rule]) -> dict[str, Partition]:
+        """Divide this pool by rules, which hold from now on, also when this client has gone.
+
+        Each rule takes of the workers that those before it have left. The scheduler follows
+        them: a worker that joins later gets its partition by them, where one is short of
+        workers first, and tasks that waited run. A worker that comes back is in its partition
+        again; while its nanny starts it, its place is kept for half a minute.
+
+        Parameters
+        ----------
+        rules
+            What each partition wants, by name; see `per_gpu`, `per_host`, `n_workers`,
+            `named` and `rest`.
+
+        Returns
+        -------
+        dict
+            The partitions by name.
+
+        Raises
+        ------
+        PoolError
+            If a partition would have fewer workers than its minimum.
+
+        Examples
+        --------
+        >>> from poolpart import Pool, per_gpu, per_host, rest
+        >>> parts = Pool.from_client(client).divide(                   # doctest: +SKIP
+        ...     {"GPU": per_gpu(1), "LIDAR": per_host(2), "OTHER": rest(exclusive=True)}
+        ... )
+        >>> parts["GPU"].submit(pow, 2, 10).result()                   # doctest: +SKIP
+        1024
+        """
+        check_rules(rules)
+        cluster = self._cluster_now()
+        mine = [cluster[worker.name] for worker in self.workers if worker.name in cluster]
+        chosen, notes = divide(rules, mine)
+        return self._make(rules, chosen, notes, cluster)
+
     def partition(
         self,
         name: str,
@@ -152,6 +198,8 @@ class Pool:
         n_workers: int | None = None,
         workers: Sequence[str] | None = None,
         slots: int | None = None,
+        minimum: int = 1,
+        exclusive: bool = False,
     ) -> tuple[Partition, Pool]:
         """Take workers out of this pool under a name.
 
@@ -159,6 +207,7 @@ class Pool:
         declare it again when their nanny restarts them. Tasks that wait for the resource
         already are sent to them. What counts is the cluster as it is now: a worker that has
         left, or that another partition has taken since this pool was made, is not chosen.
+        Workers that join later belong by the same selector, as with `divide`.
 
         Parameters
         ----------
@@ -175,6 +224,10 @@ class Pool:
             These workers, by name or address.
         slots
             Tasks that each worker takes at a time; its number of threads by default.
+        minimum
+            Workers that the partition keeps whatever is moved.
+        exclusive
+            Whether tasks of others are kept off its workers, see `raise_fence`.
 
         Returns
         -------
@@ -204,18 +257,97 @@ class Pool:
             n_workers=n_workers,
             workers=workers,
         )
-        if note:
-            logger.warning("Partition %r: %s", name, note)
+        common = {"slots": slots, "minimum": minimum, "exclusive": exclusive}
+        rule = _rule(given, [worker.name for worker in chosen], common)
+        check_rule(name, rule)
+        made = self._make({name: rule}, {name: chosen}, {name: note}, cluster)
         names = {worker.name for worker in chosen}
-        _check_sole(name, [worker for worker in cluster.values() if worker.name not in names])
-        declare(
-            self.client,
-            name,
-            {worker.name: slots or worker.nthreads for worker in chosen},
-            [worker.address for worker in chosen],
-        )
         rest = Pool(self.client, [worker for worker in mine if worker.name not in names])
-        return Partition(name, self.client, note), rest
+        return made[name], rest
+
+    def _make(
+        self,
+        rules: Mapping[str, Rule],
+        chosen: Mapping[str, Sequence[WorkerInfo]],
+        notes: Mapping[str, str],
+        cluster: Mapping[str, WorkerInfo],
+    ) -> dict[str, Partition]:
+        """Make partitions of workers that were chosen for them."""
+        for name in rules:
+            names = {worker.name for worker in chosen[name]}
+            _check_sole(name, [worker for worker in cluster.values() if worker.name not in names])
+            if note := notes.get(name):
+                logger.warning("Partition %r: %s", name, note)
+        declare(self.client, rules, chosen, list(cluster.values()))
+        try:
+            for name, rule in rules.items():
+                if rule.exclusive:
+                    raise_fence(self.client, name)
+        except PoolError:
+            with suppress(PoolError):  # the first error is the one to tell of
+                dissolve(self.client, list(rules), timeout_s=0)
+            raise
+        return {name: Partition(name, self.client, notes.get(name, "")) for name in rules}
+
+    def rebalance(self, lender: str, *, helps: str, idle_s: float = 1.0) -> None:
+        """Let idle workers of a partition help another one, from now on.
+
+        While tasks of `helps` wait for a slot, workers of `lender` that have had nothing to
+        do for a while are moved there, as far as its minimum allows. They go back as soon as
+        tasks of `lender` wait, once what they have begun has ended, or when they have had
+        nothing to do there either. The scheduler does this, also when this client has gone.
+
+        Parameters
+        ----------
+        lender, helps
+            Names of the partitions.
+        idle_s
+            Seconds without a task after which a worker counts as idle.
+
+        Raises
+        ------
+        PoolError
+            If there is no such partition.
+
+        Examples
+        --------
+        >>> pool.rebalance("OTHER", helps="GPU")                       # doctest: +SKIP
+        """
+        follow(self.client, Help(lender, helps, idle_s))
+
+    def stop_rebalancing(self, lender: str, *, helps: str, timeout_s: float = 60.0) -> list[str]:
+        """Undo `rebalance`: the workers that were lent go back; returns their names.
+
+        Raises
+        ------
+        PoolError
+            If tasks that they have begun do not end in time; the workers go back when they do.
+        """
+        return unfollow(self.client, lender, helps, timeout_s)
+
+    def dissolve(self, timeout_s: float = 30.0) -> list[str]:
+        """Undo every partition of this cluster that was made while it ran, whoever made it.
+
+        Workers declare what they did when they were found, and so they do after a restart.
+        Rules and fences are gone. Results that are held stay; should one be lost, any worker
+        computes it again. Partitions that workers were started with stay.
+
+        Parameters
+        ----------
+        timeout_s
+            How long to wait for the partitions' tasks to end.
+
+        Returns
+        -------
+        list of str
+            Names of the partitions that there were.
+
+        Raises
+        ------
+        PoolError
+            If tasks of theirs have not ended; then everything stays.
+        """
+        return dissolve(self.client, None, timeout_s)
 
     def _cluster_now(self) -> dict[str, WorkerInfo]:
         """Every worker of the cluster by name; the GPUs of those in this pool are known."""
@@ -223,6 +355,17 @@ class Pool:
         identities = self.client.scheduler_info(n_workers=-1)["workers"]
         workers = (WorkerInfo.from_identity(a, i) for a, i in identities.items())
         return {w.name: replace(w, gpus=gpus.get(w.name, ())) for w in workers}
+
+
+def _rule(given: Mapping[str, Any], names: Sequence[str], common: Mapping[str, Any]) -> Rule:
+    """Rule that goes on choosing as a selector of `Pool.partition` does."""
+    if given["max_workers_per_gpu"] is not None:
+        return PerGpu(most=given["max_workers_per_gpu"], **common)
+    if given["max_workers_per_host"] is not None:
+        return PerHost(most=given["max_workers_per_host"], **common)
+    if given["n_workers"] is not None:
+        return Count(workers=given["n_workers"], **common)
+    return Named(names=tuple(names), **common)
 
 
 def _check_sole(name: str, others: Iterable[WorkerInfo]) -> None:

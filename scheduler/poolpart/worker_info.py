@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 
@@ -39,6 +39,10 @@ class WorkerInfo:
     def partitions(self) -> frozenset[str]:
         """The partitions that it belongs to: the resources of which it has a slot."""
         return frozenset(name for name, slots in self.resources.items() if slots)
+
+    def with_gpus(self, gpus: Iterable[str]) -> WorkerInfo:
+        """Describe the same worker with these GPUs."""
+        return replace(self, gpus=tuple(gpus))
 
     @classmethod
     def from_identity(

@@ -1,0 +1,99 @@
+"""Undoing partitions: the cluster is as it was found."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Collection
+from typing import Any
+
+from distributed import Client
+
+from .book import names_of
+from .declare import ask
+from .errors import PoolError
+from .fence import lower_fence
+from .placing import asks_for
+from .steward import LOOK_EVERY_S, Steward
+
+_UNFINISHED = ("waiting", "queued", "no-worker", "processing")
+
+
+def dissolve(client: Client, names: Collection[str] | None, timeout_s: float) -> list[str]:
+    """Undo partitions that were made while the cluster ran, all of them if None.
+
+    Parameters
+    ----------
+    client
+        Client of the cluster.
+    names
+        The partitions.
+    timeout_s
+        How long to wait for their tasks to end.
+
+    Returns
+    -------
+    list of str
+        Names of the partitions that there were.
+
+    Raises
+    ------
+    PoolError
+        If tasks of theirs have not ended; then they stay.
+    """
+    asked = None if names is None else list(names)
+    done, fenced = ask(client, _dissolve, names=asked, timeout_s=timeout_s)
+    for name in fenced:
+        lower_fence(client, name)
+    return list(done)
+
+
+async def _dissolve(
+    steward: Steward, names: list[str] | None, timeout_s: float
+) -> tuple[list[str], list[str]]:
+    book, scheduler = steward.book, steward.scheduler
+    gone = [name for name in book.rules if names is None or name in names]
+    deadline = time.monotonic() + timeout_s
+    while tasks := _unfinished(scheduler, gone):
+        if time.monotonic() >= deadline:
+            raise PoolError(
+                f"{len(tasks)} tasks of {' and '.join(gone)} have not ended after {timeout_s:g} s, "
+                f"such as {tasks[0].key}: wait for them, or cancel them, and dissolve then."
+            )
+        await asyncio.sleep(LOOK_EVERY_S)
+    # From here to the next await nothing else happens on the scheduler.
+    fenced = [name for name in gone if book.rules[name].exclusive]
+    for name in gone:  # whoever was lent is a member of its own partition again
+        steward.rebalancing.drop_all(name)
+    seats = [seat for seat in book.seats.values() if seat.partition in gone]
+    for name in gone:
+        del book.rules[name]
+    for seat in seats:
+        book.put(seat, None)
+    _lift_restrictions(scheduler, gone)
+    if late := await steward.arrive(seats, max(timeout_s, 10.0)):
+        raise PoolError(
+            f"{names_of(late)} did not answer while {' and '.join(gone)} were dissolved; they "
+            "become what they were when they do."
+        )
+    await steward.restore_nannies(s for s in seats if book.wanted(s) == s.found)
+    return gone, fenced
+
+
+def _unfinished(scheduler: Any, names: Collection[str]) -> list[Any]:
+    return [
+        task
+        for task in scheduler.tasks.values()
+        if task.state in _UNFINISHED and asks_for(task, names)
+    ]
+
+
+def _lift_restrictions(scheduler: Any, names: Collection[str]) -> None:
+    """Let results that are still held be computed again, if they are lost, on any worker.
+
+    There is none any more that could take such a task: it would wait for ever.
+    """
+    for task in scheduler.tasks.values():
+        if asks_for(task, names):
+            kept = {n: q for n, q in task.resource_restrictions.items() if n not in names}
+            task.resource_restrictions = kept or None

@@ -1,0 +1,127 @@
+"""Lending idle workers of one partition to another that has more than it can do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+from .book import Book, Seat
+from .placing import asks_for
+
+
+@dataclass(frozen=True)
+class Help:
+    """Idle workers of one partition help another, and go back when they are needed.
+
+    Parameters
+    ----------
+    lender, borrower
+        The partitions.
+    idle_s
+        Seconds after which a worker without tasks counts as idle.
+    """
+
+    lender: str
+    borrower: str
+    idle_s: float
+
+
+class Rebalancing:
+    """Applies rules of help over and over; part of the steward.
+
+    Parameters
+    ----------
+    scheduler
+        The scheduler.
+    book
+        Who is where; changed here.
+    settle
+        Has workers follow the book.
+    """
+
+    def __init__(
+        self, scheduler: Any, book: Book, settle: Callable[[Iterable[Seat]], None]
+    ) -> None:
+        self.scheduler, self.book, self._settle = scheduler, book, settle
+        self.helps: dict[tuple[str, str], Help] = {}
+        self._idle_since: dict[str, float] = {}  # {address: when it was first seen idle}
+
+    def add(self, rule: Help) -> None:
+        """Follow a rule from now on; it replaces one for the same partitions."""
+        self.helps[rule.lender, rule.borrower] = rule
+
+    def drop(self, lender: str, borrower: str) -> list[Seat]:
+        """Follow a rule no more; returns the workers that go back."""
+        self.helps.pop((lender, borrower), None)
+        lent = self._lent(lender, borrower)
+        self._give_back(lent)
+        return lent
+
+    def drop_all(self, name: str) -> None:
+        """Follow no rule any more that has to do with a partition."""
+        for lender, borrower in list(self.helps):
+            if name in (lender, borrower):
+                self.drop(lender, borrower)
+
+    def look(self, now: float) -> None:
+        """Lend and give back what should be by now."""
+        if not self.helps:
+            return
+        self._watch(now)
+        for rule in list(self.helps.values()):
+            lent = self._lent(rule.lender, rule.borrower)
+            if needed := self.backlog(rule.lender):
+                self._give_back(sorted(lent, key=self._load)[:needed])
+            elif more := self.backlog(rule.borrower):
+                self._lend(rule, more, now)
+            else:
+                self._give_back([s for s in lent if self._idle(s, rule.idle_s, now)])
+
+    def backlog(self, name: str) -> int:
+        """Tasks of a partition that wait for a slot of it."""
+        waiting = 0
+        members = [
+            self.scheduler.workers[seat.info.address]
+            for seat in self.book.members(name, present=True)
+        ]
+        for worker in members:
+            busy = len(worker.processing) - len(worker.long_running)
+            waiting += max(0, busy - int(worker.resources.get(name, 0)))
+        if not any(worker.resources.get(name) for worker in members):
+            waiting += sum(asks_for(task, [name]) for task in self.scheduler.unrunnable)
+        return waiting
+
+    def _watch(self, now: float) -> None:
+        workers = self.scheduler.workers
+        busy = {address for address, worker in workers.items() if worker.processing}
+        self._idle_since = {
+            address: self._idle_since.get(address, now) for address in workers.keys() - busy
+        }
+
+    def _idle(self, seat: Seat, seconds: float, now: float) -> bool:
+        return now - self._idle_since.get(seat.info.address, now) >= seconds
+
+    def _load(self, seat: Seat) -> int:
+        return len(self.scheduler.workers[seat.info.address].processing)
+
+    def _lent(self, lender: str, borrower: str) -> list[Seat]:
+        return [s for s in self.book.members(borrower, present=True) if s.home == lender]
+
+    def _lend(self, rule: Help, most: int, now: float) -> None:
+        members = self.book.members(rule.lender, present=True)
+        spare = max(0, len(members) - self.book.rules[rule.lender].minimum)
+        # A worker that is itself lent goes home first.
+        idle = [s for s in members if s.home is None and self._idle(s, rule.idle_s, now)]
+        chosen = idle[: min(spare, most)]
+        for seat in chosen:
+            self.book.put(seat, rule.borrower)
+            seat.home = rule.lender
+            # The new member starts with a clean record, else it would be idle at once.
+            self._idle_since.pop(seat.info.address, None)
+        self._settle(chosen)
+
+    def _give_back(self, seats: list[Seat]) -> None:
+        for seat in seats:
+            self.book.put(seat, seat.home)
+        self._settle(seats)
