@@ -4,7 +4,7 @@ BIN := $(VENV)/bin
 OUT ?= lidarpool-out
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test slow lint format bench clean
+.PHONY: help demo test slow chaos soak lint format bench clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /\1\t/' | expand -t 10
@@ -20,6 +20,14 @@ test:  ## run the test suite
 slow:  ## the tests that take minutes, which `test` leaves out
 	@VENV=$(VENV) sh .ci/setup dev
 	$(BIN)/python -m pytest -m slow
+
+chaos:  ## 200 faults, every kind at every point of a survey; SEED=n plays them again
+	@VENV=$(VENV) sh .ci/setup dev
+	$(BIN)/python -m tests.chaos --faults 200 $(if $(SEED),--seed $(SEED))
+
+soak:  ## 10,000 scans with a worker killed every few seconds; memory as a picture in $(OUT)/
+	@VENV=$(VENV) sh .ci/setup dev
+	$(BIN)/python -m tests.chaos.soak --picture $(OUT)/soak.png
 
 lint:  ## format check, lint, types, layer contracts
 	@VENV=$(VENV) sh .ci/setup dev

@@ -1,0 +1,133 @@
+"""Do harm to surveys until so many faults were carried out: `python -m tests.chaos`.
+
+The last line says whether anything was lost; a seed plays the same faults again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import random
+import sys
+import time
+from collections import Counter
+
+from lidarpool.scan.points import DRIVER_POINTS, STAGE_POINTS
+
+from .arena import Arena
+from .events import KINDS
+from .nemesis import make_plan
+from .survey import PAUSES, Outcome, Reference, disturbed, reference, survey
+
+FAULTS_PER_RUN = 8
+VAIN_RUNS_MOST = 2  # one after the other in which nothing that was left to do could be done
+
+WORKER_POINTS = tuple(point for points in STAGE_POINTS.values() for point in points)
+
+
+class Campaign:
+    """Runs of one seed, one after the other."""
+
+    def __init__(self, faults: int, seed: int, crossed: bool = True) -> None:
+        self.what = survey()
+        self.seed = seed
+        self.waiting = make_plan(
+            seed, faults, WORKER_POINTS, DRIVER_POINTS, self.what.scan_count, crossed
+        )
+        self.outcomes: list[Outcome] = []
+        self._chance = random.Random(seed + 1)
+
+    @property
+    def done(self) -> Counter[tuple[str, str]]:
+        """Faults carried out so far, by kind and point."""
+        return sum((outcome.done for outcome in self.outcomes), Counter())
+
+    @property
+    def over(self) -> bool:
+        """Whether all faults were carried out, or there is no hope of that."""
+        recent = self.outcomes[-VAIN_RUNS_MOST:]
+        in_vain = len(recent) == VAIN_RUNS_MOST and not any(outcome.done for outcome in recent)
+        return not self.waiting or in_vain
+
+    def play(self, arena: Arena, known: Reference) -> Outcome:
+        """Make one run, with the next faults."""
+        faults, self.waiting = self.waiting[:FAULTS_PER_RUN], self.waiting[FAULTS_PER_RUN:]
+        options = {
+            "queue_capacity": self._chance.choice((2, 10)),
+            "collectors": self._chance.choice((1, 2, 2)),
+        }
+        outcome = disturbed(arena, self.what, known, faults, **options)
+        self.waiting += outcome.left
+        self.outcomes.append(outcome)
+        return outcome
+
+    def table(self) -> str:
+        """Faults carried out, by kind and point."""
+        done = self.done
+        points = sorted({point for _, point in done}, key=_rank)
+        width = max(map(len, points), default=0)
+        lines = [" " * width + "".join(f"{kind:>9}" for kind in KINDS)]
+        for point in points:
+            cells = "".join(f"{done[kind, point] or '·':>9}" for kind in KINDS)
+            lines.append(f"{point:<{width}}{cells}")
+        return "\n".join(lines)
+
+    def summary(self) -> str:
+        """The last line."""
+        verdicts = [outcome.verdict for outcome in self.outcomes]
+        lost = sum(len(verdict.lost) for verdict in verdicts)
+        duplicated = sum(len(verdict.duplicated) for verdict in verdicts)
+        identical = "yes" if all(outcome.identical for outcome in self.outcomes) else "no"
+        faults = sum(self.done.values())
+        return f"faults {faults} lost {lost} duplicated {duplicated} identical {identical}"
+
+
+def _rank(point: str) -> tuple[int, str]:
+    order = (*WORKER_POINTS, *DRIVER_POINTS)
+    return (order.index(point) if point in order else len(order)), point
+
+
+def _tell(number: int, outcome: Outcome, faults: int) -> None:
+    state = "sound" if outcome.sound else "NOT SOUND"
+    recovered = len(outcome.verdict.recovered)
+    print(
+        f"run {number}: {outcome.seconds:5.1f} s, {sum(outcome.done.values())} faults "
+        f"({faults} so far), {recovered} scans recovered, {outcome.replayed} batches replayed, "
+        f"{outcome.dropped} duplicates dropped, {state}",
+        flush=True,
+    )
+    if not outcome.sound:
+        print(f"  {outcome.error}\n  {outcome.verdict}\n  identical: {outcome.identical}")
+        print("  faults:", dict(outcome.done))
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the campaign; returns 0 if every run was sound."""
+    parser = argparse.ArgumentParser(prog="tests.chaos", description=__doc__)
+    parser.add_argument("--faults", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=None, help="random by default")
+    options = parser.parse_args(arguments)
+    logging.disable(logging.CRITICAL)  # that workers die here is no news
+    seed = random.SystemRandom().randrange(10**6) if options.seed is None else options.seed
+    print(f"seed {seed}", flush=True)
+    campaign = Campaign(options.faults, seed)
+    started = time.monotonic()
+    with Arena(pauses=PAUSES) as arena:
+        known = reference(arena, campaign.what)
+        while not campaign.over:
+            outcome = campaign.play(arena, known)
+            _tell(len(campaign.outcomes), outcome, sum(campaign.done.values()))
+    print(f"\n{campaign.table()}\n")
+    print(f"{len(campaign.outcomes)} runs in {time.monotonic() - started:.0f} s")
+    if campaign.waiting:
+        print("not reached:", ", ".join(f"{f.kind} at {f.point}" for f in campaign.waiting))
+    sound = all(outcome.sound for outcome in campaign.outcomes)
+    enough = sum(campaign.done.values()) >= options.faults
+    if not sound or not enough:
+        print(f"play it again with --seed {seed} --faults {options.faults}")
+    print(campaign.summary())
+    return 0 if sound and enough else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,115 @@
+"""The cluster that faults are done to."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from collections.abc import Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+
+import dask
+from distributed import Client, SpecCluster
+
+from poolpart import local_cluster, trace_to
+
+from .events import Board, ChaosPlugin
+
+# The scheduler goes by ten heartbeats, 5 s here, where this is less.
+TIME_TO_LIVE = "5s"
+CLOSING_S = 10.0
+_CONFIG = {
+    "distributed.scheduler.worker-ttl": TIME_TO_LIVE,
+    # Half of what is started here is killed; no need to be told each time.
+    "logging.distributed": "critical",
+}
+
+
+class Arena:
+    """A local cluster with two casting workers, several LIDAR workers, and a board.
+
+    Parameters
+    ----------
+    lidar
+        Number of LIDAR workers.
+    slots
+        Threads and slots of each.
+    pauses
+        Seconds to hold each pass of some points of the workers.
+    """
+
+    def __init__(
+        self, lidar: int = 2, slots: int = 4, pauses: Mapping[str, float] | None = None
+    ) -> None:
+        self._stack = ExitStack()
+        self._lidar, self._slots, self._pauses = lidar, slots, dict(pauses or {})
+
+    def __enter__(self) -> Arena:
+        with ExitStack() as stack:
+            stack.enter_context(dask.config.set(_CONFIG))
+            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="chaos-"))
+            self.board = Board(Path(folder))
+            self.cluster: SpecCluster = stack.enter_context(
+                local_cluster(gpu_workers=2, lidar_slots=self._slots, other_workers=1)
+            )
+            spec = self.cluster.worker_spec
+            for number in range(1, self._lidar):
+                spec[f"LIDAR-{number}"] = spec["LIDAR-0"]
+            self.cluster.sync(self.cluster._correct_state)
+            self.client = stack.enter_context(Client(self.cluster))
+            stack.callback(trace_to, None)
+            self.client.register_plugin(ChaosPlugin(folder, self._pauses))
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._stack.close()
+
+    def names(self, partition: str) -> list[str]:
+        """Names of a partition's workers, there or not."""
+        return sorted(name for name in self.cluster.worker_spec if name.startswith(partition))
+
+    def pid(self, name: str) -> int | None:
+        """Process of a worker, None while it has none."""
+        nanny = self.cluster.workers.get(name)
+        pid = getattr(nanny, "pid", None)
+        return pid if pid and _is_there(pid) else None
+
+    def address(self, name: str) -> str | None:
+        """Address of a worker, None while the scheduler does not have it."""
+        address = getattr(self.cluster.workers.get(name), "worker_address", None)
+        return address if address in self.cluster.scheduler.workers else None
+
+    def revive(self, name: str) -> None:
+        """Start a worker anew whose nanny has left with it."""
+        nanny = self.cluster.workers.get(name)
+        deadline = time.monotonic() + CLOSING_S
+        while nanny is not None and nanny.status.name not in ("closed", "failed"):
+            if time.monotonic() > deadline:
+                self.cluster.sync(nanny.close, timeout=5)
+            time.sleep(0.02)
+        self.cluster.workers.pop(name, None)
+        self.cluster.sync(self.cluster._correct_state)
+
+    def wait_until_whole(self, timeout_s: float = 60.0) -> None:
+        """Wait until every worker is there."""
+        deadline = time.monotonic() + timeout_s
+        while absent := [name for name in self.cluster.worker_spec if not self.address(name)]:
+            if time.monotonic() > deadline:
+                raise TimeoutError(f"{', '.join(absent)} did not come back in {timeout_s} s.")
+            time.sleep(0.02)
+
+
+def _is_there(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True

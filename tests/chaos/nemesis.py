@@ -1,0 +1,275 @@
+"""Who does harm: a plan of faults that follows from a seed, and the one who carries it out."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import threading
+import time
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+
+from poolpart import trace_to
+
+from .arena import Arena
+from .events import KINDS, RESTART, RETIRE, SIGNALS, STOP, Fired, Order, Sink
+
+RANDOM = "random time"  # in place of a point
+PARTITIONS = ("GPU", "LIDAR", "OTHER")
+ALL_AT_ONCE = 0.15  # part of the faults at random times that come together with the one before
+SHORT_STOPS_S, LONG_STOP_S = (0.1, 2.0), 7.0  # longer than `arena.TIME_TO_LIVE`
+LONG_STOPS = 0.1  # part of them
+LOOK_EVERY_S = 0.005
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One thing to go wrong.
+
+    Parameters
+    ----------
+    number
+        Tells faults apart; their order in the plan.
+    kind
+        One of `events.KINDS`.
+    point
+        Named point at which it happens, or `RANDOM`.
+    scan
+        At a named point: at the first pass that is about this scan or a later one.
+    after_s
+        At a random time: seconds after the one before.
+    partition
+        Whose worker, unless the one that passes the point is meant; "" for that one.
+    pick
+        Which of the workers, from 0 to 1.
+    stop_s
+        Until SIGCONT.
+    """
+
+    number: int
+    kind: str
+    point: str
+    scan: int = 0
+    after_s: float = 0.0
+    partition: str = ""
+    pick: float = 0.0
+    stop_s: float = 0.5
+
+    @property
+    def order(self) -> Order:
+        """What the board is told."""
+        return Order(self.number, self.kind, self.point, self.scan)
+
+
+def make_plan(
+    seed: int,
+    count: int,
+    worker_points: Sequence[str],
+    driver_points: Sequence[str],
+    scans: int,
+    crossed: bool = True,
+) -> list[Fault]:
+    """Choose faults: the same for the same arguments.
+
+    Parameters
+    ----------
+    seed
+        Where all choices come from.
+    count
+        How many; more if the points need more.
+    worker_points
+        Points that workers pass, which strike themselves there.
+    driver_points
+        Points that the driver passes; it strikes some worker.
+    scans
+        Number of scans of a run.
+    crossed
+        Every kind of fault at every point of the workers, rather than one.
+    """
+    chance = random.Random(seed)
+    fault = partial(_fault, chance, scans)
+    at: list[tuple[str, str, str]] = []  # (kind, point, partition)
+    for index, point in enumerate(worker_points):
+        kinds = KINDS if crossed else (KINDS[index % len(KINDS)],)
+        at += [(kind, point, "") for kind in kinds]
+    for point in driver_points:
+        at += [(chance.choice(KINDS), point, name) for name in PARTITIONS[: 1 + crossed]]
+    while len(at) < count:
+        at.append((KINDS[len(at) % len(KINDS)], RANDOM, chance.choice(PARTITIONS)))
+    chance.shuffle(at)
+    return [fault(number, *choice) for number, choice in enumerate(at)]
+
+
+def _fault(
+    chance: random.Random, scans: int, number: int, kind: str, point: str, partition: str
+) -> Fault:
+    long = chance.random() < LONG_STOPS
+    together = chance.random() < ALL_AT_ONCE
+    return Fault(
+        number,
+        kind,
+        point,
+        # A stage that starts, or says hello, is about no scan yet.
+        scan=0 if point.endswith((".start", ".hello")) else chance.randrange(scans * 9 // 10),
+        after_s=0.0 if together else chance.uniform(0.05, 1.5),
+        partition=partition,
+        pick=chance.random(),
+        stop_s=LONG_STOP_S if long else chance.uniform(*SHORT_STOPS_S),
+    )
+
+
+class Nemesis:
+    """Carries out faults during a run; a context manager around it.
+
+    Parameters
+    ----------
+    arena
+        Where.
+    faults
+        What is to happen. Faults at points are armed at once; those at random times follow
+        one another, from when the driver passes its first point.
+    """
+
+    def __init__(self, arena: Arena, faults: Sequence[Fault]) -> None:
+        self.arena = arena
+        self.faults = {fault.number: fault for fault in faults}
+        self.done: Counter[tuple[str, str]] = Counter()  # {(kind, point): times}
+        self.left: list[Fault] = []  # afterwards: those that were not carried out
+        self.run = ""  # the run that the driver's last point told of
+        self._carried_out: set[int] = set()
+        self._stopped: dict[int, float] = {}  # {pid: when it is to go on}
+        self._lock = threading.Lock()
+        self._helpers: list[threading.Thread] = []
+        self._over = threading.Event()
+        self._looker = threading.Thread(target=self._watch, name="nemesis")
+
+    def __enter__(self) -> Nemesis:
+        for fault in self.faults.values():
+            if fault.point != RANDOM:
+                self.arena.board.arm(fault.order)
+        trace_to(_DriverSink(self))
+        self._looker.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        trace_to(None)
+        self._over.set()
+        self._looker.join()
+        self.arena.board.disarm()
+        for fired in self.arena.board.fired():
+            self._note(self.faults[fired.order.number])
+            fired.path.unlink()
+        for helper in self._helpers:
+            helper.join()
+        self._wake(float("inf"))
+        self.left = [f for number, f in self.faults.items() if number not in self._carried_out]
+
+    # -- in the nemesis' own thread ----------------------------------------------------
+
+    def _watch(self) -> None:
+        due = float("inf")
+        timed = [fault for fault in self.faults.values() if fault.point == RANDOM]
+        while not self._over.is_set():
+            if self.run and due == float("inf"):  # it has begun
+                due = time.monotonic()
+            if timed and time.monotonic() >= due + timed[0].after_s:
+                due = time.monotonic()
+                self.strike(timed.pop(0))
+            for fired in self.arena.board.fired():
+                self._answer(fired)
+            self._wake(time.monotonic())
+            self._over.wait(LOOK_EVERY_S)
+
+    def _answer(self, fired: Fired) -> None:
+        """Do what a process that has come to a point cannot do by itself."""
+        fault = self.faults[fired.order.number]
+        if fault.partition:  # the driver does that in its own thread
+            return
+        self._note(fault)
+        fired.path.unlink()
+        if fault.kind == STOP:
+            with self._lock:
+                self._stopped[fired.pid] = time.monotonic() + fault.stop_s
+        elif fault.kind in (RETIRE, RESTART):
+            self._help(fault.kind, fired.worker)
+
+    def _wake(self, now: float) -> None:
+        """Let those go on that have been stopped for long enough."""
+        with self._lock:
+            over = [pid for pid, until in self._stopped.items() if until <= now]
+            for pid in over:
+                del self._stopped[pid]
+        for pid in over:
+            _send(pid, signal.SIGCONT)
+
+    # -- in either thread --------------------------------------------------------------
+
+    def strike(self, fault: Fault) -> None:
+        """Carry out a fault on a worker of its partition."""
+        names = [n for n in self.arena.names(fault.partition) if self.arena.pid(n)]
+        if not names:
+            return
+        name = names[int(fault.pick * len(names))]
+        pid = self.arena.pid(name)
+        if fault.kind in SIGNALS:
+            if pid is None or not _send(pid, SIGNALS[fault.kind]):
+                return
+            if fault.kind == STOP:
+                with self._lock:
+                    self._stopped[pid] = time.monotonic() + fault.stop_s
+        elif not self._help(fault.kind, name):
+            return
+        self._note(fault)
+
+    def _help(self, kind: str, name: str) -> bool:
+        """Have a worker leave or restart, in a thread of its own; False if it is not there."""
+        address = self.arena.address(name)
+        if address is None:
+            return False
+        act = self._retire if kind == RETIRE else self._restart
+        helper = threading.Thread(target=act, args=(name, address), name=f"{kind} {name}")
+        self._helpers.append(helper)
+        helper.start()
+        return True
+
+    def _retire(self, name: str, address: str) -> None:
+        self.arena.client.retire_workers([address], close_workers=True)
+        self.arena.revive(name)
+
+    def _restart(self, name: str, address: str) -> None:
+        with suppress(KeyError, ValueError, TimeoutError):  # it left by another fault
+            self.arena.client.restart_workers([address], timeout=30, raise_for_error=False)
+
+    def _note(self, fault: Fault) -> None:
+        with self._lock:
+            if fault.number not in self._carried_out:
+                self._carried_out.add(fault.number)
+                self.done[fault.kind, fault.point] += 1
+
+
+class _DriverSink(Sink):
+    """The driver logs as the workers do; what it is to strike is a worker."""
+
+    def __init__(self, nemesis: Nemesis) -> None:
+        super().__init__(nemesis.arena.board, "driver", self._strike)
+        self._nemesis = nemesis
+
+    def __call__(self, point: str, fields: dict[str, object]) -> None:  # type: ignore[override]
+        self._nemesis.run = str(fields.get("run", ""))
+        super().__call__(point, fields)
+
+    def _strike(self, fired: Fired) -> None:
+        fired.path.unlink(missing_ok=True)
+        self._nemesis.strike(self._nemesis.faults[fired.order.number])
+
+
+def _send(pid: int, number: signal.Signals) -> bool:
+    try:
+        os.kill(pid, number)
+    except ProcessLookupError:
+        return False
+    return True

@@ -1,0 +1,130 @@
+"""The survey that is disturbed, and what became of it."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidarpool import Planning, Result, Scene, Sensor, Survey, simulate
+from lidarpool.mesh import Mesh
+from poolpart import placement_violations
+
+from .arena import Arena
+from .checker import Verdict, judge
+from .nemesis import Fault, Nemesis
+
+STEPS, POSES = 360, 2
+# Where the generator is held, so that there is time for things to go wrong.
+PAUSES = {"generate.put": 0.06}
+PLANNING = Planning((25, 25), (-30, -20), [(0, 0)], 2.0, trials=12, particles=60, iterations=60)
+
+
+def room() -> Scene:
+    """A room of 10 by 8 by 6 metres around the sensor: every ray hits."""
+    corners = np.array([[x, y, z] for x in (-5, 5) for y in (-4, 4) for z in (-3, 3)], float)
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = [t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]
+    return Scene.from_meshes([Mesh("room", corners, np.array(faces))])
+
+
+def survey(poses: int = POSES, layers: int = 8) -> Survey:
+    """Describe `poses` times 360 scans, each of two azimuths."""
+    sensor = Sensor(rays_per_revolution=720, layers=layers, vertical_fov_deg=60, step_deg=1)
+    places = [(0.5 * (pose % 7), 0.25 * (pose % 5), 0.0) for pose in range(poses)]
+    return Survey(sensor, places, STEPS, keep_every=3)
+
+
+def digest(result: Result) -> str:
+    """SHA-256 of everything that a run delivers and that must not depend on luck."""
+    cloud = result.cloud
+    plan = () if result.plan is None else (result.plan.path,)
+    arrays = (cloud.positions, cloud.scan, cloud.ring, cloud.object, result.hit_counts, *plan)
+    sha = hashlib.sha256()
+    for array in arrays:
+        array = np.asarray(array)
+        sha.update(f"{array.dtype} {array.shape} ".encode())
+        sha.update(np.ascontiguousarray(array).tobytes())
+    return sha.hexdigest()
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What an undisturbed run gives."""
+
+    digest: str
+    rows: tuple[int, ...]  # scan of each row of the cloud
+
+    @classmethod
+    def of(cls, result: Result) -> Reference:
+        """Keep what is compared."""
+        return cls(digest(result), tuple(result.cloud.scan.tolist()))
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one run."""
+
+    verdict: Verdict
+    identical: bool
+    done: Counter[tuple[str, str]]  # {(kind of fault, point): times}
+    left: tuple[Fault, ...]  # not carried out
+    seconds: float
+    replayed: int
+    dropped: int
+    misplaced: int
+    error: str = ""
+
+    @property
+    def sound(self) -> bool:
+        """Whether nobody could tell this run from an undisturbed one."""
+        return self.verdict.sound and self.identical and not self.misplaced and not self.error
+
+
+def reference(arena: Arena, what: Survey, planning: Planning | None = PLANNING) -> Reference:
+    """Run it with nobody disturbing it."""
+    result = simulate(room(), what, planning, client=arena.client, backend="numpy")
+    return Reference.of(result)
+
+
+def disturbed(
+    arena: Arena,
+    what: Survey,
+    known: Reference,
+    faults: Sequence[Fault],
+    planning: Planning | None = PLANNING,
+    **options: int,
+) -> Outcome:
+    """Run it while the nemesis does its worst, and judge what comes of it."""
+    arena.wait_until_whole()
+    arena.board.forget_events()
+    started = time.monotonic()
+    result: Result | None = None
+    error = ""
+    with Nemesis(arena, faults) as nemesis:
+        try:
+            result = simulate(
+                room(), what, planning, client=arena.client, backend="numpy", **options
+            )
+        except Exception as failure:
+            error = f"{type(failure).__name__}: {failure}"
+    return Outcome(
+        verdict=judge(
+            arena.board.events(nemesis.run),
+            what.scan_count,
+            [] if result is None else result.cloud.scan.tolist(),
+            known.rows,
+        ),
+        identical=result is not None and digest(result) == known.digest,
+        done=nemesis.done,
+        left=tuple(nemesis.left),
+        seconds=time.monotonic() - started,
+        replayed=0 if result is None else result.replayed,
+        dropped=0 if result is None else result.duplicates_dropped,
+        misplaced=0 if result is None else len(placement_violations(result.records)),
+        error=error,
+    )
