@@ -13,7 +13,7 @@ from .tree import PAD, WideTree, build_tree
 _WIDTH = 4  # seven float4 a node: one 128-byte line
 LEAF_SIZE = 4
 UNIT = 2.0**-24  # half the distance from 1 to the next float32
-FLOOR = 1e-36  # products of tiny edges round by this much where float32 underflows
+FLOOR = 1e-35  # products of tiny edges are off by less where float32 underflows to zero
 
 
 @dataclass(frozen=True)

@@ -113,3 +113,18 @@ def test_soups_with_limits(same_as_numpy, shapes):
         middles = mesh[0].reshape(-1, 3, 3).mean(axis=1)
         origins = rng.uniform(-25, 25, (500, 3))
         same_as_numpy(mesh, origins, middles - origins, 3.0, 40.0)
+
+
+@pytest.mark.parametrize("power", range(14, 24))
+def test_triangles_whose_products_underflow(same_as_numpy, power):
+    """Of edges around 1e-20 of the scene, float32 keeps no area: all must go to the exact test."""
+    rng = np.random.default_rng(power)
+    tiny = rng.normal(size=(40, 3, 3)) * 10.0 ** -rng.uniform(power, power + 1, (40, 1, 1))
+    tiny -= tiny.mean(axis=1, keepdims=True)  # a ray along an axis passes inside
+    frame = np.array([[[1, 1, 1], [1, 0.9, 1], [0.9, 1, 1]]])
+    points = np.concatenate([tiny, frame, -frame]).reshape(-1, 3)
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    rays = 0.5 * axes, -axes
+    hits = same_as_numpy((points, np.arange(len(points)).reshape(-1, 3)), *rays)
+    assert hits.hit.all()
+    np.testing.assert_allclose(hits.distance, 0.5, rtol=1e-12)

@@ -8,7 +8,7 @@ import importlib
 import pytest
 
 
-@pytest.mark.parametrize("name", ["caster", "registry"])
+@pytest.mark.parametrize("name", ["caster", "memory", "registry"])
 def test_examples(name):
     done = doctest.testmod(importlib.import_module(f"raybeam.{name}"))
     assert done.attempted > 0
