@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from distributed import Client
 
-from poolpart import Pool, PoolError, WorkerInfo
+from poolpart import Pool, PoolError, WorkerInfo, ask_workers
 from raybeam import available_backends
 
 from ._version import __version__
@@ -42,7 +42,7 @@ def check_versions(client: Client, workers: Sequence[str]) -> None:
 
         return __version__
 
-    answers = client.run(version, workers=list(workers), on_error="return")
+    answers = ask_workers(client, version, workers)
     for address, answer in answers.items():
         if isinstance(answer, ModuleNotFoundError):
             raise LidarpoolError(
@@ -90,20 +90,28 @@ def survey_pool(client: Client, collectors: int, planning: bool) -> Pool:
     return pool
 
 
-def common_backend(client: Client, wanted: str, workers: Sequence[WorkerInfo]) -> str:
+AUTO_TAKES = "Backend 'auto' takes what works."
+
+
+def common_backend(
+    client: Client, wanted: str, workers: Sequence[WorkerInfo], advice: str = AUTO_TAKES
+) -> str:
     """Name of the ray-casting backend to use on all these workers.
 
     "auto" is settled here, once: if each worker chose for itself, a cloud would depend on
-    which of them casts which scan.
+    which of them casts which scan. `advice` ends the message where one is not to be had.
 
     Raises
     ------
     LidarpoolError
         If the backend wanted is not there on all of them.
     """
-    answers: Mapping[str, dict[str, str]] = client.run(
-        available_backends, workers=[worker.address for worker in workers]
+    answers: Mapping[str, dict[str, str]] = ask_workers(
+        client, available_backends, [worker.address for worker in workers]
     )
+    for answer in answers.values():
+        if isinstance(answer, BaseException):
+            raise answer
     if not answers:
         raise LidarpoolError("The workers of partition 'GPU' left before the run started.")
     names = list(next(iter(answers.values())))
@@ -114,7 +122,7 @@ def common_backend(client: Client, wanted: str, workers: Sequence[WorkerInfo]) -
         if reasons[wanted]:
             raise LidarpoolError(
                 f"Backend {wanted!r} cannot be used on the GPU worker at {address}: "
-                f"{reasons[wanted]}. Backend 'auto' takes what works."
+                f"{reasons[wanted]}. {advice}"
             )
     return wanted
 
@@ -127,14 +135,12 @@ def check_backend_name(wanted: str) -> None:
         raise LidarpoolError(f"There is no backend {wanted!r}.{hint}")
 
 
-def check_backend_here(wanted: str) -> None:
+def check_backend_here(wanted: str, advice: str = AUTO_TAKES) -> None:
     """Refuse a backend that this machine lacks, before a local cluster is started for it."""
     check_backend_name(wanted)
     reason = available_backends().get(wanted)
     if reason:
-        raise LidarpoolError(
-            f"Backend {wanted!r} cannot be used here: {reason}. Backend 'auto' takes what works."
-        )
+        raise LidarpoolError(f"Backend {wanted!r} cannot be used here: {reason}. {advice}")
 
 
 def check_precision(scene: Scene, survey: Survey) -> None:

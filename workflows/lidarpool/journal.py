@@ -1,0 +1,377 @@
+"""The journal of a run: what has been delivered is on disk, and a later run can go on from it.
+
+A journal is a folder with two files of records, see `records.py`. `records` only grows: a
+header first, then the points of some scans, or a planning trial, in the order in which they
+came. `frames` holds one record, the totals of the frames so far, and is replaced once in a
+while. Everything in them is numbers and JSON; nothing is ever unpickled.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .deliveries import Deliveries
+from .errors import LidarpoolError
+from .identity import Identity
+from .job import Job
+from .journal_folder import (
+    FRAMES,
+    FRESH,
+    RECORDS,
+    check_ours,
+    flush_folder,
+    remove_files,
+    remove_folder,
+    remove_journal,
+)
+from .plan import Trial
+from .records import DamagedFileError, Record, RecordFile
+from .scan.messages import POINT
+from .trial_record import trial_from_json, trial_to_json
+
+FORMAT = 1
+
+_HEADER, _POINTS, _TRIAL, _TOTALS = 1, 2, 3, 4  # kinds of records
+_COUNT = struct.Struct("<I")
+
+# What reading may raise of bytes that are not what they should be.
+_UNREADABLE = (
+    ValueError, KeyError, TypeError, IndexError, AttributeError,
+    OverflowError, RecursionError, struct.error,
+)  # fmt: skip
+
+TOTALS_EVERY_S = 3.0
+TOTALS_SHARE = 20  # writing the totals may take one part in so many of the time
+_BYTES_PER_S = 100e6  # what a disk takes, until it is known
+
+
+@dataclass(frozen=True)
+class Terms:
+    """How whoever reads the messages is to say it: in Python, or on the command line."""
+
+    resume: str
+    discard: str
+
+
+PYTHON_TERMS = Terms("resume=True", "remove_journal()")
+COMMAND_TERMS = Terms("--resume", "--fresh")
+
+
+def open_journal(path: Path, job: Job, *, resume: bool, terms: Terms = PYTHON_TERMS) -> Journal:
+    """Journal for a run, with what an earlier run has left there, if it is to be resumed.
+
+    Parameters
+    ----------
+    path
+        The folder; the one that it lies in must exist.
+    job
+        What the run is to do.
+    resume
+        Whether to go on from what is there; if not, there must be nothing.
+    terms
+        How messages name what can be done.
+
+    Raises
+    ------
+    LidarpoolError
+        If it holds an unfinished run and that is not to be resumed, or cannot be: it is
+        damaged, of another run, in use, or cast with another backend than is asked for.
+        Nothing on disk is changed.
+    """
+    journal = Journal(path, job, terms)
+    journal.load()
+    if not journal.kept:
+        return journal
+    try:
+        if not resume:
+            raise LidarpoolError(
+                f"{path} holds an unfinished run, {journal.kept}: continue it with "
+                f"{terms.resume}, or drop it with {terms.discard}."
+            )
+        if job.backend not in ("auto", journal.backend):
+            raise LidarpoolError(
+                f"Backend {job.backend!r} is asked for, and the scans in the journal {path} were "
+                f"cast with {journal.backend!r}: continue with that, or drop them with "
+                f"{terms.discard}."
+            )
+    except LidarpoolError:
+        journal.close()
+        raise
+    return journal
+
+
+class Journal(Deliveries):
+    """The journal of one run; it comes into being with the first delivery.
+
+    Parameters
+    ----------
+    path
+        The folder; the one that it lies in must exist.
+    job
+        What the run is to do.
+    terms
+        How messages name what can be done.
+    """
+
+    def __init__(self, path: Path, job: Job, terms: Terms = PYTHON_TERMS) -> None:
+        super().__init__(job, self)
+        self.path, self.terms = path, terms
+        self.identity = Identity.of(job.scene, job.survey, job.planning)
+        self._file: RecordFile | None = None
+        self._totals_kept = 0  # frames that are in the totals on disk
+        costs = TOTALS_SHARE * self.totals.nbytes / _BYTES_PER_S
+        self._totals_due = time.monotonic() + max(TOTALS_EVERY_S, costs)
+
+    # -- what is in it -----------------------------------------------------------------
+
+    @property
+    def kept(self) -> str:
+        """What has been delivered, in words; empty if nothing has."""
+        if self.cloud.ledger.delivered:
+            return f"{self.cloud.ledger.delivered:,} of {self.job.survey.scan_count:,} scans"
+        if self.trials:
+            return f"{len(self.trials):,} of {self.job.trials:,} planning trials"
+        return ""
+
+    @property
+    def advice(self) -> str:
+        """What to do where the backend is not to be had, for the end of a message."""
+        if not self.resumed:
+            return super().advice
+        return (
+            f"The scans in the journal {self.path} were cast with it: continue where it is to be "
+            f"had, or drop them with {self.terms.discard}."
+        )
+
+    def load(self) -> None:
+        """Read what an earlier run has left, if there is any, and go on from it.
+
+        Raises
+        ------
+        LidarpoolError
+            If it is damaged, of another run or in use; nothing on disk is changed.
+        """
+        if not self._is_there():
+            return
+        try:
+            file = RecordFile(self.path / RECORDS)
+            try:
+                self._read(file)
+            except BaseException:
+                file.close()
+                raise
+        except BlockingIOError as error:
+            raise LidarpoolError(f"Another run is using the journal {self.path}.") from error
+        except OSError as error:
+            raise LidarpoolError(
+                f"The journal {self.path} cannot be read: {error.strerror or error}."
+            ) from error
+        except _UNREADABLE as error:
+            raise self._refusal(f"is damaged ({error})") from error
+        if self.kept:
+            self._file = file
+            self.resumed = self.cloud.ledger.delivered
+        else:  # it ended before it began; the first delivery will start it anew
+            self.backend = ""
+            file.close()
+
+    def _is_there(self) -> bool:
+        """Whether there is a file to read; LidarpoolError if others' files are in its place."""
+        if not self.path.parent.is_dir():
+            raise LidarpoolError(
+                f"The folder {self.path.parent} of the journal does not exist: make it first."
+            )
+        check_ours(self.path)
+        return (self.path / RECORDS).exists()
+
+    def _read(self, file: RecordFile) -> None:
+        for record in file.records():
+            if not self.backend:
+                self.backend = self._read_header(record)
+            elif record.kind == _POINTS:
+                self._read_points(record)
+            elif record.kind == _TRIAL:
+                self.trials.append(trial_from_json(record.payload))
+        if self.kept:
+            self._read_totals()
+            file.truncate()
+
+    def _read_header(self, record: Record) -> str:
+        """Check that the journal is of this run; returns the backend of its scans."""
+        header = json.loads(record.payload) if record.kind == _HEADER else {}
+        if header.get("format") != FORMAT:
+            raise self._refusal(
+                f"is of format {header.get('format')}, and this version reads {FORMAT}"
+            )
+        theirs, backend = Identity.from_data(header["identity"]), str(header["backend"])
+        if difference := self.identity.difference(theirs):
+            raise self._refusal(f"cannot be continued, {difference}")
+        return backend
+
+    def _read_points(self, record: Record) -> None:
+        data = record.payload
+        (scans,) = _COUNT.unpack_from(data)
+        begin = _COUNT.size + 8 * scans
+        numbers = np.frombuffer(data, "<u4", 2 * scans, _COUNT.size).reshape(2, scans)
+        points = np.frombuffer(data, POINT, offset=begin)
+        if numbers[1].sum(dtype=np.int64) != len(points):
+            raise DamagedFileError(f"{len(points):,} points where there should be others")
+        self.cloud.restore(numbers[0], numbers[1], record.offset + begin, points)
+
+    def _read_totals(self) -> None:
+        if not (self.path / FRAMES).is_file():
+            return  # the run ended before they were first written
+        file = RecordFile(self.path / FRAMES)
+        try:
+            for record in file.records():
+                self.totals.unpack(record.payload)
+        finally:
+            file.close()
+        if not self.totals.frames:  # it was replaced as a whole: no crash can have cut it
+            raise DamagedFileError(f"{FRAMES} holds no whole record")
+        self._totals_kept = self.totals.frames
+
+    def _refusal(self, why: str) -> LidarpoolError:
+        return LidarpoolError(
+            f"The journal {self.path} {why}. Drop it with {self.terms.discard}, or give "
+            "another folder."
+        )
+
+    # -- writing -----------------------------------------------------------------------
+
+    # A PointStore for its own `cloud`.
+
+    def append(self, scans: Sequence[int], counts: Sequence[int], points: NDArray[Any]) -> int:
+        """Keep the points of some whole scans; returns where they lie."""
+        table = np.array([scans, counts], "<u4")
+        head = _COUNT.pack(len(scans)) + table.tobytes()
+        rows = np.ascontiguousarray(points).view(np.uint8).data
+        return self._append(_POINTS, head, rows) + len(head)
+
+    def read_into(self, offset: int, buffer: memoryview) -> None:
+        """Fill `buffer` with what lies at `offset`."""
+        assert self._file is not None  # or nobody could know of an offset
+        self._file.read_into(offset, buffer)
+
+    def add_trial(self, trial: Trial) -> None:
+        """Keep a planning trial."""
+        self._append(_TRIAL, trial_to_json(trial))
+        super().add_trial(trial)
+
+    def look(self) -> None:
+        """Sync, and write down the totals of the frames, if it is time; call it often."""
+        if self._file is None:
+            return
+        with self._explained():
+            self._file.sync_if_due()
+            if time.monotonic() >= self._totals_due:
+                self._write_totals()
+
+    def _append(self, kind: int, *pieces: Any) -> int:
+        with self._explained():
+            if self._file is None:
+                self._file = self._create()
+            return self._file.append(kind, *pieces)
+
+    def _create(self) -> RecordFile:
+        """Make the journal with its header, and both certain to be there after a crash."""
+        self.path.mkdir(exist_ok=True)
+        try:
+            # What there may be is of an earlier run that came to nothing.
+            remove_files(self.path)
+            file = RecordFile(self.path / RECORDS)
+            header = {
+                "format": FORMAT,
+                "backend": self.backend,
+                "identity": self.identity.to_data(),
+            }
+            file.append(_HEADER, json.dumps(header).encode())
+            file.sync()
+            flush_folder(self.path)
+            flush_folder(self.path.parent)
+        except OSError:
+            remove_files(self.path)
+            remove_folder(self.path)
+            raise
+        return file
+
+    def _write_totals(self) -> None:
+        """Replace the totals on disk by those of now; they take their time, so not too often."""
+        begun = time.monotonic()
+        if self.totals.frames > self._totals_kept:
+            fresh = self.path / FRESH
+            fresh.unlink(missing_ok=True)
+            file = RecordFile(fresh)
+            try:
+                file.append(_TOTALS, *self.totals.pack())
+                file.sync()
+            finally:
+                file.close()
+            fresh.replace(self.path / FRAMES)
+            self._totals_kept = self.totals.frames
+        now = time.monotonic()
+        self._totals_due = now + max(TOTALS_EVERY_S, TOTALS_SHARE * (now - begun))
+
+    @contextmanager
+    def _explained(self) -> Iterator[None]:
+        """Say of an error of the disk what it means."""
+        try:
+            yield
+        except OSError as error:
+            raise LidarpoolError(
+                f"The journal {self.path} cannot be written ({error.strerror or error}): make room "
+                "on its disk, or give another folder."
+            ) from error
+
+    # -- the end -----------------------------------------------------------------------
+
+    def save(self) -> None:
+        """Write everything to the disk, with a mark at the end.
+
+        Raises
+        ------
+        LidarpoolError
+            If the disk is full; what was delivered is there all the same.
+        """
+        if self._file is not None:
+            with self._explained():
+                self._write_totals()
+                self._file.mark()
+
+    def remove(self) -> None:
+        """Remove the journal and let go of its files."""
+        self.close()
+        remove_journal(self.path)
+
+    @contextmanager
+    def kept_on_error(self) -> Iterator[None]:
+        """Save the journal if the body raises, and add to the error how to go on.
+
+        Without a delivery it is removed, and its folder is as it was.
+        """
+        try:
+            yield
+        except BaseException as error:
+            with suppress(LidarpoolError):  # the first error is the one to tell of
+                self.save()
+            if self.kept:
+                error.add_note(
+                    f"{self.kept} are kept in {self.path}: continue with {self.terms.resume}"
+                )
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Let go of the files; afterwards the points cannot be read any more."""
+        if self._file is not None:
+            self._file.close()

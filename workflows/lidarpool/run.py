@@ -1,0 +1,236 @@
+"""A run on a cluster: the survey and, beside it, the planning, stepped in turn."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from typing import TypeVar
+
+from distributed import Client
+from distributed.client import FutureCancelledError
+from distributed.comm.core import CommClosedError
+
+from poolpart import (
+    Backoff,
+    Partition,
+    PipeClosed,
+    PipeFailed,
+    PoolError,
+    TaskRecord,
+    assign_devices,
+)
+
+from .checks import common_backend, survey_pool
+from .deliveries import Deliveries
+from .errors import LidarpoolError
+from .plan import best
+from .progress import Progress
+from .result import Result
+from .scan import GPU, LIDAR, OTHER, Frame, SurveyPump, SurveySetup
+from .trials import TrialPump
+from .watch import Watch
+
+T = TypeVar("T")
+
+# What Dask raises, here or there, once the scheduler is gone.
+_CLUSTER_LOST = (OSError, CommClosedError, FutureCancelledError, PipeClosed, PipeFailed)
+
+PROGRESS_EVERY_S = 0.1
+
+
+class Run:
+    """One run on one cluster, checked and ready to be driven.
+
+    Parameters
+    ----------
+    client
+        Client of the cluster.
+    kept
+        Where the deliveries go, and what an earlier run has left there.
+
+    Raises
+    ------
+    LidarpoolError
+        If the cluster lacks something.
+    """
+
+    def __init__(self, client: Client, kept: Deliveries) -> None:
+        job = kept.job
+        pool = survey_pool(client, job.collectors, job.planning is not None)
+        self.client, self.job, self.kept = client, job, kept
+        self.partitions: dict[str, Partition] = pool.partitions()
+        casting = [worker for worker in pool if worker.resources.get(GPU)]
+        kept.backend = common_backend(client, kept.backend or job.backend, casting, kept.advice)
+        self.notes: list[str] = []
+        if not any(worker.gpus for worker in casting):
+            self.notes.append(
+                f"no GPU in partition GPU: {len(casting)} CPU worker{'s' * (len(casting) > 1)} "
+                f"cast{'s' * (len(casting) == 1)} the rays with {kept.backend}"
+            )
+        devices = assign_devices(casting)
+        self.setup = SurveySetup(job.scene, job.survey.sensor, kept.backend, devices)
+        self.callers_error: BaseException | None = None  # raised by a callback
+
+    def drive(
+        self,
+        on_frame: Callable[[Frame], None] | None,
+        on_progress: Callable[[Progress], None] | None,
+    ) -> Result:
+        """Run to the end; whatever is raised, everything has been stopped by then."""
+        started = time.monotonic()
+        pumps: list[SurveyPump | TrialPump] = []
+        trials = None
+        try:
+            if self.job.planning is not None:  # first: no slot of OTHER waits for the survey
+                trials = TrialPump(
+                    self.client, self.partitions[OTHER], self.job.planning, self.kept.trials
+                )
+                pumps.append(trials)
+                trials.step()
+            survey = self._survey_pump(on_frame)
+            pumps.append(survey)
+            survey.start()
+            times = self._loop(pumps, survey, trials, on_progress, started)
+            for pump in pumps:
+                pump.finish()
+        except BaseException as error:
+            reason = str(error) or type(error).__name__
+            _stop(pumps, f"the run was stopped: {reason}")
+            if error is self.callers_error:
+                raise
+            if isinstance(error, PoolError):
+                raise LidarpoolError(str(error)) from error
+            if isinstance(error, _CLUSTER_LOST):
+                raise LidarpoolError(
+                    f"The cluster at {self.client.scheduler.address} cannot be reached any more, "
+                    "or somebody cancelled the tasks of this run; it has ended without a result."
+                ) from error
+            raise
+        self.kept.save()
+        return make_result(
+            self.kept,
+            records=survey.records + (trials.records if trials else []),
+            seconds=time.monotonic() - started,
+            survey_seconds=times[SurveyPump],
+            planning_seconds=times.get(TrialPump, 0.0),
+            replayed=survey.replayed,
+            duplicates_dropped=survey.duplicates_dropped,
+            notes=self.notes,
+        )
+
+    def _survey_pump(self, on_frame: Callable[[Frame], None] | None) -> SurveyPump:
+        def take(frame: Frame) -> None:
+            if on_frame:
+                self._call(on_frame, frame)
+            # Only now: a frame that the caller failed on is handed to them again.
+            self.kept.totals.take(frame)
+
+        return SurveyPump(
+            self.client,
+            self.partitions,
+            self.setup,
+            self.job.survey,
+            take,
+            self.job.queue_capacity,
+            self.job.collectors,
+            self.kept.cloud,
+            self.kept.totals.frames,
+        )
+
+    def _call(self, callback: Callable[[T], None], argument: T) -> None:
+        """Call back the caller; an OSError of theirs must not be taken for the cluster's."""
+        try:
+            callback(argument)
+        except BaseException as error:
+            self.callers_error = error
+            raise
+
+    def _loop(
+        self,
+        pumps: list[SurveyPump | TrialPump],
+        survey: SurveyPump,
+        trials: TrialPump | None,
+        on_progress: Callable[[Progress], None] | None,
+        started: float,
+    ) -> dict[type, float]:
+        """Step the pumps until all have finished; returns when each did, in seconds."""
+        pause = Backoff(least_s=0.001, most_s=0.016)
+        watch = Watch(self.client, {GPU, LIDAR} | ({OTHER} if trials else set()))
+        times: dict[type, float] = {}
+        told = float("-inf")
+        while len(times) < len(pumps):
+            moved = False
+            for pump in pumps:
+                if not pump.finished:
+                    moved |= pump.step()
+                elif type(pump) not in times:
+                    times[type(pump)] = time.monotonic() - started
+            for trial in trials.trials[len(self.kept.trials) :] if trials else ():
+                self.kept.add_trial(trial)
+            self.kept.look()
+            now = time.monotonic()
+            watch.look(now)
+            if on_progress and (now - told >= PROGRESS_EVERY_S or len(times) == len(pumps)):
+                told = now
+                self._call(on_progress, self._progress(survey, trials, now - started))
+            if moved:
+                pause.reset()
+            else:
+                pause.sleep()
+        return times
+
+    def _progress(self, survey: SurveyPump, trials: TrialPump | None, seconds: float) -> Progress:
+        return Progress(
+            scans=self.job.survey.scan_count,
+            generated=survey.generated.delivered,
+            cast=survey.cast,
+            framed=survey.frames.delivered,
+            collected=survey.cloud.ledger.delivered,
+            points=survey.cloud.point_count,
+            trials=self.job.trials,
+            trials_done=len(trials.trials) if trials else 0,
+            seconds=seconds,
+        )
+
+
+def make_result(
+    kept: Deliveries,
+    records: Iterable[TaskRecord] = (),
+    seconds: float = 0.0,
+    survey_seconds: float = 0.0,
+    planning_seconds: float = 0.0,
+    replayed: int = 0,
+    duplicates_dropped: int = 0,
+    notes: Iterable[str] = (),
+) -> Result:
+    """Put the result together once everything has been delivered; see `Result`."""
+    job = kept.job
+    trials = tuple(sorted(kept.trials, key=lambda trial: trial.trial))
+    return Result(
+        points=kept.cloud.merge(job.survey.precision_m, job.scene.origin),
+        hit_counts=kept.totals.hit_counts,
+        sample_rays=kept.totals.sample_rays,
+        plan=best(trials, job.planning) if job.planning else None,
+        trials=trials,
+        backend=kept.backend,
+        rays=job.survey.ray_count,
+        hits=kept.totals.hits,
+        records=tuple(records),
+        seconds=seconds,
+        survey_seconds=survey_seconds,
+        planning_seconds=planning_seconds,
+        replayed=replayed,
+        duplicates_dropped=duplicates_dropped,
+        resumed=kept.resumed,
+        notes=tuple(notes),
+    )
+
+
+def _stop(pumps: list[SurveyPump | TrialPump], reason: str) -> None:
+    """Stop what can be stopped; the cluster may be gone, and then nothing can."""
+    for pump in pumps:
+        for step in (lambda pump=pump: pump.stop(reason), pump.finish):
+            # The first error is the one to tell of.
+            with suppress(OSError, CommClosedError, FutureCancelledError, RuntimeError):
+                step()
