@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-import inspect
+import copy
 import time
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Sized
 from typing import Any
 
-from distributed import Client, Future, wait
+from dask.utils import funcname
+from distributed import Client, Future
 
+from . import moves
 from .backoff import Backoff
+from .dissolve import dissolve
 from .errors import PoolError
+from .mapping import MapOptions, Results
+from .quota import Quota
+from .sender import Sender
+from .stats import PartitionStats, partition_stats
 from .worker_info import WorkerInfo
-
-# `Client.submit` keeps these for itself; a function that has one of them would not get it.
-_OPTIONS_OF_SUBMIT = frozenset(
-    parameter.name
-    for parameter in inspect.signature(Client.submit).parameters.values()
-    if parameter.kind is inspect.Parameter.KEYWORD_ONLY
-    or parameter.default is not inspect.Parameter.empty
-)
 
 
 class Partition:
@@ -38,10 +36,14 @@ class Partition:
         Client of the cluster.
     note
         Something a user should know of it, such as that it had to do without GPUs.
+    priority
+        Priority of its tasks where none is given: of tasks that wait for the same worker,
+        those of a higher one run first. It can be changed.
     """
 
-    def __init__(self, name: str, client: Client, note: str = "") -> None:
-        self.name, self.client, self.note = name, client, note
+    def __init__(self, name: str, client: Client, note: str = "", priority: int = 0) -> None:
+        self.name, self.client, self.note, self.priority = name, client, note, priority
+        self._sender = Sender(client, name)
 
     @property
     def workers(self) -> tuple[WorkerInfo, ...]:
@@ -70,6 +72,10 @@ class Partition:
             f"({shown}), {_slots(workers, self.name)} slots{note}>"
         )
 
+    def stats(self) -> PartitionStats:
+        """How busy it is and what it has done, whoever submitted the tasks."""
+        return partition_stats(self.client, self.name)
+
     def wait(self, n_workers: int = 1, timeout_s: float | None = None) -> None:
         """Wait until the partition has so many workers.
 
@@ -90,13 +96,71 @@ class Partition:
                 )
             pause.sleep()
 
+    # -- workers that come and go ------------------------------------------------------
+
+    @property
+    def minimum(self) -> int:
+        """Workers that it keeps whatever is moved, as said when it was made."""
+        return moves.minimum(self.client, self.name)
+
+    def grow(
+        self, workers: int = 1, *, source: str | None = None, timeout_s: float = 60.0
+    ) -> list[str]:
+        """Move workers into this partition while everything runs; returns their names.
+
+        What a worker has begun for the partition that it leaves ends there first, and what it
+        has not begun goes to others. Where the partition was made of a number of workers, that
+        number grows too.
+
+        Parameters
+        ----------
+        workers
+            How many.
+        source
+            Name of the partition that they leave; by default they are taken of workers that
+            belong to none and of the partition that has the rest.
+        timeout_s
+            How long to wait for them to come free.
+
+        Raises
+        ------
+        PoolError
+            If there are too few, counting those that `source` needs; or if tasks do not end
+            in time, in which case their workers stay where they are.
+
+        Examples
+        --------
+        >>> gpu.grow(2, source="OTHER")                                # doctest: +SKIP
+        ['5', '6']
+        """
+        return moves.grow(self.client, self.name, workers, source, timeout_s)
+
+    def shrink(self, workers: int = 1, *, timeout_s: float = 60.0) -> list[str]:
+        """Move workers out of this partition while everything runs; returns their names.
+
+        They go to the partition that has the rest, if there is one, or to none; those with
+        the least to do go first, in the way that `grow` describes.
+
+        Raises
+        ------
+        PoolError
+            If fewer than its minimum would be left, or their tasks do not end in time.
+        """
+        return moves.shrink(self.client, self.name, workers, timeout_s)
+
+    def dissolve(self, timeout_s: float = 30.0) -> None:
+        """Undo this partition; see `Pool.dissolve`."""
+        dissolve(self.client, [self.name], timeout_s)
+
+    # -- work --------------------------------------------------------------------------
+
     def submit(
         self,
         function: Callable[..., Any],
         /,
         *args: Any,
         key: str | None = None,
-        priority: int = 0,
+        priority: int | None = None,
         worker: str | None = None,
         **kwargs: Any,
     ) -> Future:
@@ -111,7 +175,7 @@ class Partition:
         key
             The task's key; by default a new one, so that equal calls run each by itself.
         priority
-            Higher runs first.
+            Higher runs first; the partition's by default.
         worker
             Address of the one member to run on; if it leaves, the task waits for ever.
 
@@ -124,106 +188,118 @@ class Partition:
         TypeError
             If a keyword is an option of `Client.submit`.
         """
-        if taken := sorted(_OPTIONS_OF_SUBMIT & kwargs.keys()):
-            raise TypeError(
-                f"{', '.join(taken)}: Client.submit has options of this name, so that "
-                f"{function} would not get it; bind it with functools.partial."
-            )
-        return self.client.submit(
-            function,
-            *args,
-            key=key,
-            pure=False,
-            priority=priority,
-            resources={self.name: 1},
-            workers=None if worker is None else [worker],
-            **kwargs,
+        return self._sender.send(
+            function, args, kwargs, key=key, priority=self._default(priority), worker=worker
         )
 
-    def map(
-        self, function: Callable[..., Any], /, *iterables: Iterable[Any], priority: int = 0
-    ) -> list[Future]:
-        """Submit one task for each item, all at once; see `imap` for many items."""
-        return [
-            self.submit(function, *args, priority=priority)
-            for args in zip(*iterables, strict=False)
-        ]
-
-    def imap(
+    def submit_many(
         self,
         function: Callable[..., Any],
-        items: Iterable[Any],
-        window: int | None = None,
-        ordered: bool = True,
-    ) -> Iterator[Any]:
-        """Results of `function` for each item, with a bounded number of tasks under way.
+        /,
+        *iterables: Iterable[Any],
+        priority: int | None = None,
+    ) -> list[Future]:
+        """Submit one task for each item, in one message; see `map` for many or endless items.
 
-        Dask does not hold back tasks that need a resource, so mapping a long iterable at once
-        would fill the workers with results that nobody has taken yet.
-
-        Parameters
-        ----------
-        function
-            Called with one item.
-        items
-            The items; taken as they are needed.
-        window
-            Tasks under way at most; twice the slots by default.
-        ordered
-            Results in the order of the items, or else as they come.
+        Dask does not hold back tasks that need a resource: what has run stays in the workers'
+        memory as long as its future is held.
 
         Returns
         -------
-        iterator
-            Results. An error of a task is raised by it. Whoever stops early lets go of the
-            tasks under way: those that have not started never do.
+        list of Future
+            In the order of the items, as many as the shortest iterable has.
+        """
+        columns = list(zip(*zip(*iterables, strict=False), strict=True))
+        count = len(columns[0]) if columns else 0
+        futures: list[Future] = []
+        while (start := len(futures)) < count:
+            futures += self._sender.send_many(
+                function,
+                *(column[start : start + self._sender.most] for column in columns),
+                key=funcname(function),
+                priority=self._default(priority),
+                wait=True,
+            )
+        return futures
+
+    def map(
+        self,
+        function: Callable[..., Any],
+        /,
+        *iterables: Iterable[Any],
+        ordered: bool = True,
+        window: int | None = None,
+        chunk: int | None = None,
+        priority: int | None = None,
+    ) -> Results:
+        """Call a function for each item; an iterator gives the results.
+
+        For any number of items, also without end: they are taken, and results are fetched,
+        while results are asked for, and a bounded number is under way. Small items travel
+        several in a task; how many, is learned from how long they take and how large they
+        are.
+
+        Parameters
+        ----------
+        function, iterables
+            Called with one item of each, until the shortest has no more.
+        ordered
+            Results in the order of the items, or else as they come.
+        window
+            Tasks under way at most; by default twice the slots, of which there may be more
+            or fewer later.
+        chunk
+            Items in a task; by default as many as take a tenth of a second, or longer where
+            there are many slots. Give 1 where items differ much, or must not wait for others.
+        priority
+            Higher runs first; the partition's by default.
+
+        Returns
+        -------
+        Results
+            An iterator. It raises what `function` raises, after the results before; a note
+            names the item. To stop early, close it or let go of it: tasks that have not
+            started never do.
 
         Raises
         ------
         ValueError
-            If the window is below 1.
+            If the window or the chunk is below 1.
         """
-        if window is None:
-            window = max(2, 2 * self.slots)
-        if window < 1:
-            raise ValueError(f"A window of {window} tasks is too small; give 1 or more.")
-        futures = (self.submit(function, item) for item in items)
-        return _in_order(futures, window) if ordered else _as_they_come(futures, window)
+        options = MapOptions(ordered, window, chunk, self._default(priority))
+        sized = [len(iterable) for iterable in iterables if isinstance(iterable, Sized)]
+        calls = zip(*iterables, strict=False)
+        total = min(sized, default=None)
+        return Results(self._sender, lambda: self.slots, function, calls, total, options)
 
+    def limited(self, slots: int, priority: int | None = None) -> Partition:
+        """Give a handle on the same workers that has at most so many tasks under way.
 
-def _in_order(futures: Iterator[Future], window: int) -> Iterator[Any]:
-    waiting: deque[Future] = deque()
-    try:
-        for future in futures:
-            waiting.append(future)
-            if len(waiting) >= window:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
-    finally:
-        waiting.clear()  # whoever keeps an error keeps this frame: do not keep tasks with it
+        With one for each, users of a partition share it. Beyond the limit its `submit` waits
+        until one of its tasks is done; so each of its tasks is wanted until then, also when
+        its future is dropped, unless it is cancelled. It limits what is submitted through
+        this handle: Dask itself knows no users.
 
+        Parameters
+        ----------
+        slots
+            Tasks under way at a time, 1 or more.
+        priority
+            Priority of its tasks; by default that of this handle.
 
-def _as_they_come(futures: Iterator[Future], window: int) -> Iterator[Any]:
-    # Not with `as_completed`: what it watches stays wanted when its user has stopped.
-    running: set[Future] = set()
-    try:
-        for future in futures:
-            running.add(future)
-            if len(running) >= window:
-                yield _pop_finished(running).result()
-        while running:
-            yield _pop_finished(running).result()
-    finally:
-        running.clear()
+        Raises
+        ------
+        ValueError
+            If `slots` is below 1.
+        """
+        handle = copy.copy(self)
+        handle._sender = Sender(self.client, self.name, Quota(slots))
+        if priority is not None:
+            handle.priority = priority
+        return handle
 
-
-def _pop_finished(running: set[Future]) -> Future:
-    done = next((future for future in running if future.done()), None)
-    if done is None:
-        done = next(iter(wait(running, return_when="FIRST_COMPLETED").done))
-    running.remove(done)
-    return done
+    def _default(self, priority: int | None) -> int:
+        return self.priority if priority is None else priority
 
 
 def _slots(workers: Iterable[WorkerInfo], name: str) -> int:

@@ -21,7 +21,7 @@ def wait_for(event):
 def test_only_what_is_finished_comes(client):
     gate = Event(f"gate-{uuid.uuid4().hex}", client=client)
     part = Partition("A", client)
-    done, pending = part.map(twice, range(5)), part.submit(wait_for, gate.name)
+    done, pending = part.submit_many(twice, range(5)), part.submit(wait_for, gate.name)
     wait(done, timeout=30)
     keys = [future.key for future in done]
     fetched = fetch_available(client, [*keys, pending.key, "never-submitted"])

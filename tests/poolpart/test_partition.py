@@ -1,6 +1,5 @@
 """Tasks of a partition: where they run, in which order, and how many at a time."""
 
-import itertools
 import time
 import uuid
 from functools import partial
@@ -19,16 +18,8 @@ def twice(x):
     return 2 * x
 
 
-def slow_if_even(x):
-    if x % 2 == 0:
-        time.sleep(0.02)
-    return x
-
-
-def fail_at_3(x):
-    if x == 3:
-        raise ZeroDivisionError("at 3")
-    return x
+def ident(_):
+    return uuid.uuid4()
 
 
 def options(key=None, priority=None, workers=None):
@@ -53,12 +44,8 @@ def b(client):
     return Partition("B", client)
 
 
-def task_count(client):
-    return len(client.cluster.scheduler.tasks)
-
-
 def test_tasks_run_on_its_workers_and_on_all_of_them(a, b):
-    in_a, in_b = a.map(here, range(200)), b.map(here, range(200))
+    in_a, in_b = a.submit_many(here, range(200)), b.submit_many(here, range(200))
     assert {future.result() for future in in_a} == {"A-0", "A-1"}
     assert {future.result() for future in in_b} == {"B-0"}
 
@@ -110,17 +97,44 @@ def test_arguments_named_like_options_can_be_bound(a):
 def test_higher_priority_runs_first(b, client, wait_until):
     gate = f"gate-{uuid.uuid4().hex}"
     blocker = b.submit(wait_for, gate, priority=100)
-    low = b.map(stamp, range(3))
-    high = b.map(stamp, range(3), priority=5)
+    low = b.submit_many(stamp, range(3))
+    high = b.submit_many(stamp, range(3), priority=5)
     wait_until(lambda: len(client.cluster.workers["B-0"].state.tasks) == 7)
     Event(gate, client=client).set()
     assert blocker.result()
     assert max(future.result() for future in high) < min(future.result() for future in low)
 
 
-def test_map_stops_with_the_shortest_iterable(a):
-    assert [future.result() for future in a.map(pow, [2, 3, 4], [5, 6])] == [32, 729]
-    assert a.map(pow, []) == []
+def test_the_priority_of_the_partition_is_that_of_its_tasks(client, wait_until):
+    tasks = client.cluster.scheduler.tasks
+
+    def priority(future):
+        return -tasks[future.key].priority[0]
+
+    partition = Partition("B", client, priority=3)
+    one, two = partition.submit(stamp, 0), partition.submit(stamp, 0, priority=0)
+    many = partition.submit_many(stamp, range(2))
+    wait([one, two, *many])
+    assert [priority(future) for future in (one, two, *many)] == [3, 0, 3, 3]
+    partition.priority = 7
+    later = partition.submit(stamp, 0)
+    wait([later])
+    assert priority(later) == 7
+    results = partition.map(wait_for, [f"gate-{uuid.uuid4().hex}"])
+    wait_until(lambda: any(key.startswith("map-") for key in tasks))
+    (mapped,) = (task for key, task in tasks.items() if key.startswith("map-"))
+    assert -mapped.priority[0] == 7
+    results.close()
+
+
+def test_submit_many_stops_with_the_shortest_iterable(a):
+    assert [future.result() for future in a.submit_many(pow, [2, 3, 4], [5, 6])] == [32, 729]
+    assert a.submit_many(pow, []) == a.submit_many(pow) == []
+
+
+def test_submit_many_takes_iterators_and_runs_equal_calls_each_by_itself(a):
+    futures = a.submit_many(ident, iter([1] * 20))
+    assert len({future.result() for future in futures}) == 20
 
 
 def test_wait_returns_when_the_workers_are_there(a):
@@ -130,72 +144,3 @@ def test_wait_returns_when_the_workers_are_there(a):
 def test_wait_names_what_is_missing(client):
     with pytest.raises(PoolError, match=r"'C' has 0 of 2 workers after 0.05 s: .*C=1"):
         Partition("C", client).wait(2, timeout_s=0.05)
-
-
-# -- imap ------------------------------------------------------------------------------
-
-
-def test_imap_keeps_the_order_of_the_items(a):
-    assert list(a.imap(slow_if_even, range(30))) == list(range(30))
-
-
-def test_imap_unordered_gives_each_once(a):
-    assert sorted(a.imap(slow_if_even, range(30), ordered=False)) == list(range(30))
-
-
-def test_imap_unordered_does_not_wait_for_a_slow_item(a, client):
-    gate = Event(f"gate-{uuid.uuid4().hex}", client=client)
-
-    def function(item):
-        return (Event(gate.name).wait(30) and item) if item == 0 else item
-
-    results = a.imap(function, range(4), window=4, ordered=False)
-    assert sorted(next(results) for _ in range(3)) == [1, 2, 3]
-    gate.set()
-    assert list(results) == [0]
-
-
-@pytest.mark.parametrize("ordered", [True, False])
-def test_imap_of_nothing(a, ordered):
-    assert list(a.imap(twice, [], ordered=ordered)) == []
-
-
-@pytest.mark.parametrize("ordered", [True, False])
-@pytest.mark.parametrize("window", [1, 3])
-def test_imap_keeps_so_many_tasks_under_way_even_of_an_endless_iterator(a, client, ordered, window):
-    taken = itertools.count()
-    results = a.imap(twice, taken, window=window, ordered=ordered)
-    for number in range(20):
-        next(results)
-        assert next(taken) - 2 * number <= window + number + 1
-        assert task_count(client) <= window + 1
-    results.close()
-
-
-@pytest.mark.parametrize("ordered", [True, False])
-def test_imap_raises_what_a_task_raises_and_lets_go_of_the_others(a, client, ordered, wait_until):
-    with pytest.raises(ZeroDivisionError, match="at 3") as caught:
-        list(a.imap(fail_at_3, range(50), window=8, ordered=ordered))
-    wait_until(lambda: task_count(client) <= 2)  # the failed one and the last, by the traceback
-    assert caught.tb is not None
-
-
-@pytest.mark.parametrize("ordered", [True, False])
-def test_closing_imap_lets_go_of_tasks_that_have_not_started(b, client, ordered, wait_until):
-    gate = Event(f"gate-{uuid.uuid4().hex}", client=client)
-    blocker = b.submit(wait_for, gate.name)
-    results = b.imap(wait_for, itertools.repeat(gate.name), window=5, ordered=ordered)
-    gate.set()
-    assert next(results)
-    gate.clear()
-    assert wait([blocker], timeout=30).done
-    results.close()
-    del blocker
-    gate.set()
-    wait_until(lambda: task_count(client) == 0)
-
-
-@pytest.mark.parametrize("window", [0, -1])
-def test_imap_refuses_windows_at_once(a, window):
-    with pytest.raises(ValueError, match=f"window of {window} tasks"):
-        a.imap(twice, [1], window=window)

@@ -1,0 +1,116 @@
+"""Submitting tasks that take one slot of a resource, no more at a time than a quota allows."""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from distributed import Client, Future
+
+from .quota import Quota
+
+# `Client.submit` keeps these for itself; a function that has one of them would not get it.
+_OPTIONS_OF_SUBMIT = frozenset(
+    parameter.name
+    for parameter in inspect.signature(Client.submit).parameters.values()
+    if parameter.kind is inspect.Parameter.KEYWORD_ONLY
+    or parameter.default is not inspect.Parameter.empty
+)
+
+
+class Sender:
+    """Sends tasks for one resource.
+
+    Parameters
+    ----------
+    client
+        Client of the cluster.
+    resource
+        Of which each task takes one slot.
+    quota
+        Limit to the tasks under way; None for no limit.
+    """
+
+    def __init__(self, client: Client, resource: str, quota: Quota | None = None) -> None:
+        self.client, self.resource, self.quota = client, resource, quota
+        self.most = sys.maxsize if quota is None else quota.slots  # tasks under way
+
+    def send(
+        self,
+        function: Callable[..., Any],
+        args: Sequence[Any],
+        kwargs: Mapping[str, Any],
+        *,
+        key: str | None,
+        priority: int,
+        worker: str | None,
+    ) -> Future:
+        """Submit one task; waits until the quota allows it."""
+        if taken := sorted(_OPTIONS_OF_SUBMIT & kwargs.keys()):
+            raise TypeError(
+                f"{', '.join(taken)}: Client.submit has options of this name, so that "
+                f"{function} would not get it; bind it with functools.partial."
+            )
+        if self.quota is not None:
+            self.quota.take(1, wait=True)
+        future = self.client.submit(
+            function,
+            *args,
+            key=key,
+            pure=False,
+            priority=priority,
+            resources={self.resource: 1},
+            workers=None if worker is None else [worker],
+            **kwargs,
+        )
+        if self.quota is not None:
+            self.quota.watch(future)
+        return future
+
+    def send_many(
+        self,
+        function: Callable[..., Any],
+        *columns: Sequence[Any],
+        key: str,
+        priority: int,
+        wait: bool,
+    ) -> list[Future]:
+        """Submit a task for each row of arguments, in one message, as far as the quota allows.
+
+        One message for many tasks costs the scheduler less than half of one for each.
+
+        Parameters
+        ----------
+        function, columns
+            The function, and its arguments: columns of equal length, 1 or more.
+        key
+            What the tasks' keys start with.
+        priority
+            Higher runs first.
+        wait
+            Whether to wait until the quota allows at least one.
+
+        Returns
+        -------
+        list of Future
+            For the first rows; possibly none.
+        """
+        count = len(columns[0])
+        if self.quota is not None:
+            count = self.quota.take(count, wait)
+            if not count:
+                return []
+        futures: list[Future] = self.client.map(
+            function,
+            *(column[:count] for column in columns),
+            key=key,
+            pure=False,
+            priority=priority,
+            resources={self.resource: 1},
+        )
+        if self.quota is not None:
+            for future in futures:
+                self.quota.watch(future)
+        return futures

@@ -1,0 +1,96 @@
+"""Chunks as they run, and how many items they have."""
+
+import time
+
+import pytest
+from distributed import Reschedule
+from hypothesis import given
+from hypothesis import strategies as st
+
+from poolpart.chunks import MOST_BYTES, MOST_ITEMS, Chunk, ChunkSize, run_chunk
+
+
+def invert(x):
+    return 1 / x
+
+
+def calls(*numbers):
+    return [(number,) for number in numbers]
+
+
+def test_all_results_come_in_order():
+    answer = run_chunk(invert, 10, 5, calls(1, 2, 4))
+    assert (answer.results, answer.failure) == ([1, 0.5, 0.25], None)
+    assert answer.nbytes > 0 < answer.seconds
+
+
+def test_an_error_comes_with_the_results_before_it():
+    answer = run_chunk(invert, 10, 5, calls(1, 2, 0, 4))
+    assert answer.results == [1, 0.5]
+    with pytest.raises(ZeroDivisionError) as caught:
+        answer.failure.reraise()
+    assert caught.value.__notes__ == ["poolpart: this was item 7 of a map: 0"]
+
+
+def test_an_error_of_the_first_item_is_raised():
+    with pytest.raises(ZeroDivisionError) as caught:
+        run_chunk(invert, 10, 5, calls(0, 1))
+    assert caught.value.__notes__ == ["poolpart: this was item 5 of a map: 0"]
+
+
+def test_long_items_are_shortened_in_the_note():
+    with pytest.raises(TypeError) as caught:
+        run_chunk(invert, 10, 0, [("x" * 10_000,)])
+    assert len(caught.value.__notes__[0]) < 100
+
+
+def test_it_ends_when_the_time_is_up_but_not_before_the_first_item():
+    answer = run_chunk(time.sleep, 0.015, 0, calls(0.01, 0.01, 0.01, 0.01))
+    assert len(answer.results) in (1, 2)
+    assert len(run_chunk(invert, 0, 0, calls(1, 1)).results) == 1
+
+
+def test_dask_is_told_to_reschedule():
+    def again(_):
+        raise Reschedule
+
+    with pytest.raises(Reschedule):
+        run_chunk(again, 10, 0, calls(1))
+
+
+def test_a_chunk_says_which_items_it_has():
+    assert str(Chunk(7, calls(1))) == "item 7"
+    assert str(Chunk(7, calls(1, 2, 3))) == "items 7 to 9"
+
+
+def learned(item_s, item_bytes, rounds=30, target_s=0.1):
+    size = ChunkSize()
+    for _ in range(rounds):
+        items = size.items(target_s)
+        size.learn(items, item_s * items, int(item_bytes * items))
+    return size.items(target_s)
+
+
+@pytest.mark.parametrize(
+    ("item_s", "item_bytes", "items"),
+    [(1e-2, 100, 10), (1, 100, 1), (1e-6, 100, MOST_ITEMS), (1e-6, MOST_BYTES / 4, 4)],
+)
+def test_chunks_are_as_large_as_time_and_size_allow(item_s, item_bytes, items):
+    assert learned(item_s, item_bytes) == pytest.approx(items, abs=1)
+
+
+def test_chunks_get_small_again_when_items_take_longer():
+    size = ChunkSize()
+    for item_s in [1e-4] * 20 + [1e-1] * 20:
+        items = size.items(0.1)
+        size.learn(items, item_s * items, 100)
+    assert size.items(0.1) == 1
+
+
+@given(st.lists(st.tuples(st.integers(1, 1000), st.floats(0, 1e3), st.integers(0, 2**40))))
+def test_a_chunk_has_an_item_and_at_most_twice_what_was_tried(chunks):
+    size = ChunkSize()
+    for items, seconds, nbytes in chunks:
+        size.learn(items, seconds, nbytes)
+    tried = max((items for items, _, _ in chunks), default=0)
+    assert 1 <= size.items(0.1) <= max(1, min(2 * tried, MOST_ITEMS))
