@@ -1,5 +1,6 @@
 """Pool partitions, pipes and a delivery ledger for Dask clusters."""
 
+from .asking import ask_workers
 from .backoff import Backoff
 from .errors import PipeClosed, PipeFailed, PoolError
 from .fetch import fetch_available
@@ -27,6 +28,7 @@ __all__ = [
     "Slots",
     "TaskRecord",
     "WorkerInfo",
+    "ask_workers",
     "assign_devices",
     "fetch_available",
     "forget_pipes",

@@ -11,6 +11,7 @@ from typing import Any
 
 from distributed import Client
 
+from .asking import ask_workers
 from .declare import declare
 from .dissolve import dissolve
 from .errors import PoolError
@@ -74,7 +75,7 @@ class Pool:
             identities = {a: i for a, i in identities.items() if declaring & set(i["resources"])}
             if not identities:
                 return cls(client, [])
-        facts = client.run(probe_worker, workers=list(identities), on_error="return")
+        facts = ask_workers(client, probe_worker, list(identities))
         for address, fact in facts.items():
             if isinstance(fact, BaseException):
                 raise PoolError(
