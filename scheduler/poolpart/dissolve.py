@@ -13,7 +13,10 @@ from .book import names_of
 from .declare import ask
 from .errors import PoolError
 from .fence import lower_fence
+from .inherit import disinherit
+from .page import remove_partitions_page
 from .placing import asks_for
+from .stats import unwatch
 from .steward import LOOK_EVERY_S, Steward
 
 _UNFINISHED = ("waiting", "queued", "no-worker", "processing")
@@ -45,6 +48,11 @@ def dissolve(client: Client, names: Collection[str] | None, timeout_s: float) ->
     done, fenced = ask(client, _dissolve, names=asked, timeout_s=timeout_s)
     for name in fenced:
         lower_fence(client, name)
+    for name in done:
+        disinherit(client, name)
+    if names is None:
+        remove_partitions_page(client)
+        unwatch(client)
     return list(done)
 
 

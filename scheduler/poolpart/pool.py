@@ -16,12 +16,15 @@ from .declare import declare
 from .dissolve import dissolve
 from .errors import PoolError
 from .fence import raise_fence
+from .inherit import inherit
 from .moves import follow, unfollow
+from .page import partitions_page
 from .partition import Partition
 from .probe import probe_worker
 from .rebalancing import Help
 from .rules import Count, Named, PerGpu, PerHost, Rule, check_rule, check_rules, divide
 from .selection import check_request, choose
+from .stats import watch
 from .worker_info import WorkerInfo
 
 logger = logging.getLogger(__name__)
@@ -281,7 +284,9 @@ class Pool:
                 logger.warning("Partition %r: %s", name, note)
         declare(self.client, rules, chosen, list(cluster.values()))
         try:
+            watch(self.client)
             for name, rule in rules.items():
+                inherit(self.client, name)
                 if rule.exclusive:
                     raise_fence(self.client, name)
         except PoolError:
@@ -289,6 +294,10 @@ class Pool:
                 dissolve(self.client, list(rules), timeout_s=0)
             raise
         return {name: Partition(name, self.client, notes.get(name, "")) for name in rules}
+
+    def page(self) -> str:
+        """Add a page of partitions to Dask's dashboard, see `partitions_page`; returns its URL."""
+        return partitions_page(self.client)
 
     def rebalance(self, lender: str, *, helps: str, idle_s: float = 1.0) -> None:
         """Let idle workers of a partition help another one, from now on.
@@ -330,8 +339,8 @@ class Pool:
         """Undo every partition of this cluster that was made while it ran, whoever made it.
 
         Workers declare what they did when they were found, and so they do after a restart.
-        Rules and fences are gone. Results that are held stay; should one be lost, any worker
-        computes it again. Partitions that workers were started with stay.
+        Rules, fences, statistics and the page are gone. Results that are held stay; should one
+        be lost, any worker computes it again. Partitions that workers were started with stay.
 
         Parameters
         ----------
