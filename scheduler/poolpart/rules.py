@@ -170,8 +170,9 @@ def divide(
 ) -> tuple[dict[str, list[WorkerInfo]], dict[str, str]]:
     """Divide workers by rules, each of which takes of what those before it have left.
 
-    Members of a partition come first where it chooses, so that the same rules, again, make
-    the same partitions. Workers that declare something else are left alone.
+    Workers that a rule names are kept for it. Members of a partition come first, so that the
+    same rules, again, make the same partitions. Workers that declare something else are left
+    alone.
 
     Returns
     -------
@@ -186,9 +187,12 @@ def divide(
     chosen: dict[str, list[WorkerInfo]] = {}
     notes: dict[str, str] = {}
     taken: set[str] = set()
+    named_by = {n for rule in rules.values() if isinstance(rule, Named) for n in rule.names}
     for name, rule in rules.items():
         free = [worker for worker in pool if worker.partitions == {name}]
         free += [w for w in pool if not w.partitions and w.name not in taken]
+        if not isinstance(rule, Named):
+            free = [worker for worker in free if not named_by & {worker.name, worker.address}]
         chosen[name] = rule.choose(free)
         taken |= {worker.name for worker in chosen[name]}
         if len(chosen[name]) < rule.minimum:
@@ -209,8 +213,8 @@ def partition_for(
 ) -> str | None:
     """Which partition a worker that joins belongs to; None for none.
 
-    Partitions with fewer workers than their minimum, or with none, come first; then those
-    whose rule comes first.
+    A rule that names it comes first, then partitions with fewer workers than their minimum or
+    with none, then those whose rule comes first.
     """
     everyone = [worker, *(member for group in members.values() for member in group)]
     willing = [n for n, rule in rules.items() if rule.wants(worker, members[n], everyone)]
@@ -219,7 +223,8 @@ def partition_for(
         for name in willing
         if len(members[name]) < max(rules[name].minimum, not isinstance(rules[name], Rest))
     ]
-    return next(iter([*short, *willing]), None)
+    by_name = [name for name in willing if isinstance(rules[name], Named)]
+    return next(iter([*by_name, *short, *willing]), None)
 
 
 def check_rules(rules: Mapping[str, Rule]) -> None:

@@ -10,15 +10,15 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 from distributed.diagnostics.plugin import SchedulerPlugin
-from distributed.protocol.pickle import dumps
 from tornado.ioloop import PeriodicCallback
 
 from .book import Book, Resources, Seat, seat_key
+from .calls import call
 from .placing import hand_off, held_by, recount, show
 from .probe import probe_worker
 from .rebalancing import Rebalancing
@@ -191,7 +191,7 @@ class Steward(SchedulerPlugin):
         # First the nanny: a worker that dies right after would come back as it was.
         await self._tell_nanny(seat, wanted)
         trace("partition.nanny_told", worker=worker.address, declares=dict(wanted))
-        if not await self.call(worker.address, declare_on_worker, resources=wanted):
+        if not await call(self.scheduler, worker.address, declare_on_worker, resources=wanted):
             return
         if self.scheduler.workers.get(worker.address) is not worker:
             return
@@ -213,20 +213,11 @@ class Steward(SchedulerPlugin):
         if seat.nanny not in self._nannies:
             if wanted == seat.found:
                 return  # it starts its worker like that already
-            before = await self.call(seat.nanny, keep_on_nanny, resources=wanted)
+            before = await call(self.scheduler, seat.nanny, keep_on_nanny, resources=wanted)
             self._nannies[seat.nanny] = (wanted, before)
         elif self._nannies[seat.nanny][0] != wanted:
-            await self.call(seat.nanny, keep_on_nanny, resources=wanted)
+            await call(self.scheduler, seat.nanny, keep_on_nanny, resources=wanted)
             self._nannies[seat.nanny] = (wanted, self._nannies[seat.nanny][1])
-
-    async def call(self, address: str, function: Callable[..., Any], **arguments: Any) -> Any:
-        """Call a function that runs in the event loop of a worker or nanny."""
-        answer = await self.scheduler.rpc(address).run(
-            function=dumps(function), kwargs=dumps(arguments)
-        )
-        if answer["status"] != "OK":
-            raise OSError(answer["exception_text"])
-        return answer["result"]
 
     async def arrive(self, seats: Collection[Seat], timeout_s: float) -> list[Seat]:
         """Wait until workers declare what the book says; returns those that do not in time.
@@ -247,7 +238,7 @@ class Steward(SchedulerPlugin):
         if not any(isinstance(rule, PerGpu) for rule in self.book.rules.values()):
             return
         try:
-            facts = await self.call(seat.info.address, probe_worker)
+            facts = await call(self.scheduler, seat.info.address, probe_worker)
         except OSError as error:
             logger.warning("Worker %s cannot tell about its GPUs: %s", seat.info.name, error)
             return
@@ -269,7 +260,7 @@ class Steward(SchedulerPlugin):
                 continue
             _, before = self._nannies.pop(seat.nanny)
             try:
-                await self.call(seat.nanny, restore_on_nanny, before=before)
+                await call(self.scheduler, seat.nanny, restore_on_nanny, before=before)
             except OSError as error:
                 logger.info("The nanny at %s is gone: %s", seat.nanny, error)
 

@@ -1,0 +1,316 @@
+"""Moving workers between partitions while tasks run: none is lost, none runs elsewhere."""
+
+import os
+import signal
+import threading
+import time
+
+import pytest
+from distributed import Event, get_worker, secede
+
+from poolpart import Partition, Pool, PoolError, n_workers, per_host, recorded, rest, trace_to
+
+LONG_S = 60.0
+
+
+def here():
+    return str(get_worker().name)
+
+
+def brief(_=None):
+    time.sleep(0.01)
+    return here()
+
+
+def wait_for(event):
+    return Event(event).wait(LONG_S)
+
+
+def hold_on(event):
+    secede()
+    return Event(event).wait(LONG_S)
+
+
+def declared(client):
+    """Resources by worker, as the scheduler knows them."""
+    workers = client.scheduler_info(n_workers=-1)["workers"].values()
+    return {str(worker["name"]): worker["resources"] for worker in workers}
+
+
+def declared_by_themselves(client):
+    answers = client.run(lambda dask_worker: dict(dask_worker.state.total_resources))
+    names = {w["name"]: a for a, w in client.scheduler_info(n_workers=-1)["workers"].items()}
+    return {str(name): answers[address] for name, address in names.items()}
+
+
+def used(client):
+    return {str(w.name): w.used_resources for w in client.cluster.scheduler.workers.values()}
+
+
+def members(part):
+    return [worker.name for worker in part.workers]
+
+
+@pytest.fixture
+def divided(start):
+    """Client and partitions of six workers: A has three, B one, the rest two."""
+    client = start({name: {} for name in "abcdef"})
+    rules = {"A": n_workers(3), "B": n_workers(1), "C": rest()}
+    return client, Pool.from_client(client).divide(rules)
+
+
+def test_tasks_of_a_worker_that_leaves_end_in_their_partition(divided):
+    client, parts = divided
+    tasks = [parts["A"].submit(recorded, "s", "A", brief) for _ in range(100)]
+    left = parts["A"].shrink(2)
+    assert len(left) == 2
+    assert {name: len(part) for name, part in parts.items()} == {"A": 1, "B": 1, "C": 4}
+    records = [record for _, record in client.gather(tasks)]
+    assert len({(r.worker, r.start) for r in records}) == 100
+    assert not any(record.misplaced for record in records)
+    ran = client.gather([parts["A"].submit(brief) for _ in range(20)])
+    assert set(ran) == set(members(parts["A"]))
+
+
+def test_workers_that_come_take_tasks(divided):
+    client, parts = divided
+    came = parts["B"].grow(2)
+    assert set(came) < set(members(parts["B"]))
+    assert set(client.gather([parts["B"].submit(brief) for _ in range(60)])) == {
+        *members(parts["B"])
+    }
+    assert declared(client) == declared_by_themselves(client)
+    assert sorted(map(str, declared(client).values())) == [*["{'A': 1}"] * 3, *["{'B': 1}"] * 3]
+
+
+def test_back_and_forth_is_as_before(divided):
+    client, parts = divided
+    before = declared(client)
+    for _ in range(5):
+        parts["A"].grow(2)
+        parts["A"].shrink(2)
+    assert sorted(map(str, declared(client).values())) == sorted(map(str, before.values()))
+    assert declared(client) == declared_by_themselves(client)
+
+
+def test_slots_are_those_of_the_partition(start):
+    client = start({name: {"nthreads": 3} for name in "abc"})
+    rules = {"A": n_workers(1, slots=7), "B": rest()}
+    parts = Pool.from_client(client).divide(rules)
+    parts["A"].grow(1)
+    assert (parts["A"].slots, parts["B"].slots) == (14, 3)
+
+
+def test_the_least_busy_worker_goes(divided):
+    client, parts = divided
+    event = Event("least-busy", client)
+    busy = parts["A"].workers[:2]
+    tasks = [parts["A"].submit(wait_for, "least-busy", worker=w.address) for w in busy]
+    scheduler = client.cluster.scheduler
+    while sum(len(scheduler.workers[w.address].processing) for w in busy) < 2:
+        time.sleep(0.01)
+    left = parts["A"].shrink(1)
+    assert left and not {worker.name for worker in busy} & set(left)
+    event.set()
+    client.gather(tasks)
+
+
+def test_a_task_that_does_not_end_keeps_its_worker(divided, wait_until):
+    client, parts = divided
+    event = Event("endless", client)
+    tasks = [
+        parts["A"].submit(function, "endless", key=f"endless-{i}", worker=worker.address)
+        for i, (function, worker) in enumerate(
+            zip((wait_for, hold_on, hold_on), parts["A"].workers, strict=True)
+        )
+    ]
+    scheduler = client.cluster.scheduler
+    wait_until(lambda: sum(len(w.processing) for w in scheduler.workers.values()) == 3)
+    before = declared(client)
+    with pytest.raises(PoolError, match=r"1 of 1 workers .* 0.2 s and stay .*: .*of endless-"):
+        parts["A"].shrink(1, timeout_s=0.2)
+    wait_until(lambda: declared(client) == before)
+    assert declared_by_themselves(client) == before
+    assert sum(sum(u.values()) for u in used(client).values()) == 3
+    event.set()
+    assert client.gather(tasks) == [True] * 3
+    assert len(parts["A"].shrink(1)) == 1
+
+
+def test_a_task_that_was_cancelled_but_runs_on_keeps_its_slot(divided, wait_until):
+    client, parts = divided
+    event = Event("cancelled", client)
+    scheduler = client.cluster.scheduler
+    workers = {w.address for w in parts["A"].workers}
+    tasks = [parts["A"].submit(wait_for, "cancelled", worker=address) for address in workers]
+    wait_until(lambda: all(len(scheduler.workers[a].processing) == 1 for a in workers))
+    time.sleep(0.1)  # until they run: nobody tells
+    client.cancel(tasks)
+    threading.Timer(1.5, event.set).start()
+    left = parts["A"].shrink(1)
+    assert event.is_set()
+    assert declared_by_themselves(client)[left[0]] == {"C": 1}
+    assert parts["A"].submit(brief).result() in members(parts["A"])
+
+
+def test_what_was_moved_is_counted_where_it_is(divided, wait_until):
+    client, parts = divided
+    event = Event("counted", client)
+    scheduler = client.cluster.scheduler
+    parts["A"].shrink(2)
+    tasks = [parts["A"].submit(wait_for, "counted") for _ in range(9)]
+    wait_until(lambda: len(scheduler.workers[parts["A"].workers[0].address].processing) == 9)
+    parts["A"].grow(2)
+    wait_until(lambda: sum(len(w.processing) for w in scheduler.workers.values()) == 9)
+    event.set()
+    client.gather(tasks)
+    parts["A"].shrink(1)
+    assert all(not any(u.values()) for u in used(client).values())
+
+
+# -- what is refused -------------------------------------------------------------------
+
+
+def test_never_below_the_minimum(start):
+    client = start({name: {} for name in "abcd"})
+    rules = {"A": n_workers(2, minimum=2), "B": n_workers(1), "C": rest(minimum=1)}
+    parts = Pool.from_client(client).divide(rules)
+    before = declared(client)
+    assert [part.minimum for part in parts.values()] == [2, 1, 1]
+    with pytest.raises(PoolError, match="'A' cannot shrink by 1: it has 2 workers and needs at"):
+        parts["A"].shrink()
+    with pytest.raises(PoolError, match="'B' cannot grow by 1: the remainder has 0 workers to"):
+        parts["B"].grow()
+    with pytest.raises(PoolError, match="'B' cannot grow by 1: partition 'A', beyond its min"):
+        parts["B"].grow(source="A")
+    assert declared(client) == before
+
+
+def test_what_makes_no_sense(divided):
+    client, parts = divided
+    for workers in (0, -1, 1.5):
+        with pytest.raises(PoolError, match="number of workers to move is"):
+            parts["A"].grow(workers)
+        with pytest.raises(PoolError, match="number of workers to move is"):
+            parts["A"].shrink(workers)
+    with pytest.raises(PoolError, match="'A' cannot grow by its own workers"):
+        parts["A"].grow(source="A")
+    with pytest.raises(PoolError, match="There is no partition 'X': no worker declares it"):
+        parts["A"].grow(source="X")
+    with pytest.raises(PoolError, match="There is no partition 'X'"):
+        Partition("X", client).shrink()
+    assert Partition("X", client).minimum == 0
+
+
+def test_a_cluster_that_was_divided_when_it_was_started(start):
+    client = start({"a": {"resources": {"A": 1}}, **{n: {"resources": {"B": 2}} for n in "bc"}})
+    plugins = set(client.cluster.scheduler.plugins)
+    parts = Pool.from_client(client).partitions()
+    assert parts["A"].grow(1, source="B")[0] in "bc"
+    assert {name: (len(part), part.slots) for name, part in parts.items()} == {
+        "A": (2, 2),
+        "B": (1, 2),
+    }
+    assert Pool.from_client(client).dissolve() == ["A", "B"]
+    assert declared(client) == {"a": {"A": 1}, "b": {"B": 2}, "c": {"B": 2}}
+    assert set(client.cluster.scheduler.plugins) == plugins
+
+
+# -- rebalancing -----------------------------------------------------------------------
+
+
+def test_idle_workers_help_and_go_back(divided, wait_until):
+    client, parts = divided
+    pool = Pool.from_client(client)
+    pool.rebalance("C", helps="B", idle_s=0.1)
+    pool.rebalance("C", helps="B", idle_s=0.1)
+    home = members(parts["C"])
+    event = Event("help", client)
+    tasks = [parts["B"].submit(wait_for, "help") for _ in range(3)]
+    wait_until(lambda: len(parts["B"]) == 3)
+    assert not members(parts["C"])
+    event.set()
+    client.gather(tasks)
+    wait_until(lambda: members(parts["C"]) == home)
+
+
+def test_whoever_helps_goes_back_when_needed(divided, wait_until):
+    client, parts = divided
+    Pool.from_client(client).rebalance("C", helps="B", idle_s=0.1)
+    events = {name: Event(name, client) for name in ("b", "c")}
+    tasks = [parts["B"].submit(recorded, "s", "B", wait_for, "b") for _ in range(3)]
+    wait_until(lambda: len(parts["B"]) == 3)
+    # There is nobody in C: its task waits for nobody, and calls somebody back.
+    tasks += [parts["C"].submit(recorded, "s", "C", wait_for, "c")]
+    events["b"].set()
+    wait_until(lambda: len(parts["C"]) >= 1)
+    events["c"].set()
+    assert not any(record.misplaced for _, record in client.gather(tasks))
+
+
+def test_the_lender_keeps_its_minimum(start, wait_until):
+    client = start({name: {} for name in "abcd"})
+    parts = Pool.from_client(client).divide({"A": n_workers(1), "B": rest(minimum=2)})
+    pool = Pool.from_client(client)
+    pool.rebalance("B", helps="A", idle_s=0.0)
+    event = Event("minimum", client)
+    tasks = [parts["A"].submit(wait_for, "minimum") for _ in range(9)]
+    wait_until(lambda: len(parts["A"]) == 2)
+    time.sleep(0.5)
+    assert (len(parts["A"]), len(parts["B"])) == (2, 2)
+    event.set()
+    client.gather(tasks)
+    pool.stop_rebalancing("B", helps="A")
+    assert (len(parts["A"]), len(parts["B"])) == (1, 3)
+
+
+def test_rebalancing_that_makes_no_sense(divided):
+    client, _ = divided
+    pool = Pool.from_client(client)
+    with pytest.raises(PoolError, match="'A' cannot help itself"):
+        pool.rebalance("A", helps="A")
+    with pytest.raises(PoolError, match="idle_s is -1"):
+        pool.rebalance("A", helps="B", idle_s=-1)
+    with pytest.raises(PoolError, match="There is no partition 'X'"):
+        pool.rebalance("A", helps="X")
+    assert pool.stop_rebalancing("A", helps="B") == []
+
+
+# -- whoever dies in between -----------------------------------------------------------
+
+
+def kill_at(point, pids):
+    """Kill the worker that passes a point, once; returns the addresses that were killed."""
+    killed = []
+
+    def sink(name, fields):
+        if name == point and fields["worker"] in pids and not killed:
+            killed.append(fields["worker"])
+            os.kill(pids[fields["worker"]], signal.SIGKILL)
+
+    trace_to(sink)
+    return killed
+
+
+@pytest.mark.parametrize("point", ["drained", "nanny_told", "worker_told"])
+def test_a_worker_that_is_killed_while_it_moves(nannies, wait_until, point):
+    parts = Pool.from_client(nannies).divide({"A": per_host(1), "B": rest()})
+    target, moving = members(parts["A"])[0], members(parts["B"])[0]
+    tasks = [parts["B"].submit(recorded, "s", "B", brief) for _ in range(20)]
+    tasks += [parts["A"].submit(recorded, "s", "A", brief) for _ in range(20)]
+    killed = kill_at(f"partition.{point}", nannies.run(os.getpid))
+    try:
+        assert parts["A"].grow(1) == [moving]
+    finally:
+        trace_to(None)
+    assert len(killed) == 1
+    wait_until(lambda: killed[0] not in nannies.scheduler_info(n_workers=-1)["workers"])
+    parts["A"].wait(2, timeout_s=LONG_S)
+    assert members(parts["A"]) == sorted([target, moving])
+    assert declared(nannies) == declared_by_themselves(nannies) == {"0": {"A": 1}, "1": {"A": 1}}
+    # Those of B that had ended are lost with their worker, and wait for the next one.
+    assert parts["A"].shrink(1)
+    records = [record for _, record in nannies.gather(tasks)]
+    assert not any(record.misplaced for record in records)
+    nannies.restart()
+    assert sorted(map(str, declared(nannies).values())) == ["{'A': 1}", "{'B': 1}"]

@@ -1,0 +1,306 @@
+"""Rules: whom they choose, now and when a worker joins, without a cluster and on one."""
+
+import pytest
+from distributed import Client, LocalCluster, get_worker
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from poolpart import (
+    Partition,
+    Pool,
+    PoolError,
+    WorkerInfo,
+    n_workers,
+    named,
+    per_gpu,
+    per_host,
+    probe,
+    rest,
+)
+from poolpart.rules import check_rules, divide, partition_for
+from poolpart.selection import NO_GPU
+
+
+def worker(name, *gpus, host="h", **resources):
+    return WorkerInfo(name, f"tcp://{name}", host, 2, gpus=gpus, resources=resources)
+
+
+def names(rules, pool):
+    return {name: [w.name for w in group] for name, group in divide(rules, pool)[0].items()}
+
+
+def here():
+    return str(get_worker().name)
+
+
+# -- whom they choose ------------------------------------------------------------------
+
+
+def test_each_rule_takes_of_what_those_before_it_have_left():
+    pool = [worker("a"), worker("b", "x"), worker("c", "x"), worker("d"), worker("e", host="2")]
+    rules = {"GPU": per_gpu(1), "LIDAR": per_host(1), "REST": rest()}
+    assert names(rules, pool) == {"GPU": ["b"], "LIDAR": ["a", "e"], "REST": ["c", "d"]}
+
+
+def test_workers_that_a_rule_names_are_kept_for_it():
+    pool = [worker("a"), worker("b"), worker("c")]
+    rules = {"P": n_workers(1), "Q": named("a", "tcp://b")}
+    assert names(rules, pool) == {"P": ["c"], "Q": ["a", "b"]}
+
+
+def test_workers_that_declare_something_else_are_left_alone():
+    pool = [worker("a", DISK=1), worker("b"), worker("c", Q=0)]
+    assert names({"P": rest()}, pool) == {"P": ["b", "c"]}
+
+
+def test_the_same_rules_again_make_the_same_partitions():
+    pool = [worker("a"), worker("b", P=1), worker("c", R=1)]
+    assert names({"P": n_workers(1), "R": rest()}, pool) == {"P": ["b"], "R": ["c", "a"]}
+
+
+def test_without_a_gpu_there_is_a_note():
+    chosen, notes = divide({"GPU": per_gpu(1), "R": rest()}, [worker("a"), worker("b")])
+    assert ([w.name for w in chosen["GPU"]], notes) == (["a"], {"GPU": NO_GPU})
+
+
+def test_fewer_than_the_minimum():
+    pool = [worker("a"), worker("b")]
+    message = "'Q' would have 0 workers of the 1 that it needs: 0 of 2 are left"
+    with pytest.raises(PoolError, match=message):
+        divide({"P": n_workers(2), "Q": per_host(1)}, pool)
+    assert names({"P": n_workers(2), "Q": per_host(1, minimum=0)}, pool)["Q"] == []
+    with pytest.raises(PoolError, match="would have 2 workers of the 3"):
+        divide({"P": rest(minimum=3)}, pool)
+
+
+@pytest.mark.parametrize(
+    ("rules", "message"),
+    [
+        ({}, "no rules to divide by"),
+        ({"": rest()}, "name of a partition is empty"),
+        ({"P": 3}, r"rule of partition 'P' is 3; give one, such as per_host\(2\)"),
+        ({"P": rest(slots=0)}, "slots is 0"),
+        ({"P": rest(minimum=-1)}, "minimum of 'P' is -1"),
+        ({"P": per_gpu(0)}, "a whole number, 1 or more"),
+        ({"P": per_host(1.5)}, "a whole number, 1 or more"),
+        ({"P": n_workers(0)}, "a whole number, 1 or more"),
+        ({"P": n_workers(2, minimum=3)}, "a minimum above its 2 workers"),
+    ],
+)
+def test_rules_that_make_no_sense(rules, message):
+    with pytest.raises(PoolError, match=message):
+        check_rules(rules)
+
+
+# -- whom a worker that joins belongs to -----------------------------------------------
+
+RULES = {"GPU": per_gpu(1), "LIDAR": per_host(2), "OTHER": rest()}
+
+
+def test_a_gpu_that_nobody_uses_comes_first():
+    members = {"GPU": [worker("a", "x")], "LIDAR": [worker("b")], "OTHER": []}
+    assert partition_for(worker("new", "y"), RULES, members) == "GPU"
+    assert partition_for(worker("new", "x"), RULES, members) == "LIDAR"
+    assert partition_for(worker("new"), RULES, members) == "LIDAR"
+    assert partition_for(worker("new", host="2"), RULES, members) == "LIDAR"
+    full = members | {"LIDAR": [worker("b"), worker("c")]}
+    assert partition_for(worker("new"), RULES, full) == "OTHER"
+
+
+def test_a_gpu_worker_joins_where_cpu_workers_had_to_do():
+    members = {"GPU": [worker("a")], "LIDAR": [worker("b"), worker("c")], "OTHER": []}
+    assert partition_for(worker("new", "x"), RULES, members) == "GPU"
+    assert partition_for(worker("new"), RULES, members) == "OTHER"
+    assert partition_for(worker("new", host="2"), RULES, members) == "GPU"
+
+
+def test_what_is_short_is_filled_first():
+    rules = {"A": per_host(2), "B": n_workers(3, minimum=2), "C": rest()}
+    members = {"A": [worker("a")], "B": [worker("b")], "C": []}
+    assert partition_for(worker("new"), rules, members) == "B"
+    members["B"].append(worker("c"))
+    assert partition_for(worker("new"), rules, members) == "A"
+    assert partition_for(worker("new"), rules, members | {"A": [], "B": []}) == "A"
+
+
+def test_nobody_wants_it():
+    rules, members = {"A": n_workers(1), "B": named("b")}, {"A": [worker("a")], "B": []}
+    assert partition_for(worker("new"), rules, members) is None
+    assert partition_for(worker("b"), rules, members) == "B"
+
+
+@given(
+    gpus=st.lists(st.integers(0, 3), min_size=1, max_size=4),
+    order=st.randoms(use_true_random=False),
+    most=st.integers(1, 3),
+)
+@settings(deadline=None)
+def test_whoever_joins_finds_a_place_and_no_rule_gets_more_than_it_wants(gpus, order, most):
+    pool = [
+        worker(f"{h}-{i}", *(f"{h}:{g}" for g in range(count)), host=str(h))
+        for h, count in enumerate(gpus)
+        for i in range(2 + count)
+    ]
+    rules = {"GPU": per_gpu(most), "HOST": per_host(1), "REST": rest()}
+    members = {name: [] for name in rules}
+    order.shuffle(pool)
+    for one in pool:
+        members[partition_for(one, rules, members)].append(one)
+    assert sum(map(len, members.values())) == len(pool)
+    assert len(rules["HOST"].choose(members["HOST"])) == len(members["HOST"])
+    casting = [w for w in members["GPU"] if w.gpus]
+    assert len(rules["GPU"].choose(casting)) == len(casting)
+    # What goes to the rest is wanted by nobody else.
+    for one in members["REST"]:
+        others = {name: group for name, group in members.items() if name != "REST"}
+        assert partition_for(one, {n: rules[n] for n in others}, others) is None
+
+
+# -- on a cluster ----------------------------------------------------------------------
+
+
+def declared(client):
+    workers = client.scheduler_info(n_workers=-1)["workers"].values()
+    return {str(worker["name"]): worker["resources"] for worker in workers}
+
+
+def join(client, name, **options):
+    """Start one more worker."""
+    spec = next(iter(client.cluster.worker_spec.values()))
+    client.cluster.worker_spec[name] = {**spec, "options": {**spec["options"], **options}}
+    client.sync(client.cluster._correct_state)
+
+
+def leave(client, name):
+    del client.cluster.worker_spec[name]
+    client.sync(client.cluster._correct_state)
+
+
+def test_a_cluster_that_somebody_else_started():
+    with (
+        LocalCluster(
+            n_workers=4, processes=False, threads_per_worker=2, dashboard_address="127.0.0.1:0"
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        rules = {"A": n_workers(1), "B": named("3", "0", slots=1), "C": rest()}
+        parts = Pool.from_client(client).divide(rules)
+        assert {name: len(part) for name, part in parts.items()} == {"A": 1, "B": 2, "C": 1}
+        assert (parts["A"].slots, parts["B"].slots) == (2, 2)
+        for part in parts.values():
+            ran = {future.result() for future in part.submit_many(lambda _: here(), range(20))}
+            assert ran <= {worker.name for worker in part.workers}
+
+
+def test_workers_that_join_later(start, wait_until):
+    client = start({"a": {}, "b": {}})
+    Pool.from_client(client).divide({"A": n_workers(2), "B": per_host(2, minimum=0), "C": rest()})
+    for name in "cdef":
+        join(client, name, nthreads=3)
+        wait_until(lambda name=name: declared(client).get(name))
+    assert declared(client) == {
+        **{name: {"A": 1} for name in "ab"},
+        **{name: {"B": 3} for name in "cd"},
+        **{name: {"C": 3} for name in "ef"},
+    }
+
+
+def test_a_rule_holds_when_its_client_has_gone(start, wait_until):
+    client = start({"a": {}})
+    with Client(client.cluster) as other:
+        Pool.from_client(other).divide({"A": n_workers(1), "B": rest()})
+    join(client, "b")
+    wait_until(lambda: declared(client).get("b") == {"B": 1})
+
+
+def test_a_worker_that_left_is_replaced_by_one_that_joins_and_waiting_tasks_run(start, wait_until):
+    client = start({"a": {}, "b": {}})
+    parts = Pool.from_client(client).divide({"A": named("b", "late"), "B": rest()})
+    leave(client, "b")
+    waiting = [parts["A"].submit(here) for _ in range(3)]
+    wait_until(lambda: len(client.cluster.scheduler.unrunnable) == 3)
+    join(client, "late")
+    assert client.gather(waiting) == ["late"] * 3
+    assert declared(client) == {"a": {"B": 1}, "late": {"A": 1}}
+
+
+def test_a_late_worker_is_asked_for_its_gpus(start, wait_until, monkeypatch):
+    gpus = iter([("x",), ("x", "y"), ("x", "y")])
+    monkeypatch.setattr(probe, "visible_gpus", lambda: next(gpus))
+    client = start({"a": {}})
+    Pool.from_client(client).divide({"GPU": per_gpu(1), "OTHER": rest()})
+    for name in ("second", "third"):
+        join(client, name)
+        wait_until(lambda name=name: declared(client).get(name))
+    assert declared(client) == {"a": {"GPU": 1}, "second": {"GPU": 1}, "third": {"OTHER": 1}}
+
+
+def test_a_late_worker_that_cannot_be_asked_has_no_gpu(start, wait_until, monkeypatch):
+    client = start({"a": {}})
+    Pool.from_client(client).divide({"GPU": per_gpu(1), "OTHER": rest()})
+
+    def broken():
+        raise ZeroDivisionError("no driver")
+
+    monkeypatch.setattr(probe, "visible_gpus", broken)
+    join(client, "late")
+    wait_until(lambda: declared(client).get("late") == {"OTHER": 1})
+
+
+def test_a_late_worker_that_declares_a_partition_belongs_to_it(start, wait_until):
+    client = start({"a": {}, "b": {}})
+    parts = Pool.from_client(client).divide({"A": n_workers(1), "B": rest()})
+    join(client, "c", resources={"A": 5})
+    join(client, "d", resources={"DISK": 1})
+    parts["A"].wait(2, timeout_s=20)
+    wait_until(lambda: len(declared(client)) == 4)
+    assert [declared(client)[name] for name in "cd"] == [{"A": 5}, {"DISK": 1}]
+
+
+def test_a_selector_of_partition_holds_as_a_rule_does(start, wait_until):
+    client = start({"a": {}, "b": {}})
+    part, _ = Pool.from_client(client).partition("P", n_workers=2, slots=4)
+    leave(client, "a")
+    wait_until(lambda: len(part) == 1)
+    join(client, "c")
+    join(client, "d")
+    part.wait(2, timeout_s=20)
+    wait_until(lambda: len(declared(client)) == 3)
+    assert sorted(map(str, declared(client).values())) == ["{'P': 4}", "{'P': 4}", "{}"]
+
+
+def test_rules_that_a_cluster_cannot_meet_change_nothing(start):
+    client = start({"a": {}, "b": {"resources": {"O": 1}}})
+    plugins = set(client.cluster.scheduler.plugins)
+    pool = Pool.from_client(client)
+    for rules in ({"A": n_workers(1), "B": n_workers(1)}, {"A": rest(minimum=2)}):
+        with pytest.raises(PoolError):
+            pool.divide(rules)
+    assert declared(client) == {"a": {}, "b": {"O": 1}}
+    assert set(client.cluster.scheduler.plugins) == plugins
+
+
+def test_two_who_divide_one_cluster_at_a_time(start):
+    client = start({"a": {}, "b": {}})
+    mine, theirs = Pool.from_client(client), Pool.from_client(client)
+    mine._cluster_now = theirs._cluster_now = lambda: {w.name: w for w in mine}
+    mine.partition("P", workers=["a"])
+    with pytest.raises(PoolError, match="Worker a already declares P; a worker belongs to one"):
+        theirs.divide({"Q": rest()})
+    assert declared(client) == {"a": {"P": 1}, "b": {}}
+
+
+def test_an_exclusive_partition_keeps_others_out(start):
+    client = start({"a": {}, "b": {}})
+    parts = Pool.from_client(client).divide({"A": n_workers(1, exclusive=True), "B": rest()})
+    inside = parts["A"].workers[0].name
+    plain = [client.submit(here, pure=False) for _ in range(30)]
+    assert inside not in client.gather(plain)
+    assert parts["A"].submit(here).result() == inside
+
+
+def test_a_partition_that_no_rule_has_made_is_not_touched(start):
+    client = start({"a": {"resources": {"A": 2}}, "b": {}})
+    Pool.from_client(client).divide({"B": rest()})
+    assert declared(client) == {"a": {"A": 2}, "b": {"B": 1}}
+    assert Partition("A", client).submit(here).result() == "a"
