@@ -11,6 +11,7 @@ from .pipe import Pipe
 from .pipe_parts import forget_pipes
 from .placement import Recorder, TaskRecord, placement_violations, recorded
 from .pool import Pool
+from .rules import Rule, n_workers, named, per_gpu, per_host, rest
 from .slots import Slots, look_at_slots
 from .tracing import trace, trace_to
 from .worker_info import WorkerInfo, assign_devices
@@ -25,6 +26,7 @@ __all__ = [
     "Pool",
     "PoolError",
     "Recorder",
+    "Rule",
     "Slots",
     "TaskRecord",
     "WorkerInfo",
@@ -34,8 +36,13 @@ __all__ = [
     "forget_pipes",
     "local_cluster",
     "look_at_slots",
+    "n_workers",
+    "named",
+    "per_gpu",
+    "per_host",
     "placement_violations",
     "recorded",
+    "rest",
     "trace",
     "trace_to",
 ]
