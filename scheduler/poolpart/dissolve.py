@@ -62,6 +62,8 @@ async def _dissolve(
     book, scheduler = steward.book, steward.scheduler
     gone = [name for name in book.rules if names is None or name in names]
     deadline = time.monotonic() + timeout_s
+    # What the client submitted just before comes by another connection, after some milliseconds.
+    await asyncio.sleep(2 * LOOK_EVERY_S)
     while tasks := _unfinished(scheduler, gone):
         if time.monotonic() >= deadline:
             raise PoolError(

@@ -48,6 +48,7 @@ class Steward(SchedulerPlugin):
     def __init__(self, scheduler: Any) -> None:
         self.scheduler = scheduler
         self.book = Book()
+        self.asked = 0  # questions of clients that are being answered
         self.rebalancing = Rebalancing(scheduler, self.book, self.settle)
         self._resources_before = set(scheduler.resources)
         self._declared: dict[str, Resources] = {}  # {address: what the worker itself declares}
@@ -264,10 +265,15 @@ class Steward(SchedulerPlugin):
             except OSError as error:
                 logger.info("The nanny at %s is gone: %s", seat.nanny, error)
 
+    def _at_rest(self, seat: Seat) -> bool:
+        """Whether nothing is left to do for a worker, or its nanny, which may start it again."""
+        if seat.absent_since is None:
+            return self.settled(seat)
+        return not seat.holds or seat.nanny not in self._nannies
+
     def remove_if_done(self) -> None:
         """Leave the scheduler, once there are no partitions and all workers are as they were."""
-        here = [seat for seat in self.book.seats.values() if seat.absent_since is None]
-        if self.book.rules or not all(self.settled(seat) for seat in here):
+        if self.book.rules or self.asked or not all(map(self._at_rest, self.book.seats.values())):
             return
         self.stop()
         for name in self.book.names - self._resources_before:
@@ -284,7 +290,9 @@ def steward_of(scheduler: Any) -> Iterator[Steward]:
     if steward is None:
         steward = Steward(scheduler)
         scheduler.add_plugin(steward)
+    steward.asked += 1
     try:
         yield steward
     finally:
+        steward.asked -= 1
         steward.remove_if_done()

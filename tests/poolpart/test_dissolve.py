@@ -1,0 +1,194 @@
+"""Undoing partitions: what the scheduler, workers and nannies know is what they knew before."""
+
+import os
+import signal
+import threading
+
+import pytest
+from distributed import Client, Event, get_worker
+
+from poolpart import Partition, Pool, PoolError, n_workers, named, per_host, rest
+
+LONG_S = 60.0
+
+
+def here():
+    return str(get_worker().name)
+
+
+def wait_for(event):
+    return Event(event).wait(LONG_S)
+
+
+def known(client):
+    """All that the scheduler, the workers and the nannies know of partitions."""
+    scheduler = client.cluster.scheduler
+    # Clients come and go, and Dask itself keeps an entry for a resource that was asked for.
+    return {
+        "workers": {
+            str(w.name): (dict(w.resources), dict(w.used_resources), w.status.name)
+            for w in scheduler.workers.values()
+        },
+        "by resource": {
+            name: sorted(str(scheduler.workers[a].name) for a in workers)
+            for name, workers in scheduler.resources.items()
+        },
+        "plugins": set(scheduler.plugins),
+        "plugins for others": (set(scheduler.worker_plugins), set(scheduler.nanny_plugins)),
+        "extensions": set(scheduler.extensions),
+        "handlers": {name: str(handler) for name, handler in scheduler.handlers.items()},
+        "streams": set(scheduler.stream_handlers),
+        "callbacks": set(scheduler.periodic_callbacks),
+        "overridden": {name for name in vars(scheduler) if hasattr(type(scheduler), name)},
+        "unrunnable": set(scheduler.unrunnable),
+        "tasks": {
+            key: (task.state, task.resource_restrictions, task.worker_restrictions)
+            for key, task in scheduler.tasks.items()
+        },
+        "themselves": sorted(client.run(_on_worker).values(), key=str),
+        "nannies": sorted(client.run(_on_nanny, nanny=True).values(), key=str),
+    }
+
+
+def _on_worker(dask_worker):
+    state = dask_worker.state
+    return (
+        str(dask_worker.name),
+        dict(state.total_resources),
+        dict(state.available_resources),
+        sorted(dask_worker.plugins),
+    )
+
+
+def _on_nanny(dask_worker):
+    kwargs = dask_worker.process.worker_kwargs
+    return str(dask_worker.name), dask_worker.resources, kwargs["resources"], kwargs.keys()
+
+
+def declared(client):
+    workers = client.scheduler_info(n_workers=-1)["workers"].values()
+    return {str(worker["name"]): worker["resources"] for worker in workers}
+
+
+def join(client, name):
+    client.cluster.worker_spec[name] = next(iter(client.cluster.worker_spec.values()))
+    client.sync(client.cluster._correct_state)
+
+
+def test_everything_is_as_before(start, wait_until):
+    workers = {"native": {"resources": {"GPU": 2}}, "disk": {"resources": {"DISK": 1}}}
+    client = start({**{name: {} for name in "abcd"}, **workers})
+    held = client.submit(here, key="held")
+    held.result()
+    before = known(client)
+    pool = Pool.from_client(client)
+    parts = pool.divide({"A": n_workers(2, exclusive=True), "B": per_host(1), "C": rest()})
+    part, _ = pool.partition("GPU", workers=["native"], slots=5)
+    client.gather([part.submit(here), *(p.submit(here) for p in parts.values())])
+    parts["A"].grow(1)
+    parts["C"].minimum  # noqa: B018 - asks the scheduler
+    pool.rebalance("A", helps="B", idle_s=0.0)
+    wait_until(lambda: client.cluster.scheduler.tasks.keys() == {"held"})
+    assert known(client) != before
+    assert sorted(Pool.from_client(client).dissolve()) == ["A", "B", "C", "GPU"]
+    assert known(client) == before
+    assert Pool.from_client(client).dissolve() == []
+    assert known(client) == before
+
+
+def test_nannies_are_as_before(nannies, wait_until):
+    before = known(nannies)
+    Pool.from_client(nannies).divide({"A": per_host(1), "B": rest()})
+    addresses = set(nannies.scheduler_info(n_workers=-1)["workers"])
+    victim = nannies.run(os.getpid).popitem()
+    os.kill(victim[1], signal.SIGKILL)
+    # While one is starting again, too.
+    wait_until(lambda: victim[0] not in nannies.scheduler_info(n_workers=-1)["workers"])
+    assert Pool(nannies, []).dissolve() == ["A", "B"]
+    assert victim[0] in addresses
+    assert known(nannies) == before
+    nannies.restart()
+    assert declared(nannies) == {"0": {}, "1": {}}
+    assert known(nannies)["nannies"] == before["nannies"]
+
+
+def test_one_partition(start):
+    client = start({name: {} for name in "abc"})
+    parts = Pool.from_client(client).divide({"A": named("a"), "B": rest()})
+    parts["A"].dissolve()
+    assert declared(client) == {"a": {}, "b": {"B": 1}, "c": {"B": 1}}
+    parts["B"].grow(1)
+    assert len(parts["B"]) == 3
+    parts["B"].dissolve()
+    assert declared(client) == {"a": {}, "b": {}, "c": {}}
+
+
+def test_whoever_was_lent_goes_home_first(start, wait_until):
+    client = start({name: {} for name in "abc"})
+    parts = Pool.from_client(client).divide({"A": named("a"), "B": rest()})
+    Pool.from_client(client).rebalance("B", helps="A", idle_s=0.0)
+    event = Event("lent", client)
+    tasks = [parts["A"].submit(wait_for, "lent") for _ in range(6)]
+    wait_until(lambda: len(parts["A"]) == 3)
+    threading.Timer(0.3, event.set).start()
+    parts["A"].dissolve()
+    assert all(client.gather(tasks))
+    assert declared(client) == {"a": {}, "b": {"B": 1}, "c": {"B": 1}}
+
+
+def test_workers_that_join_afterwards_are_left_alone(start):
+    client = start({"a": {}})
+    pool = Pool.from_client(client)
+    pool.divide({"A": rest()})
+    pool.dissolve()
+    join(client, "late")
+    client.wait_for_workers(2, timeout=LONG_S)
+    assert declared(client) == {"a": {}, "late": {}}
+
+
+def test_tasks_that_have_not_ended_are_waited_for(start, wait_until):
+    client = start({"a": {}, "b": {}})
+    pool = Pool.from_client(client)
+    parts = pool.divide({"A": n_workers(1), "B": rest()})
+    event = Event("dissolve", client)
+    tasks = [parts["A"].submit(wait_for, "dissolve", key=f"t-{i}") for i in range(3)]
+    before = declared(client)
+    with pytest.raises(PoolError, match="3 tasks of A and B have not ended after 0 s, such as t-"):
+        pool.dissolve(timeout_s=0)
+    assert declared(client) == before
+    threading.Timer(0.3, event.set).start()
+    pool.dissolve()
+    assert client.gather(tasks) == [True] * 3
+    assert declared(client) == {"a": {}, "b": {}}
+
+
+def test_a_result_that_is_lost_afterwards_is_computed_again(start, wait_until):
+    client = start({"a": {}, "b": {}})
+    pool = Pool.from_client(client)
+    part, _ = pool.partition("P", workers=["a"])
+    future = part.submit(here)
+    assert future.result() == "a"
+    pool.dissolve()
+    del client.cluster.worker_spec["a"]
+    address = {w.name: w.address for w in pool}["a"]
+    client.cluster.scheduler_comm  # noqa: B018
+    client.sync(client.cluster.scheduler.remove_worker, address, stimulus_id="lost")
+    assert future.result(LONG_S) == "b"
+
+
+def test_dividing_once_more(start):
+    client = start({"a": {}, "b": {}})
+    for names in ("PQ", "QP", "PQ"):
+        pool = Pool.from_client(client)
+        parts = pool.divide({names[0]: n_workers(1), names[1]: rest()})
+        assert [part.submit(here).result() in "ab" for part in parts.values()] == [True, True]
+        assert sorted(pool.dissolve()) == ["P", "Q"]
+
+
+def test_another_client_can_undo_it(start):
+    client = start({"a": {}})
+    with Client(client.cluster) as other:
+        Pool.from_client(other).divide({"A": rest()})
+    Pool.from_client(client).dissolve()
+    assert declared(client) == {"a": {}}
+    assert len(Partition("A", client)) == 0
