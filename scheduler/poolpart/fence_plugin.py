@@ -143,7 +143,6 @@ class Fences(SchedulerPlugin):
         if declares:
             self.closed.add(worker)
             self.scheduler.idle_task_count.discard(worker)
-            self._turn_out(worker)
         elif worker in self.closed:
             self.closed.discard(worker)
             self.scheduler.check_idle_saturated(worker)
@@ -154,28 +153,31 @@ class Fences(SchedulerPlugin):
                 )
                 self.scheduler.stimulus_queue_slots_maybe_opened(stimulus_id=stimulus)
 
-    def _turn_out(self, worker: Any) -> None:
-        """Ask a worker for tasks that it should not have.
+    def _turn_out(self, worker: Any, asked: set[Any]) -> None:
+        """Ask a worker for tasks that it should not have, each once.
 
         By the protocol of work stealing: a worker gives up what it has not started, and the
-        scheduler decides anew, since the thief is one that has left.
+        scheduler decides anew, since the thief is one that has left. A task that is being
+        stolen already is left for the next time.
         """
         if stealing := self.scheduler.extensions.get("stealing"):
-            for task in list(worker.processing - worker.long_running):
-                if self.stop(task) and not task.actor:
+            for task in worker.processing - worker.long_running - asked:
+                if self.stop(task) and not task.actor and task not in stealing.in_flight:
+                    asked.add(task)
                     stealing.move_task_request(task, worker, _departed(self.scheduler))
 
     async def settle(self) -> None:
-        """Wait until workers behind fences have answered, those that answer."""
+        """Turn out what has not started behind fences, and wait a moment for the answers."""
         stealing = self.scheduler.extensions.get("stealing")
+        asked: set[Any] = set()
         deadline = time.monotonic() + _SETTLE_S
         while stealing and time.monotonic() < deadline:
+            for worker in self.closed:
+                self._turn_out(worker, asked)
             moves = stealing.in_flight.values()
+            # Also what somebody behind a fence steals just now; it is turned out then.
             if not any(move["thief"] in self.closed or _is_departed(move) for move in moves):
-                # A thief's booty that was under way when the fence went up is turned out too.
-                self.look_again()
-                if not any(_is_departed(move) for move in stealing.in_flight.values()):
-                    return
+                return
             await asyncio.sleep(0.005)
 
     def remove_worker(self, scheduler: Any, worker: str, **kwargs: Any) -> None:
@@ -191,7 +193,10 @@ class Fences(SchedulerPlugin):
 
     def _add_resources(self, original: Callable[..., Any], worker: str, resources: Any) -> Any:
         answer = original(worker, resources)
-        self._look_at(self.scheduler.workers[worker])
+        state = self.scheduler.workers[worker]
+        self._look_at(state)
+        if state in self.closed:
+            self._turn_out(state, set())
         return answer
 
     def _valid_workers(self, original: Callable[..., Any], task: Any) -> Any:

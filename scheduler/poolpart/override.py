@@ -22,6 +22,7 @@ class _Chain:
 
     def __init__(self, original: Method) -> None:
         self.original = self.method = original
+        self.__name__ = original.__name__  # the server tells its log which handler it calls
         self.replacements: list[Method] = []
 
     def change(self, replacements: list[Method]) -> None:

@@ -1,0 +1,358 @@
+"""Fences: who is kept out, who passes, what waits, and what is left when one is lowered."""
+
+import os
+import signal
+import threading
+import time
+import warnings
+from collections import Counter
+
+import dask
+import dask.array
+import pytest
+from distributed import get_worker, wait, worker_client
+
+from poolpart import Partition, Pool, PoolError
+from poolpart.fence import lower_fence, raise_fence, raised_fences
+from poolpart.fence_plugin import kept_out
+from poolpart.override import Overrides
+
+LONG_S = 30.0
+CLUSTER = {
+    "A-0": {"resources": {"A": 1}},
+    "A-1": {"resources": {"A": 1}},
+    "B-0": {"resources": {"B": 1}},
+    "plain": {},
+}
+OUTSIDE = {"B-0", "plain"}
+
+
+def here(*_, pause_s=0.0):
+    time.sleep(pause_s)
+    return str(get_worker().name)
+
+
+def inside(count):
+    """Submit from inside a task, without a partition."""
+    with worker_client() as client:
+        return client.gather([client.submit(here, i, pure=False) for i in range(count)])
+
+
+class Counting:
+    def where(self):
+        return here()
+
+
+@pytest.fixture
+def client(start):
+    client = start(CLUSTER)
+    client.cluster.scheduler.validate = True  # Dask checks itself after each step
+    return client
+
+
+def scheduler_of(client):
+    return client.cluster.scheduler
+
+
+def state_of(client, name):
+    return next(w for w in scheduler_of(client).workers.values() if w.name == name)
+
+
+def declare(client, name, **resources):
+    """Have a running worker declare something."""
+    address = state_of(client, name).address
+
+    async def on_worker(dask_worker):
+        await dask_worker.set_resources(**resources)
+
+    client.run(on_worker, workers=[address])
+
+
+def pile_up(client, count=40):
+    """Tasks that Dask gives to the workers at once, more than they can run."""
+    scheduler_of(client).WORKER_SATURATION = float("inf")
+    return [client.submit(here, i, pause_s=0.05, pure=False) for i in range(count)]
+
+
+def submitted(client):
+    return client.gather([client.submit(here, i, pure=False) for i in range(40)])
+
+
+def mapped(client):
+    return client.gather(client.map(here, range(200), pure=False))
+
+
+def mapped_on_a_scheduler_without_a_queue(client):
+    scheduler_of(client).WORKER_SATURATION = float("inf")
+    return mapped(client)
+
+
+def from_inside_others(client):
+    by_resource = client.submit(inside, 20, resources={"B": 1}, pure=False)
+    return [*by_resource.result(LONG_S), *client.submit(inside, 20, pure=False).result(LONG_S)]
+
+
+def delayed(client):
+    return dask.compute(*(dask.delayed(here, pure=False)(i) for i in range(40)))
+
+
+def dependent(client):
+    """Tasks whose only input lies behind the fence."""
+    behind = client.submit(bytes, 10_000_000, resources={"A": 1})
+    return client.gather([client.submit(here, behind, i, pure=False) for i in range(20)])
+
+
+def preferring_the_partition(client):
+    wanted = [state_of(client, "A-0").address]
+    futures = [
+        client.submit(here, i, workers=wanted, allow_other_workers=True, pure=False)
+        for i in range(10)
+    ]
+    return client.gather(futures)
+
+
+def actors(client):
+    made = [client.submit(Counting, actor=True, key=f"counting-{i}").result() for i in range(6)]
+    return [actor.where().result() for actor in made]
+
+
+def array(client):
+    blocks = dask.array.ones((40, 40), chunks=(4, 4)).map_blocks(
+        lambda block: block * 0 + ord(here()[0]), dtype=float, meta=dask.array.ones((0, 0))._meta
+    )
+    return [chr(int(code)) for code in set(blocks.compute().ravel())]
+
+
+def shuffled(client):
+    """Outputs of a peer-to-peer shuffle, which chooses their workers itself."""
+    whole = dask.array.ones((200, 200), chunks=(10, 200)).rechunk((200, 10), method="p2p").persist()
+    wait(whole, LONG_S)
+    return [w.name for w in scheduler_of(client).workers.values() if w.has_what]
+
+
+@pytest.mark.parametrize(
+    "way",
+    [
+        submitted,
+        mapped,
+        mapped_on_a_scheduler_without_a_queue,
+        from_inside_others,
+        delayed,
+        dependent,
+        preferring_the_partition,
+        actors,
+    ],
+)
+def test_other_tasks_stay_out(client, way):
+    raise_fence(client, "A")
+    assert set(way(client)) == OUTSIDE
+
+
+def test_arrays_stay_out(client):
+    raise_fence(client, "A")
+    assert set(array(client)) == {"B", "p"}
+    assert set(shuffled(client)) == OUTSIDE
+
+
+def test_without_a_fence_they_come_in(client):
+    """Else the tests above would say nothing."""
+    for way in (submitted, mapped, delayed, dependent, preferring_the_partition, shuffled):
+        assert not set(way(client)) <= OUTSIDE, way.__name__
+
+
+def test_tasks_of_the_partition_pass(client):
+    raise_fence(client, "A")
+    raise_fence(client, "B")
+    assert set(client.gather(Partition("A", client).map(here, range(20)))) == {"A-0", "A-1"}
+    assert set(client.gather(Partition("B", client).map(here, range(5)))) == {"B-0"}
+    assert set(submitted(client)) == {"plain"}
+    assert len(client.run(os.getpid)) == 4  # not a task
+
+
+def test_root_tasks_are_held_back_as_before(client, wait_until):
+    raise_fence(client, "A")
+    raise_fence(client, "B")
+    futures = client.map(here, range(200), pause_s=0.02, pure=False)
+    scheduler = scheduler_of(client)
+    wait_until(lambda: len(scheduler.queued) > 150)
+    assert len(state_of(client, "plain").processing) <= 2
+    del futures
+
+
+ran = []  # the workers are threads of this process
+go = threading.Event()
+
+
+def held(number):
+    ran.append(number)
+    go.wait(LONG_S)
+    return here()
+
+
+def test_what_has_not_started_leaves_when_a_fence_is_raised(client, wait_until):
+    ran.clear()
+    go.clear()
+    address = state_of(client, "A-0").address
+    # These may run elsewhere, but Dask puts them here at first.
+    futures = [
+        client.submit(held, i, workers=[address, state_of(client, "plain").address], pure=False)
+        for i in range(8)
+    ]
+    wait_until(lambda: len(ran) == 2)
+    assert len(state_of(client, "A-0").processing) > 1
+    raise_fence(client, "A")
+    assert len(state_of(client, "A-0").processing) == 1  # what runs goes on
+    go.set()
+    names = Counter(client.gather(futures))
+    assert names == {"plain": 7, "A-0": 1}
+    assert sorted(ran) == list(range(8))  # each once
+
+
+async def steal(dask_scheduler):
+    """Have work stealing look for work now; who steals, if anybody does."""
+    stealing = dask_scheduler.extensions["stealing"]
+    stealing.balance()
+    thieves = {str(move["thief"].name) for move in stealing.in_flight.values()}
+    return ", ".join(thieves)
+
+
+def test_nothing_is_stolen_into_a_partition(client, wait_until):
+    raise_fence(client, "A")
+    futures = pile_up(client, 60)
+    wait_until(lambda: len(state_of(client, "plain").processing) > 5)
+    assert {client.run_on_scheduler(steal) for _ in range(20)} <= {"", *OUTSIDE}
+    assert set(client.gather(futures)) == OUTSIDE
+
+
+def test_what_is_computed_again_stays_out(start):
+    client = start({"A-0": {"resources": {"A": 1}}, "one": {}, "two": {}})
+    first = client.submit(here, workers=["one"], allow_other_workers=True, pure=False)
+    assert first.result() == "one"
+    raise_fence(client, "A")
+    scheduler = scheduler_of(client)
+    address = state_of(client, "one").address
+
+    async def lose(dask_scheduler):
+        await dask_scheduler.remove_worker(address, stimulus_id="test", expected=True)
+
+    client.run_on_scheduler(lose)
+    assert client.submit(str, first).result(LONG_S) == "two"
+    assert {w.name for w in scheduler.workers.values() if w.has_what} == {"two"}
+
+
+def test_tasks_wait_where_all_workers_are_behind_fences_and_everybody_is_told(client, wait_until):
+    for name in ("A", "B", "C"):
+        raise_fence(client, name)
+    declare(client, "plain", C=1)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        one = client.submit(here, pure=False)
+        many = client.map(here, range(100), pure=False)
+        wait_until(lambda: caught and kept_out(scheduler_of(client)) == 101)
+    assert len(caught) == 1  # not one for each task
+    assert "exclusive partitions (A, B, C)" in str(caught[0].message)
+    assert not one.done()
+    lower_fence(client, "B")
+    assert {one.result(LONG_S), *client.gather(many)} == {"B-0"}
+    assert kept_out(scheduler_of(client)) == 0
+
+
+def test_a_fence_follows_what_workers_declare(client, wait_until):
+    raise_fence(client, "A")
+    declare(client, "plain", A=1)
+    assert set(submitted(client)) == {"B-0"}
+    declare(client, "A-0", A=0)
+    assert set(submitted(client)) == {"A-0", "B-0"}
+    assert set(client.gather(Partition("A", client).map(here, range(10)))) == {"A-1", "plain"}
+
+
+def test_a_worker_that_joins_a_partition_gives_away_what_it_has_not_started(client, wait_until):
+    raise_fence(client, "A")
+    futures = pile_up(client)
+    plain = state_of(client, "plain")
+    wait_until(lambda: len(plain.processing) > 5)
+    declare(client, "plain", A=1)
+    wait_until(lambda: len(plain.processing) <= 1)
+    assert Counter(client.gather(futures))["B-0"] > 25
+
+
+def test_waiting_tasks_go_to_a_worker_that_leaves_the_partition(start):
+    client = start({"A-0": {"resources": {"A": 1}}})
+    raise_fence(client, "A")
+    with pytest.warns(UserWarning, match="Tasks wait"):
+        waiting = [client.submit(here, pure=False), *client.map(here, range(50), pure=False)]
+        time.sleep(0.1)
+    declare(client, "A-0", A=0)
+    assert set(client.gather(waiting)) == {"A-0"}
+
+
+def test_it_holds_after_a_restart(nannies, wait_until):
+    part, _ = Pool.from_client(nannies).partition("P", workers=["1"], exclusive=True)
+    [member] = part.workers
+    os.kill(nannies.run(os.getpid, workers=[member.address])[member.address], signal.SIGKILL)
+    waiting = [part.submit(here) for _ in range(3)]
+    seen = set()
+    while not all(future.done() for future in waiting):
+        seen |= set(nannies.gather([nannies.submit(here, pure=False) for _ in range(10)]))
+    seen |= set(nannies.gather([nannies.submit(here, pure=False) for _ in range(10)]))
+    assert seen == {"0"}
+    assert set(nannies.gather(waiting)) == {"1"}
+
+
+def test_a_lowered_fence_leaves_nothing(client):
+    scheduler = scheduler_of(client)
+    stealing, shuffle = scheduler.extensions["stealing"], scheduler.extensions["shuffle"]
+
+    def look():
+        return (
+            [set(vars(owner)) for owner in (scheduler, stealing, shuffle)],
+            set(scheduler.plugins),
+            scheduler.handlers["set_resources"],
+            type(scheduler.idle_task_count),
+            {str(worker.name) for worker in scheduler.idle_task_count},
+            dict(stealing.in_flight_tasks),
+        )
+
+    before = look()
+    raise_fence(client, "A")
+    raise_fence(client, "B")
+    raise_fence(client, "A")
+    assert raised_fences(client) == {"A", "B"}
+    assert look() != before
+    lower_fence(client, "A")
+    assert set(submitted(client)) == {"A-0", "A-1", "plain"}
+    lower_fence(client, "B")
+    lower_fence(client, "B")
+    assert raised_fences(client) == frozenset()
+    assert look() == before
+    assert set(mapped(client)) == {*CLUSTER}
+
+
+def test_another_version_of_dask_is_refused():
+    class Owner:
+        def kept(self):
+            return 1
+
+    owner, overrides = Owner(), Overrides()
+    overrides.put(owner, {"kept": lambda original: original() + 1})
+    assert owner.kept() == 2
+    with pytest.raises(PoolError, match=r"Owner of distributed [0-9.]+ has no decide"):
+        overrides.put(owner, {"kept": lambda original: 0, "decide": lambda original: 0})
+    assert owner.kept() == 1
+    assert vars(owner) == {}
+
+
+def test_two_may_override_the_same_method():
+    class Owner:
+        def value(self, more):
+            return [more]
+
+    owner, first, second = Owner(), Overrides(), Overrides()
+    first.put(owner, {"value": lambda original, more: [*original(more), "first"]})
+    second.put(owner, {"value": lambda original, more: [*original(more), "second"]})
+    assert owner.value(0) == [0, "first", "second"]
+    first.take_back()
+    assert owner.value(0) == [0, "second"]
+    second.take_back()
+    assert owner.value(0) == [0]
+    assert vars(owner) == {}
