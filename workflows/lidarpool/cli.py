@@ -2,36 +2,28 @@
 
 from __future__ import annotations
 
-import math
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import NoReturn
 
 import click
-from distributed import Client
 
 from poolpart import Pool, PoolError
 from poolpart.probe import visible_gpus
 from raybeam import available_backends
 
 from ._version import __version__
-from .checks import check_backend_here, check_backend_name, check_precision
 from .complaints import did_you_mean
-from .connection import connected, local_client
+from .connection import connected
 from .errors import LidarpoolError
-from .interrupts import INTERRUPTED, interrupt_on_signals
-from .quiet import QuietWorkers, silence_logs
+from .interrupts import INTERRUPTED, STOPPED, UNTOUCHED, interrupt_on_signals
+from .quiet import silence_logs
 from .report import versions
-from .result import Result
+from .run_command import RunOptions, run_scenario
 from .scenario import Scenario
-from .scene import Scene
 from .scene_commands import scene
-from .simulate import simulate
-from .survey import Survey
-from .terminal import shown_progress, shown_status
-from .tls import NO_FILES, TlsFiles
+from .tls import TlsFiles
 
 _out = click.option(
     "--out",
@@ -92,7 +84,7 @@ def demo(out: Path, tls: bool, quiet: bool) -> None:
       lidarpool demo
       lidarpool demo --out /tmp/demo
     """  # noqa: D301 - click wants the character, not its name
-    _run(Scenario(), out, tls=tls, quiet=quiet)
+    run_scenario(Scenario(), RunOptions(out, tls=tls, journal=False, quiet=quiet))
 
 
 @cli.command()
@@ -107,6 +99,8 @@ def demo(out: Path, tls: bool, quiet: bool) -> None:
     help="Ray caster of stage 2; by default the scenario's, else the fastest there is.",
 )
 @click.option("--no-plan", is_flag=True, help="Leave the path planning out.")
+@click.option("--resume", is_flag=True, help="Go on with an unfinished run, if there is one.")
+@click.option("--fresh", is_flag=True, help="Drop an unfinished run.")
 @_quiet
 def run(
     scenario: Path,
@@ -114,6 +108,8 @@ def run(
     scheduler: str | None,
     backend: str | None,
     no_plan: bool,
+    resume: bool,
+    fresh: bool,
     quiet: bool,
     tls: bool,
     tls_ca: Path | None,
@@ -125,7 +121,7 @@ def run(
     \b
     Examples:
       lidarpool run examples/seed.yaml --out seed
-      lidarpool run hall.glb --no-plan --scheduler tcp://127.0.0.1:8786
+      lidarpool run hall.glb --no-plan --resume --scheduler tcp://127.0.0.1:8786
     """  # noqa: D301 - click wants the character, not its name
     files = _files_for(scheduler, tls_ca, tls_cert, tls_key)
     if tls and scheduler is not None:
@@ -133,7 +129,12 @@ def run(
             "--tls is for a cluster of this machine; that of --scheduler is encrypted if its "
             "address begins with tls://."
         )
-    _run(Scenario.load(scenario), out, scheduler, backend, no_plan, quiet, tls, files)
+    if resume and fresh:
+        raise click.UsageError("--resume goes on with what --fresh drops: give one of them.")
+    options = RunOptions(
+        out, scheduler, files, tls, backend, no_plan, resume=resume, fresh=fresh, quiet=quiet
+    )
+    run_scenario(Scenario.load(scenario), options)
 
 
 def _files_for(scheduler: str | None, *files: Path | None) -> TlsFiles:
@@ -144,72 +145,6 @@ def _files_for(scheduler: str | None, *files: Path | None) -> TlsFiles:
             "address, tls://host:8786, or --tls for an encrypted cluster of this machine."
         )
     return TlsFiles(*files)
-
-
-def _run(
-    scenario: Scenario,
-    out: Path,
-    scheduler: str | None = None,
-    backend: str | None = None,
-    no_plan: bool = False,
-    quiet: bool = False,
-    tls: bool = False,
-    files: TlsFiles = NO_FILES,
-) -> None:
-    # Matplotlib is a third of the time that --help would take.
-    from .output import result_folder, write_result
-
-    backend = backend or scenario.pool.backend
-    (check_backend_here if scheduler is None else check_backend_name)(backend)
-    scene = scenario.build_scene()
-    survey = scenario.survey(scene)
-    planning = None if no_plan else scenario.plan(scene)
-    check_precision(scene, survey)
-    pool = scenario.pool
-    with result_folder(out):
-        with (
-            _local_client(scenario, quiet, tls)
-            if scheduler is None
-            else connected(scheduler, files) as client,
-            shown_progress(quiet) as show,
-        ):
-            result = simulate(
-                scene,
-                survey,
-                planning,
-                client=client,
-                backend=backend,
-                on_progress=show,
-                queue_capacity=pool.queue_capacity,
-                collectors=pool.collectors,
-            )
-        with shown_status("writing the cloud, the pictures and the report", quiet):
-            report = write_result(out, result, scene, survey, planning)
-    _tell(out, result, scene, survey, report["files"])
-
-
-def _tell(out: Path, result: Result, scene: Scene, survey: Survey, files: list[str]) -> None:
-    for note in result.notes:
-        click.echo(f"note: {note}")
-    click.echo(
-        f"{survey.scan_count:,} scans, {result.rays:,} rays, {result.hits:,} hits on "
-        f"{len(scene.names):,} objects, {len(result.cloud):,} points in the cloud "
-        f"({result.backend}, {result.survey_seconds:.1f} s)"
-    )
-    if result.plan is not None:
-        plan = result.plan
-        found = (
-            f"path of {plan.length:.2f} m, free of collisions"
-            if plan.collision_free
-            else "no path free of collisions was found"
-        )
-        possible = (
-            f"the shortest possible is {plan.shortest_possible:.2f} m"
-            if math.isfinite(plan.shortest_possible)
-            else "none is possible, the obstacles leave no way"
-        )
-        click.echo(f"{found}; {possible} ({plan.trials} trials, {result.planning_seconds:.1f} s)")
-    click.echo(f"results in {click.format_filename(out)}: {', '.join(files)}")
 
 
 @cli.command()
@@ -251,23 +186,6 @@ def _tell_workers(pool: Pool) -> None:
         )
 
 
-@contextmanager
-def _local_client(scenario: Scenario, quiet: bool, tls: bool) -> Iterator[Client]:
-    """Client of a cluster on this machine whose workers say nothing of their own."""
-    with ExitStack() as stack:
-        with shown_status("starting the workers", quiet):
-            client = stack.enter_context(
-                local_client(
-                    gpu_workers=scenario.pool.gpu,
-                    collectors=scenario.pool.collectors,
-                    other_workers=scenario.pool.other,
-                    tls=tls,
-                )
-            )
-            client.register_plugin(QuietWorkers())
-        yield client
-
-
 def main(arguments: list[str] | None = None) -> NoReturn:
     """Run the command and exit: 0 done, 2 for what the user can put right, 130 interrupted."""
     interrupt_on_signals()
@@ -275,16 +193,28 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     try:
         cli.main(args=arguments, prog_name="lidarpool", standalone_mode=False)
     except (LidarpoolError, PoolError) as error:
-        _die(str(error), 2)
+        _die(" ".join([str(error), *_notes(error)]), 2)
     except click.UsageError as error:
         _die(error.format_message(), 2)
-    except (KeyboardInterrupt, click.Abort):
+    except (KeyboardInterrupt, click.Abort) as error:
         _die(
-            "interrupted; everything was stopped, and the output folder is as it was.", INTERRUPTED
+            " ".join([f"{STOPPED}.", *notes]) if (notes := _notes(error)) else UNTOUCHED,
+            INTERRUPTED,
         )
-    except MemoryError:
-        _die("not enough memory: take a smaller scene, fewer scans or a larger keep_every.", 2)
+    except MemoryError as error:
+        advice = "not enough memory: take a smaller scene, fewer scans or a larger keep_every."
+        _die(" ".join([advice, *_notes(error)]), 2)
     sys.exit(0)
+
+
+def _notes(error: BaseException) -> list[str]:
+    """List the notes of an error, or of what it came from: what was kept, and how to go on."""
+    link: BaseException | None = error
+    while link is not None:
+        if notes := getattr(link, "__notes__", []):
+            return list(notes)
+        link = link.__cause__ or link.__context__
+    return []
 
 
 def _die(message: str, code: int) -> NoReturn:

@@ -30,6 +30,7 @@ class Deliveries:
         self.cloud = CloudBuilder(job.survey.scan_count, store)
         self.totals = FrameTotals(len(job.scene.faces), job.survey.scan_count)
         self.trials: list[Trial] = []
+        self.notes: list[str] = []  # what a user should know of them
         self.resumed = 0  # scans whose points are of an earlier run
 
     @property

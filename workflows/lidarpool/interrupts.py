@@ -12,6 +12,8 @@ from multiprocessing import resource_tracker
 from types import FrameType
 
 INTERRUPTED = 130  # exit code, as shells give it to whatever Ctrl-C ended
+STOPPED = "interrupted; everything was stopped"
+UNTOUCHED = f"{STOPPED}, and the output folder is as it was."
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)  # from the keyboard, and from a job manager
 _IMPATIENT_S = 1.0  # a second signal sooner than this is the first one's twin
@@ -30,6 +32,17 @@ class _Interrupt:
         if time.monotonic() - self.first_at > _IMPATIENT_S:
             os.write(2, b"lidarpool: stopped at once; workers of this machine end by themselves.\n")
             os._exit(INTERRUPTED)
+
+
+def end_on_signals() -> None:
+    """Let SIGINT and SIGTERM end the process at once: as long as nothing has been started."""
+
+    def end(number: int, frame: FrameType | None) -> None:
+        os.write(2, f"lidarpool: {UNTOUCHED}\n".encode())
+        os._exit(INTERRUPTED)
+
+    for number in _SIGNALS:
+        signal.signal(number, end)
 
 
 def interrupt_on_signals() -> None:

@@ -336,7 +336,7 @@ class Journal(Deliveries):
     # -- the end -----------------------------------------------------------------------
 
     def save(self) -> None:
-        """Write everything to the disk, with a mark at the end.
+        """Write everything to the disk, with a mark at the end; nothing more will come.
 
         Raises
         ------
@@ -347,6 +347,7 @@ class Journal(Deliveries):
             with self._explained():
                 self._write_totals()
                 self._file.mark()
+                self._file.unlock()
 
     def remove(self) -> None:
         """Remove the journal and let go of its files."""
@@ -366,7 +367,7 @@ class Journal(Deliveries):
                 self.save()
             if self.kept:
                 error.add_note(
-                    f"{self.kept} are kept in {self.path}: continue with {self.terms.resume}"
+                    f"{self.kept} are kept in {self.path}: continue with {self.terms.resume}."
                 )
             self.close()
             raise

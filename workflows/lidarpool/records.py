@@ -167,6 +167,11 @@ class RecordFile:
             self.append(MARK)
             self._durable = self.end  # of no use to sync this one as well
 
+    def unlock(self) -> None:
+        """Let others open it: nothing more will be written."""
+        if sys.platform != "win32":
+            fcntl.flock(self._file.fileno(), fcntl.LOCK_UN)
+
     def _record_at(self, at: int, size: int) -> Record | None:
         """Record that begins at a byte; None if there is no whole one."""
         if size - at < HEAD_BYTES:

@@ -223,7 +223,7 @@ def make_result(
         replayed=replayed,
         duplicates_dropped=duplicates_dropped,
         resumed=kept.resumed,
-        notes=tuple(notes),
+        notes=(*kept.notes, *notes),
     )
 
 

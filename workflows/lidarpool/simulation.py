@@ -102,6 +102,7 @@ def simulate(
     kept = Deliveries(job) if journal is None else open_journal(Path(journal), job, resume=resume)
     with kept.kept_on_error():
         if kept.complete:
+            kept.save()
             return make_result(kept)
         if client is None:
             check_backend_here(kept.backend or backend, kept.advice)

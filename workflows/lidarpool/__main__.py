@@ -1,0 +1,20 @@
+"""The way into the command, which Ctrl-C stops from the first moment on."""
+
+from __future__ import annotations
+
+from typing import NoReturn
+
+from .interrupts import end_on_signals
+
+
+def main() -> NoReturn:
+    """Run the command, see `cli.main`."""
+    end_on_signals()
+    # A second of imports, in which Python would answer an interrupt with a traceback of its own.
+    from .cli import main as command
+
+    command()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,157 @@
+"""The commands `run` and `demo` without their options: survey, planning, files."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import click
+from distributed import Client
+
+from .checks import check_backend_here, check_backend_name
+from .connection import connected, local_client
+from .deliveries import Deliveries
+from .job import Job
+from .journal import COMMAND_TERMS, open_journal
+from .journal_folder import remove_journal
+from .quiet import QuietWorkers
+from .result import Result
+from .run import Run, make_result
+from .scenario import Scenario
+from .terminal import shown_progress, shown_status
+from .tls import NO_FILES, TlsFiles
+
+JOURNAL = "journal"  # the folder of the journal, in the output folder
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """How a scenario is to be run; see the options of `lidarpool run`.
+
+    `journal` says whether to keep one; without it, `resume` and `fresh` mean nothing.
+    """
+
+    out: Path
+    scheduler: str | None = None
+    files: TlsFiles = NO_FILES
+    tls: bool = False
+    backend: str | None = None
+    no_plan: bool = False
+    journal: bool = True
+    resume: bool = False
+    fresh: bool = False
+    quiet: bool = False
+
+
+def run_scenario(scenario: Scenario, options: RunOptions) -> None:
+    """Run a scenario, write the result and tell of it.
+
+    Raises
+    ------
+    LidarpoolError
+        If something is wrong or fails; notes of the error say what was kept.
+    """
+    # Matplotlib is a third of the time that --help would take.
+    from .output import result_folder, write_result
+
+    _check_backend(options.backend or scenario.pool.backend, options)
+    job = _job(scenario, options)
+    with result_folder(options.out):
+        kept = _deliveries(job, options)
+        with kept.kept_on_error():
+            result = _conduct(scenario, kept, options)
+            with shown_status("writing the cloud, the pictures and the report", options.quiet):
+                report = write_result(options.out, result, job.scene, job.survey, job.planning)
+        kept.remove()
+        _tell(options.out, result, job, report["files"])
+
+
+def _job(scenario: Scenario, options: RunOptions) -> Job:
+    scene = scenario.build_scene()
+    return Job(
+        scene,
+        scenario.survey(scene),
+        None if options.no_plan else scenario.plan(scene),
+        options.backend or scenario.pool.backend,
+        scenario.pool.queue_capacity,
+        scenario.pool.collectors,
+    )
+
+
+def _check_backend(backend: str, options: RunOptions, *advice: str) -> None:
+    """Refuse a backend that is not to be had, as far as that can be seen from here."""
+    if options.scheduler is None:
+        check_backend_here(backend, *advice)
+    else:
+        check_backend_name(backend)
+
+
+def _deliveries(job: Job, options: RunOptions) -> Deliveries:
+    """Where the deliveries go, with those of an earlier run if it is to be resumed."""
+    if not options.journal:
+        return Deliveries(job)
+    path = options.out / JOURNAL
+    if options.fresh:
+        remove_journal(path)
+    journal = open_journal(path, job, resume=options.resume, terms=COMMAND_TERMS)
+    if options.resume and not journal.kept:
+        journal.notes.append(f"there was nothing to resume in {options.out}")
+    return journal
+
+
+def _conduct(scenario: Scenario, kept: Deliveries, options: RunOptions) -> Result:
+    """Have everything delivered that is not there yet."""
+    if kept.complete:
+        return make_result(kept)
+    if kept.backend:
+        _check_backend(kept.backend, options, kept.advice)
+    if options.scheduler is None:
+        cluster = _local_client(scenario, options.quiet, options.tls)
+    else:
+        cluster = connected(options.scheduler, options.files)
+    with cluster as client, shown_progress(options.quiet) as show:
+        return Run(client, kept).drive(None, show)
+
+
+@contextmanager
+def _local_client(scenario: Scenario, quiet: bool, tls: bool) -> Iterator[Client]:
+    """Client of a cluster on this machine whose workers say nothing of their own."""
+    with ExitStack() as stack:
+        with shown_status("starting the workers", quiet):
+            client = stack.enter_context(
+                local_client(
+                    gpu_workers=scenario.pool.gpu,
+                    collectors=scenario.pool.collectors,
+                    other_workers=scenario.pool.other,
+                    tls=tls,
+                )
+            )
+            client.register_plugin(QuietWorkers())
+        yield client
+
+
+def _tell(out: Path, result: Result, job: Job, files: list[str]) -> None:
+    for note in result.notes:
+        click.echo(f"note: {note}")
+    click.echo(
+        f"{job.survey.scan_count:,} scans, {result.rays:,} rays, {result.hits:,} hits on "
+        f"{len(job.scene.names):,} objects, {len(result.points):,} points in the cloud "
+        f"({result.backend}, {result.survey_seconds:.1f} s)"
+    )
+    if result.plan is not None:
+        plan = result.plan
+        found = (
+            f"path of {plan.length:.2f} m, free of collisions"
+            if plan.collision_free
+            else "no path free of collisions was found"
+        )
+        possible = (
+            f"the shortest possible is {plan.shortest_possible:.2f} m"
+            if math.isfinite(plan.shortest_possible)
+            else "none is possible, the obstacles leave no way"
+        )
+        click.echo(f"{found}; {possible} ({plan.trials} trials, {result.planning_seconds:.1f} s)")
+    click.echo(f"results in {click.format_filename(out)}: {', '.join(files)}")
