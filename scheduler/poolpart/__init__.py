@@ -14,6 +14,7 @@ from .pool import Pool
 from .rules import Rule, n_workers, named, per_gpu, per_host, rest
 from .slots import Slots, look_at_slots
 from .tracing import trace, trace_to
+from .whereabouts import TaskPlace, Whereabouts, look_for_tasks
 from .worker_info import WorkerInfo, assign_devices
 
 __all__ = [
@@ -28,7 +29,9 @@ __all__ = [
     "Recorder",
     "Rule",
     "Slots",
+    "TaskPlace",
     "TaskRecord",
+    "Whereabouts",
     "WorkerInfo",
     "ask_workers",
     "assign_devices",
@@ -36,6 +39,7 @@ __all__ = [
     "forget_pipes",
     "local_cluster",
     "look_at_slots",
+    "look_for_tasks",
     "n_workers",
     "named",
     "per_gpu",

@@ -8,6 +8,10 @@ from typing import Any
 
 from distributed import Client
 
+from . import whereabouts
+from .remote import on_scheduler
+from .whereabouts import silent_workers
+
 
 @dataclass(frozen=True)
 class Slots:
@@ -18,16 +22,19 @@ class Slots:
     free
         Slots that no task holds or waits for, by address of the worker; below 0 where more
         tasks were given to a worker than it has slots for. Workers that take no tasks at the
-        moment are left out.
+        moment, or give no sign of life, are left out.
     present
         Addresses of all workers of the partition.
     running
         Those of the keys asked for whose tasks run for long, that is, have seceded.
+    silent
+        Addresses of those workers that give no sign of life, see `Whereabouts`.
     """
 
     free: dict[str, int]
     present: frozenset[str]
     running: frozenset[str]
+    silent: frozenset[str] = frozenset()
 
 
 def look_at_slots(client: Client, resource: str, keys: Collection[str] = ()) -> Slots:
@@ -38,20 +45,25 @@ def look_at_slots(client: Client, resource: str, keys: Collection[str] = ()) -> 
     looks idle to it. A long-running task that lands there waits as long as the other runs.
     Whoever starts several of them should choose their workers.
     """
-    free, present, running = client.run_on_scheduler(_look, resource=resource, keys=list(keys))
-    return Slots(free, frozenset(present), frozenset(running))
+    free, *sets = on_scheduler(
+        client, _look, resource=resource, keys=list(keys), patience_s=whereabouts.SILENT_S
+    )
+    return Slots(free, *map(frozenset, sets))
 
 
-def _look(resource: str, keys: list[str], dask_scheduler: Any = None) -> tuple[Any, ...]:
+def _look(
+    resource: str, keys: list[str], patience_s: float, dask_scheduler: Any = None
+) -> tuple[Any, ...]:
+    silent = silent_workers(dask_scheduler, patience_s)
     members = [ws for ws in dask_scheduler.workers.values() if ws.resources.get(resource)]
     free = {
         ws.address: int(ws.resources[resource] - ws.used_resources.get(resource, 0))
         for ws in members
-        if ws.status.name == "running"
+        if ws.status.name == "running" and ws.address not in silent
     }
     running = []
     for key in keys:
         task = dask_scheduler.tasks.get(key)
         if task is not None and task.processing_on and task in task.processing_on.long_running:
             running.append(key)
-    return free, [ws.address for ws in members], running
+    return free, [ws.address for ws in members], running, list(silent)

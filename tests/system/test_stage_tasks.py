@@ -129,7 +129,7 @@ def test_more_deaths_than_dask_allows_a_task(client, undisturbed):
 
 @pytest.mark.parametrize("pump", [SurveyPump, TrialPump])
 def test_an_interrupt_while_starting_leaves_nothing(client, undisturbed, monkeypatch, pump):
-    method = "_prepare_workers" if pump is SurveyPump else "step"
+    method = "start" if pump is SurveyPump else "step"
     original = getattr(pump, method)
 
     def interrupted(self) -> None:

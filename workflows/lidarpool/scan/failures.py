@@ -1,9 +1,15 @@
-"""Saying which scans an error is about."""
+"""Telling failed tasks apart, and saying which scans an error is about."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
+
+from distributed import Client, Future, KilledWorker
+
+from ..errors import LidarpoolError
+
+ASK_S = 10.0  # for an error's text, which the scheduler has
 
 
 @contextmanager
@@ -20,3 +26,26 @@ def naming_scans(first: int, last: int | None = None) -> Iterator[None]:
     except Exception as error:
         span = f"scan {first}" if last in (None, first) else f"scans {first} to {last}"
         raise RuntimeError(f"{span}: {type(error).__name__}: {error}") from error
+
+
+def was_killed(future: Future) -> bool:
+    """Whether a failed task was given up by Dask because its workers kept dying."""
+    return isinstance(future.exception(timeout=ASK_S), KilledWorker)
+
+
+def raise_if_failed(future: Future, what: str) -> None:
+    """Raise LidarpoolError if a task has failed or was cancelled by somebody else."""
+    if future.status == "error":
+        raise LidarpoolError(f"{what} failed: {future.exception(timeout=ASK_S)}")
+    if future.status == "cancelled":  # "lost" passes: a worker died and the task runs again
+        raise LidarpoolError(f"{what} was cancelled from outside this run.")
+
+
+def words_on_memory(client: Client, workers: Collection[str]) -> str:
+    """Clause for a message about workers that died, if nannies ended them for their memory."""
+    # A nanny logs it as an event, with the address of the worker; no other cause is told.
+    events = client.get_events("worker-restart-memory")
+    ended = {event.get("worker") for _, event in events} & set(workers)
+    if not ended:
+        return ""
+    return " (used more memory than their limit, says the nanny that ended them)"

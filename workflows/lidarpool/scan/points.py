@@ -28,6 +28,7 @@ driver.handon      results were put into the pipe of `stage`
 driver.frame       a frame was handed out
 driver.points      points were entered into the cloud
 driver.duplicate   something came that is here already, from `stage`, and was dropped
+driver.stale       something came from an attempt that was replaced, and was dropped
 driver.release     scans have arrived both ways and nothing holds them any more
 driver.replay      scans that `stage` was given before are about to be put once more
 driver.recast      a batch is about to be submitted to stage 2 once more; `reason` says why
@@ -53,6 +54,7 @@ DRIVER_POINTS = (
     "driver.frame",
     "driver.points",
     "driver.duplicate",
+    "driver.stale",
     "driver.release",
     "driver.replay",
     "driver.recast",

@@ -1,4 +1,4 @@
-"""The driver's side of the survey: it feeds the stages, keeps the ledger, sends again.
+"""The driver's side of the survey: it feeds the stages and keeps the ledgers.
 
 Everything happens in `step`, called over and over from one thread; nothing in it waits for
 long. Scans are under way from when they leave stage 1's pipe until both their frame and
@@ -11,51 +11,35 @@ from __future__ import annotations
 
 import time
 import uuid
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
-from typing import Any
 
-from distributed import Client, Future
+from distributed import Client
 
-from poolpart import (
-    Ledger,
-    Partition,
-    Pipe,
-    PipeFailed,
-    TaskRecord,
-    fetch_available,
-    forget_pipes,
-    trace,
-)
+from poolpart import Ledger, Partition, Pipe, PipeFailed, TaskRecord, fetch_available, forget_pipes
 
 from ..errors import LidarpoolError
 from ..survey import Survey
+from ..task_book import TaskBook
 from .builder import CloudBuilder
-from .casting import frames_of, intersect
-from .messages import Attempt, Delivery, Frame, FrameRun, Hello, Part
+from .caster import Caster
+from .crew import Crew
+from .failures import raise_if_failed, was_killed
+from .handover import Handover
+from .long_stages import long_stages
+from .messages import Delivery, Frame, FrameRun, Hello, Part
 from .setup import SurveySetup
 from .stage_names import COLLECT, GENERATE, GPU, INTERSECT, LIDAR, SORT
-from .stage_tasks import Command, StageTasks, was_killed
-from .stages import collect, generate, sort_frames
+from .stage_tasks import StageTasks
+from .survey_run import SurveyRun
+from .under_way import UnderWay, Wire
 
 BATCH_SECONDS = 0.05  # casting time that makes a batch worth its overhead
 BATCH_RAYS = 1_000_000  # bounds a batch's memory, at 16 bytes a hit and 24 a direction
+BATCHES_LEAST = 16  # for each slot, so that none idles for long in the end
 STALL_SECONDS = 20.0  # with nothing moving; then what was handed on is sent again
-LOOK_FOR_WORKERS_S = 1.0
 LAST_WORDS_S = 3.0  # for the stages to end after everything has arrived
 DELIVERY_CAPACITY = 16  # messages of at most `stages.DELIVERY_BYTES` on their way to the driver
-
-
-@dataclass(eq=False)
-class _UnderWay:
-    """One batch between stage 1 and its arrival."""
-
-    scans: list[int]
-    batch: Future
-    frames: Future
-    handed_on: set[str] = field(default_factory=set)  # stages whose pipe it was put into
-    waiting_for: set[str] = field(default_factory=lambda: {SORT, COLLECT})
 
 
 class SurveyPump:
@@ -78,9 +62,12 @@ class SurveyPump:
     collectors
         Number of tasks of stage 4.
     cloud
-        Where the points go, with those that an earlier run has delivered.
+        Takes the points; one that has some already is not asked for these again.
     frames_done
-        Frames that an earlier run has delivered: those of scans 0 to frames_done - 1.
+        Frames that an earlier run has handed out; this one goes on behind them.
+    scans_per_second
+        How fast stage 1 describes scans, as a sensor that takes its time; as fast as they are
+        taken by default.
     """
 
     def __init__(
@@ -94,105 +81,61 @@ class SurveyPump:
         collectors: int = 2,
         cloud: CloudBuilder | None = None,
         frames_done: int = 0,
+        *,
+        scans_per_second: float | None = None,
     ) -> None:
-        self.client, self.partitions, self.survey = client, partitions, survey
-        self.on_frame = on_frame
+        self.client, self.survey, self.on_frame = client, survey, on_frame
         self.run_id = uuid.uuid4().hex[:8]
         self.cloud = CloudBuilder(survey.scan_count) if cloud is None else cloud
         self.frames = Ledger(survey.scan_count)
         self.generated = Ledger(survey.scan_count)
-        self.frames.restore(range(frames_done))
-        self._resumed = Ledger(survey.scan_count)  # scans that an earlier run has done both ways
-        self._resumed.restore(s for s in range(frames_done) if s in self.cloud.ledger)
-        self.generated.restore(s for s in range(frames_done) if s in self._resumed)
-        self.cast = self._resumed.delivered  # scans that stage 2 has finished
-        self.replayed = 0  # batches that were put into a pipe once more
-        self.records: list[TaskRecord] = []
+        self.book = TaskBook()
+        self._restore(frames_done)
 
-        slots = max(1, partitions[GPU].slots)
-        self._running_most = 2 * slots + 2
-        self._under_way_most = self._running_most + 2 * queue_capacity
-        rays_per_scan = max(1, survey.ray_count // survey.scan_count)
-        self._batch_most = max(
-            1, min(BATCH_RAYS // rays_per_scan, survey.scan_count // (16 * slots))
+        self._queue_capacity = queue_capacity
+        self._run = run = SurveyRun(self.run_id, client, partitions[GPU], partitions[LIDAR])
+        self._under_way = UnderWay(self.frames, self.cloud.ledger)
+        self._crew = Crew(run, setup)
+        self._caster = Caster(run, self._crew, self._under_way)
+        self._handover = Handover(run, self._under_way, self.frames, queue_capacity)
+        self._scans = Pipe(f"lidarpool-{self.run_id}-scans", queue_capacity, client)
+        self._deliveries = Pipe(f"lidarpool-{self.run_id}-deliveries", DELIVERY_CAPACITY, client)
+        self._stages = StageTasks(
+            client,
+            run.lidar,
+            run.key,
+            long_stages(
+                run,
+                survey,
+                collectors=collectors,
+                first=lambda: self.generated.first_missing,
+                pace=scans_per_second,
+                scans=self._scans,
+                inlet=self._handover.inlet,
+                deliveries=self._deliveries,
+            ),
+            on_deaths=lambda names: self._handover.note_deaths([n.split("-")[0] for n in names]),
+            where=self._where,
         )
-        self._under_way: list[_UnderWay] = []
-        self._recorded: set[TaskRecord] = set()
-        self._greeted: set[str] = set()  # consumers that have started, once or more
-        self._collectors = collectors
         self._moved_at = time.monotonic()  # when something was last handed on or delivered
         self._closed_at: float | None = None  # when all had arrived and the pipes were closed
 
-        def pipe(name: str, capacity: int) -> Pipe:
-            return Pipe(f"lidarpool-{self.run_id}-{name}", capacity, client)
-
-        # With room for what is under way, and for all of it once more: puts never wait.
-        room = 2 * (self._under_way_most + queue_capacity)
-        self._scans = pipe("scans", queue_capacity)
-        self._inlets = {stage: pipe(stage, room) for stage in (SORT, COLLECT)}
-        self._deliveries = pipe("deliveries", DELIVERY_CAPACITY)
-        self._pipes = (self._scans, self._deliveries, *self._inlets.values())
-        self._arguments = setup.__reduce__()[1]
-        self._setup: Future | None = None
-        self._prepared: dict[str, Future] = {}  # {address of a GPU worker: task that readies it}
-        self._stages = StageTasks(client, partitions[LIDAR], self._key, self._commands())
+    def _restore(self, frames_done: int) -> None:
+        """Enter what an earlier run has delivered; what came both ways is not made again."""
+        self.frames.restore(range(frames_done))
+        done = min(self.frames.first_missing, self.cloud.ledger.first_missing)
+        self.generated.restore(range(done))
+        self._resumed = sum(scan in self.cloud.ledger for scan in range(frames_done))
 
     def start(self) -> None:
         """Make the pipes and start the stages; after this `stop` and `finish` must be called."""
-        for pipe in self._pipes:
-            pipe.create()
-        gpu = self.partitions[GPU]
-        self._setup = gpu.submit(_make_setup, *self._arguments, key=self._key("scene"))
+        self._scans.create()
+        self._deliveries.create()
+        self._handover.start()
+        self._crew.start()
         self._stages.start()
-        self._prepare_workers()
 
-    def _key(self, name: str, number: int | None = None) -> str:
-        return f"{name}-{self.run_id}" + ("" if number is None else f"-{number}")
-
-    def _commands(self) -> dict[str, Command]:
-        survey, out = self.survey, self._deliveries
-        cloud = (survey.sensor, survey.keep_every, survey.precision_m)
-
-        def attempt(name: str, number: int) -> Attempt:
-            return Attempt(self.run_id, name, number)
-
-        def generator(number: int) -> tuple[Callable[..., Any], tuple[Any, ...]]:
-            first = self.generated.first_missing
-            return generate, (attempt(GENERATE, number), survey, self._scans, first)
-
-        def sorter(number: int) -> tuple[Callable[..., Any], tuple[Any, ...]]:
-            return sort_frames, (attempt(SORT, number), self._inlets[SORT], out)
-
-        def collector(which: int) -> Command:
-            name = f"{COLLECT}-{which}"
-            return lambda number: (
-                collect,
-                (attempt(name, number), *cloud, self._inlets[COLLECT], out),
-            )
-
-        commands: dict[str, Command] = {GENERATE: generator, SORT: sorter}
-        commands |= {f"{COLLECT}-{number}": collector(number) for number in range(self._collectors)}
-        return commands
-
-    def _prepare_workers(self) -> None:
-        """Have each GPU worker that is new fetch the scene and build its ray caster.
-
-        Dask runs a task where its inputs are, unless the wait there is longer than it takes to
-        move them. Scans are so short that it would leave all of them to the one worker that
-        has the scene, and a worker that was restarted would never get one.
-        """
-        self._looked_for_workers = time.monotonic()
-        here = {worker.address for worker in self.partitions[GPU].workers}
-        for address in here - self._prepared.keys():
-            self._prepared[address] = self.partitions[GPU].submit(
-                _prepare,
-                self._setup,
-                key=self._key("prepare", len(self._prepared)),
-                priority=10,
-                worker=address,
-            )
-
-    # -- one turn ----------------------------------------------------------------------
+    # -- how far it is -----------------------------------------------------------------
 
     @property
     def complete(self) -> bool:
@@ -210,6 +153,36 @@ class SurveyPump:
             return False
         return self._stages.done or time.monotonic() - self._closed_at > LAST_WORDS_S
 
+    @property
+    def cast(self) -> int:
+        """Scans that stage 2 has finished, or an earlier run both ways."""
+        return self._resumed + self._handover.cast
+
+    @property
+    def records(self) -> list[TaskRecord]:
+        """Tasks of this run, of many a selection; `book` has the totals."""
+        return self.book.records
+
+    @property
+    def replayed(self) -> int:
+        """Batches that were put into a pipe, or cast, once more."""
+        return self._handover.replayed + self._caster.recast
+
+    @property
+    def duplicates_dropped(self) -> int:
+        """Scans that came more than once: descriptions, frames or points."""
+        ledgers = (self.generated, self.frames, self.cloud.ledger)
+        return sum(ledger.duplicates for ledger in ledgers)
+
+    def _where(self, stage: str) -> str:
+        """Say for a message how far a stage had come."""
+        ledgers = {GENERATE: self.generated, SORT: self.frames}
+        if stage not in ledgers:
+            return ""
+        return f", the last times at scan {ledgers[stage].first_missing}"
+
+    # -- one turn ----------------------------------------------------------------------
+
     def step(self) -> bool:
         """Do what can be done now; returns whether anything was.
 
@@ -218,187 +191,138 @@ class SurveyPump:
         LidarpoolError
             If a task of the survey has failed, naming stage and scans.
         """
-        self._check_tasks()
+        self._check_stages()
         moved = self._take_deliveries()
         if self._closed_at is not None:  # last words only
             return moved
-        if time.monotonic() - self._looked_for_workers > LOOK_FOR_WORKERS_S:
-            self._prepare_workers()
+        moved |= self._caster.step()
         self._stages.look(self.frames.delivered + self.cloud.ledger.delivered)
-        moved |= self._hand_on()
-        moved |= self._take_scans()
+        if self._handover.hand_on():
+            moved = True
+            self._moved_at = time.monotonic()
+        if self._under_way.condemned:
+            self._end_condemned()
+        else:
+            moved |= self._take_scans()
         if self.complete:
-            for inlet in self._inlets.values():
-                inlet.close()
+            self._handover.close()
             self._closed_at = time.monotonic()
         elif self._under_way and time.monotonic() - self._moved_at > STALL_SECONDS:
-            for stage, inlet in self._inlets.items():
-                if not inlet.depth:  # else it is not lost, but waits for a reader
-                    self._send_again(stage)
+            self._handover.resend()
             self._moved_at = time.monotonic()
         return moved
 
-    def _check_tasks(self) -> None:
+    def _check_stages(self) -> None:
         for name, future in self._stages.futures.items():
             if not (future.status == "error" and was_killed(future)):
-                _raise_if_failed(future, f"stage {name}")
-        for future in (self._setup, *self._prepared.values()):
-            if future is not None:
-                _raise_if_failed(future, "preparing the scene on the GPU workers")
-        for item in self._under_way:
-            for future in (item.batch, item.frames):
-                _raise_if_failed(
-                    future, f"stage {INTERSECT}, scans {item.scans[0]} to {item.scans[-1]}"
-                )
+                raise_if_failed(future, f"stage {name}")
 
     def _take_scans(self) -> bool:
         """Submit a stage-2 task for each item of stage 1, as far as the credit goes."""
-        running = sum(not item.handed_on for item in self._under_way)
-        if running >= self._running_most or len(self._under_way) >= self._under_way_most:
+        most = self._caster.running_most + 2 * self._queue_capacity
+        self._handover.capacity = most + self._queue_capacity
+        if self._caster.room <= 0 or len(self._under_way) >= most:
             return False
         items = self._scans.poll()
         for item in items:
-            # A generator that was run again describes scans again.
-            wire, known = [], []
-            for numbers in item:
-                scan = int(numbers[0])
-                if scan in self._resumed:
-                    continue  # it is described all the same: the generator knows only a start
-                if self.generated.accept(scan):
-                    wire.append(numbers)
-                else:
-                    known.append(scan)
-            self._trace("take", GENERATE, [int(numbers[0]) for numbers in wire])
-            self._trace_duplicates(GENERATE, known)
-            if wire:
-                self._submit(wire)
+            wire = self._new_scans(item)
+            for batch in self._under_way.add(wire):
+                self._caster.submit(batch)
         return bool(items)
 
-    def _submit(self, wire: Sequence[Sequence[float]]) -> None:
-        gpu, first = self.partitions[GPU], int(wire[0][0])
-        key = self._key(INTERSECT, first)
-        batch = gpu.submit(intersect, self._setup, wire, self.run_id, key=key)
-        frames = gpu.submit(frames_of, batch, key=self._key("frames", first), priority=1)
-        scans = [int(numbers[0]) for numbers in wire]
-        self._trace("submit", INTERSECT, scans)
-        self._under_way.append(_UnderWay(scans, batch, frames))
+    def _new_scans(self, item: Wire) -> Wire:
+        """Leave out what a generator that was run again has described again."""
+        new: list[Sequence[float]] = []
+        known: list[Sequence[float]] = []
+        for numbers in item:
+            scan = int(numbers[0])
+            (new if self.generated.accept(scan) else known).append(numbers)
+        self._run.trace("take", GENERATE, (int(numbers[0]) for numbers in new))
+        self._trace_duplicates(GENERATE, [int(numbers[0]) for numbers in known])
+        return new
 
-    def _hand_on(self) -> bool:
-        """Put what stage 2 has finished into the pipes of stages 3 and 4."""
-        moved = False
-        for stage, inlet in self._inlets.items():
-            ready = [
-                item
-                for item in self._under_way
-                if stage not in item.handed_on and _result_of(item, stage).status == "finished"
-            ]
-            if ready:
-                self._put(stage, inlet, ready)
-                moved = True
-                if stage == COLLECT:
-                    self.cast += sum(len(item.scans) for item in ready)
-        return moved
+    def _end_condemned(self) -> None:
+        """Wait for the points of what is under way, then say which scan cannot be done.
 
-    def _put(self, stage: str, inlet: Pipe, items: Sequence[_UnderWay]) -> None:
-        keys = [_result_of(item, stage).key for item in items]
-        inlet.put({"base": self.frames.first_missing, "keys": keys}, timeout_s=STALL_SECONDS)
-        for item in items:
-            item.handed_on.add(stage)
-            self._trace("handon", stage, item.scans)
-        self._moved_at = time.monotonic()
-
-    def _trace(self, event: str, stage: str, scans: Sequence[int]) -> None:
-        trace(f"driver.{event}", run=self.run_id, stage=stage, scans=list(scans))
-
-    def _trace_duplicates(self, stage: str, scans: Sequence[int]) -> None:
-        if scans:
-            self._trace("duplicate", stage, scans)
+        Frames are in order, so that none comes behind one that is missing.
+        """
+        self._under_way.give_up(SORT)
+        self._release()
+        if not self._under_way or time.monotonic() - self._moved_at > STALL_SECONDS:
+            raise LidarpoolError("\n".join(self._under_way.condemned))
 
     # -- what arrives ------------------------------------------------------------------
 
     def _take_deliveries(self) -> bool:
         deliveries = self._deliveries.poll()
         for data in deliveries:
-            delivery = Delivery.from_wire(data)
-            content = delivery.content
-            if isinstance(content, Hello):
-                self._greet(delivery.attempt)
-            elif isinstance(content, FrameRun):
-                self._take_frames(content)
-            else:
-                self._take_points(content)
+            self._take(Delivery.from_wire(data))
         if deliveries:
             self._moved_at = time.monotonic()
-            self._release_arrived()
+            self._release()
         return bool(deliveries)
 
+    def _take(self, delivery: Delivery) -> None:
+        content = delivery.content
+        if self._handover.is_stale(delivery.attempt):
+            frames = content.frames if isinstance(content, FrameRun) else ()
+            self._run.trace("stale", delivery.attempt.stage, (frame.scan for frame in frames))
+        elif isinstance(content, Hello):
+            self._handover.greet(delivery.attempt)
+        elif isinstance(content, FrameRun):
+            self._take_frames(content)
+        else:
+            self._take_points(content)
+
     def _take_frames(self, run: FrameRun) -> None:
-        self._record(run.records)
         for frame in run.frames:
             if self.frames.accept(frame.scan):
-                self._trace("frame", SORT, [frame.scan])
+                self._under_way.arrived(SORT, frame.scan)
+                self._run.trace("frame", SORT, [frame.scan])
                 self.on_frame(frame)
             else:
                 self._trace_duplicates(SORT, [frame.scan])
         if run.records:
-            last = run.records[-1]
-            per_scan = max(last.seconds, 1e-6) / last.items
-            wished = min(int(BATCH_SECONDS / per_scan), 2 * last.items, self._batch_most)
-            self._scans.advise(max(1, wished))
+            self._caster.learn(record for record in run.records if self.book.add(record))
+            self._advise(run.records[-1])
 
     def _take_points(self, part: Part) -> None:
         new = self.cloud.add(part)
-        self._trace("points", COLLECT, new)
+        for scan in new:
+            self._under_way.arrived(COLLECT, scan)
+        self._run.trace("points", COLLECT, new)
         if len(new) < len(part.scans):
             self._trace_duplicates(COLLECT, sorted(set(part.scans) - set(new)))
 
-    def _record(self, records: Iterable[TaskRecord]) -> None:
-        """Keep records that are new: a batch that was fetched twice brings its own twice."""
-        for record in records:
-            if record not in self._recorded:
-                self._recorded.add(record)
-                self.records.append(record)
+    def _advise(self, record: TaskRecord) -> None:
+        """Tell stage 1 how many scans to put into one item, from how long a batch took."""
+        rays_per_scan = max(1, self.survey.ray_count // self.survey.scan_count)
+        most = min(
+            BATCH_RAYS // rays_per_scan,
+            self.survey.scan_count // (BATCHES_LEAST * self._crew.slots),
+        )
+        per_scan = max(record.seconds, 1e-6) / record.items
+        wished = min(int(BATCH_SECONDS / per_scan), 2 * record.items, most)
+        self._scans.advise(max(1, wished))
 
-    def _release_arrived(self) -> None:
-        still = []
-        for item in self._under_way:
-            if SORT in item.waiting_for and all(scan in self.frames for scan in item.scans):
-                item.waiting_for.discard(SORT)
-            if COLLECT in item.waiting_for and all(s in self.cloud.ledger for s in item.scans):
-                item.waiting_for.discard(COLLECT)
-            if item.waiting_for:
-                still.append(item)
-            else:
-                self._trace("release", "", item.scans)
-        self._under_way = still
+    def _release(self) -> None:
+        for item in self._under_way.release():
+            self._run.trace("release", INTERSECT, item.scans)
 
-    # -- sending again -----------------------------------------------------------------
-
-    def _greet(self, attempt: Attempt) -> None:
-        """Note that a consumer has started; the second time means that it had died meanwhile."""
-        if attempt.name in self._greeted:
-            self._send_again(attempt.stage)
-        self._greeted.add(attempt.name)
-
-    def _send_again(self, stage: str) -> None:
-        lost = [i for i in self._under_way if stage in i.handed_on and stage in i.waiting_for]
-        lost = [item for item in lost if _result_of(item, stage).status == "finished"]
-        if lost:
-            self.replayed += len(lost)
-            self._trace("replay", stage, [scan for item in lost for scan in item.scans])
-            self._put(stage, self._inlets[stage], lost)
+    def _trace_duplicates(self, stage: str, scans: Sequence[int]) -> None:
+        if scans:
+            self._run.trace("duplicate", stage, scans)
 
     # -- the end -----------------------------------------------------------------------
 
     @property
-    def duplicates_dropped(self) -> int:
-        """Scans that came more than once: descriptions, frames or points."""
-        ledgers = (self.generated, self.frames, self.cloud.ledger)
-        return sum(ledger.duplicates for ledger in ledgers)
+    def _pipes(self) -> list[Pipe]:
+        return [self._scans, self._deliveries, *self._handover.pipes]
 
     def stop(self, reason: str) -> None:
         """End every stage at once; `finish` does the rest."""
-        self.client.cancel([f for item in self._under_way for f in (item.frames, item.batch)])
+        casts = [cast for item in self._under_way for cast in item.casts]
+        self.client.cancel([future for cast in casts for future in (cast.frames, cast.batch)])
         for pipe in self._pipes:
             with suppress(PipeFailed):  # not made yet, or gone already
                 pipe.fail(reason)
@@ -412,32 +336,13 @@ class SurveyPump:
             self._take_last_records()
         finally:
             forget_pipes(self.client, [pipe.name for pipe in self._pipes])
-            kept = [*self._stages.futures.values(), *self._prepared.values(), self._setup]
-            self.client.cancel([future for future in kept if future is not None])
+            self.client.cancel([*self._stages.futures.values(), *self._crew.futures])
             self._under_way.clear()
 
     def _take_last_records(self) -> None:
         """Take the stages' own records; those whose worker cannot be reached are done without."""
         ended = [f for f in self._stages.futures.values() if f.status == "finished"]
         found = fetch_available(self.client, [future.key for future in ended])
-        self._record(found[future.key] for future in ended if future.key in found)
-
-
-def _make_setup(*arguments: Any) -> SurveySetup:
-    return SurveySetup(*arguments)
-
-
-def _prepare(setup: SurveySetup) -> None:
-    setup.prepare()
-
-
-def _result_of(item: _UnderWay, stage: str) -> Future:
-    return item.frames if stage == SORT else item.batch
-
-
-def _raise_if_failed(future: Future, what: str) -> None:
-    if future.status == "error":
-        error = future.exception(timeout=10)
-        raise LidarpoolError(f"{what} failed: {error}")
-    if future.status == "cancelled":  # "lost" passes: a worker died and the task runs again
-        raise LidarpoolError(f"{what} was cancelled from outside this run.")
+        for future in ended:
+            if future.key in found:
+                self.book.add(found[future.key])

@@ -5,24 +5,26 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
-from distributed import Client, Future, KilledWorker
+from distributed import Client, Future
 
 from poolpart import Partition, Slots, look_at_slots
 
 from .. import watch
 from ..errors import LidarpoolError
+from .failures import was_killed, words_on_memory
 
 logger = logging.getLogger(__name__)
 
 LOOK_EVERY_S = 0.5
 SETTLE_S = 2.0  # for a task that was just submitted to start
-DEATHS_MOST = 5  # of one stage with nothing delivered in between
+DEATHS_MOST = 12  # of one stage with nothing delivered in between; `Handover` needs up to eight
 
 # Makes what a stage is to do, from the attempt's number: a function and its arguments.
-Command = Callable[[int], tuple[Callable[..., Any], tuple[Any, ...]]]
+Work = tuple[Callable[..., Any], tuple[Any, ...]]
+Command = Callable[[int], Work]
 
 
 @dataclass(eq=False)
@@ -32,8 +34,8 @@ class _Task:
     future: Future
     worker: str  # address of the one worker that it may run on
     since: float
-    dead_since: float | None = None  # it cannot be started again
-    deaths: int = 0  # in a row
+    dead_since: float | None = None  # it has died, and was not started again yet
+    died: list[str] = field(default_factory=list)  # earlier workers, in a row
     progress: int = -1  # what had been delivered when it last died
 
 
@@ -54,6 +56,10 @@ class StageTasks:
         Makes a key of a name.
     commands
         What each stage is to do, by name; asked again each time the stage is started.
+    on_deaths
+        Called with the names of stages whose workers have died, before any is started again.
+    where
+        Says, for a message, how far a stage had come.
     """
 
     def __init__(
@@ -62,8 +68,11 @@ class StageTasks:
         partition: Partition,
         key: Callable[[str], str],
         commands: Mapping[str, Command],
+        on_deaths: Callable[[list[str]], None],
+        where: Callable[[str], str],
     ) -> None:
         self.client, self.partition = client, partition
+        self._on_deaths, self._where = on_deaths, where
         self._key, self._commands = key, commands
         self._tasks: dict[str, _Task] = {}
         self._submitted = 0
@@ -106,17 +115,37 @@ class StageTasks:
             self.client, self.partition.name, [task.future.key for task in self._tasks.values()]
         )
         free = dict(slots.free)
+        self._mark_dead(slots, now)
         for name, task in list(self._tasks.items()):
             if task.future.status == "finished":
                 continue
-            if self._has_died(task, slots):
-                if max(free.values(), default=0) > 0:
+            has_room = max(free.values(), default=0) > 0
+            if task.dead_since is not None:
+                if has_room:
                     self._restart(name, task, free, progress)
                 else:
                     self._mourn(name, task, now)
-            elif self._waits(task, slots, now) and max(free.values(), default=0) > 0:
+            elif has_room and self._waits(task, slots, now):
                 free[task.worker] += 1
                 self._submit(name, free)
+
+    def _mark_dead(self, slots: Slots, now: float) -> None:
+        """Note the stages whose workers have died; all that died together in one go."""
+        going = {
+            name: task
+            for name, task in self._tasks.items()
+            if task.future.status != "finished" and task.dead_since is None
+        }
+        dead = [name for name, task in going.items() if self._has_died(task, slots)]
+        # A worker that is silent may wake up: its stages are left to it while there is no
+        # other place for them.
+        places = sum(max(0, count) for count in slots.free.values()) - len(dead)
+        silent = [n for n, t in going.items() if n not in dead and t.worker in slots.silent]
+        dead += silent[: max(0, places)]
+        for name in dead:
+            going[name].dead_since = now
+        if dead:
+            self._on_deaths(dead)
 
     def _has_died(self, task: _Task, slots: Slots) -> bool:
         if task.future.status == "error":
@@ -135,8 +164,8 @@ class StageTasks:
 
         One of several collectors is not missed: the others do its work.
         """
-        task.dead_since = task.dead_since or now
-        if now - task.dead_since > watch.PATIENCE_S and not self._is_spare(name):
+        since = now if task.dead_since is None else task.dead_since
+        if now - since > watch.PATIENCE_S and not self._is_spare(name):
             raise LidarpoolError(
                 f"Stage {name} has had no free slot in partition {self.partition.name!r} for "
                 f"{watch.PATIENCE_S:.0f} s since its worker died: start another worker with "
@@ -151,14 +180,15 @@ class StageTasks:
         )
 
     def _restart(self, name: str, task: _Task, free: dict[str, int], progress: int) -> None:
-        deaths = 1 if progress != task.progress else task.deaths + 1
-        if deaths > DEATHS_MOST:
+        died = [*(task.died if progress == task.progress else []), task.worker]
+        if len(died) > DEATHS_MOST:
             raise LidarpoolError(
-                f"stage {name} was started {deaths} times, and each time its worker died before "
-                "anything was delivered: look into the logs of the LIDAR workers."
+                f"stage {name} was started {len(died)} times{self._where(name)}, and each time "
+                f"its worker died before anything was delivered"
+                f"{words_on_memory(self.client, died)}: look into the logs of the LIDAR workers."
             )
         self._submit(name, free)
-        self._tasks[name].deaths, self._tasks[name].progress = deaths, progress
+        self._tasks[name].died, self._tasks[name].progress = died, progress
         logger.info("stage %s was started again; its worker had died", name)
 
     def _submit(self, name: str, free: dict[str, int]) -> None:
@@ -180,8 +210,3 @@ class StageTasks:
         if earlier is not None:
             # Where it still runs after all, it ends with the pipes; what comes twice is dropped.
             earlier.future.cancel()
-
-
-def was_killed(future: Future) -> bool:
-    """Whether a failed task was given up by Dask because its workers kept dying."""
-    return isinstance(future.exception(timeout=10), KilledWorker)

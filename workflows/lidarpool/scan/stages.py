@@ -30,6 +30,7 @@ from ..sensor import Sensor
 from ..survey import ScanSpec, Survey
 from .failures import naming_scans
 from .messages import POINT, Attempt, Batch, Delivery, Frame, FrameRun, Hello, Part
+from .pacer import Pacer
 from .setup import ray_directions
 from .stage_names import COLLECT, GENERATE, LIDAR, SORT
 
@@ -37,15 +38,24 @@ DELIVERY_BYTES = 4 << 20  # of points or frames in one message through the sched
 GIVE_UP_S = 120.0  # asking for a result; the driver sends what does not arrive again
 
 
-def generate(attempt: Attempt, survey: Survey, outlet: Pipe, first: int = 0) -> TaskRecord:
-    """Stage 1: describe every scan from `first` on, as many in one item as is advised."""
+def generate(
+    attempt: Attempt, survey: Survey, outlet: Pipe, first: int = 0, pace: float | None = None
+) -> TaskRecord:
+    """Stage 1: describe every scan from `first` on, as many in one item as is advised.
+
+    With a pace, so many a second, each when its time has come.
+    """
     secede()
     recorder = Recorder(GENERATE, LIDAR)
     sent = first
+    clock = None if pace is None else Pacer(pace, first)
     trace("generate.start", **attempt.fields, first=first, scans=[])
     try:
         while sent < survey.scan_count:
             stop = min(sent + outlet.advice, survey.scan_count)
+            if clock is not None and (stop := min(stop, clock.due)) <= sent:
+                clock.wait(sent)
+                continue
             with naming_scans(sent, stop - 1):
                 item = [survey.scan(index).wire() for index in range(sent, stop)]
             trace("generate.put", **attempt.fields, scans=list(range(sent, stop)))

@@ -1,0 +1,122 @@
+"""The tasks of a run in bounded memory: totals of all, and records of some thousands."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+from poolpart import TaskRecord
+
+RECORDS_MOST = 4096  # of one stage; beyond that every other one is dropped, again and again
+RECENT = 1024  # records that are known when they come again
+MISPLACED_MOST = 20  # kept of each stage; all are counted
+SPANS_MOST = 2048
+
+
+@dataclass(eq=False)
+class StageTotals:
+    """All tasks of one stage together.
+
+    Parameters
+    ----------
+    stage, partition
+        Its name and where it belongs.
+    tasks, items, seconds
+        Tasks, what they count, and their time added up.
+    start, stop
+        First start and last stop, seconds since the epoch.
+    workers
+        Names of the workers that ran some.
+    resources
+        {resource: tasks that ran on workers which have it}; "none" for those without any.
+    violations, misplaced
+        How many ran outside their partition, and the first of these.
+    busy
+        When at least one was running, as far as it is known: (start, stop), in order.
+    """
+
+    stage: str
+    partition: str
+    tasks: int = 0
+    items: int = 0
+    seconds: float = 0.0
+    start: float = float("inf")
+    stop: float = float("-inf")
+    workers: set[str] = field(default_factory=set)
+    resources: Counter[str] = field(default_factory=Counter)
+    violations: int = 0
+    misplaced: list[TaskRecord] = field(default_factory=list)
+    busy: list[tuple[float, float]] = field(default_factory=list)
+    _records: list[TaskRecord] = field(default_factory=list, repr=False)
+    _every: int = 1  # which records are kept
+    _gap: float = 1e-4  # seconds between spans that are taken for one
+
+    def add(self, record: TaskRecord) -> None:
+        """Count a task."""
+        if self.tasks % self._every == 0:
+            self._records.append(record)
+            if len(self._records) > RECORDS_MOST:
+                del self._records[1::2]
+                self._every *= 2
+        self.tasks += 1
+        self.items += record.items
+        self.seconds += record.seconds
+        self.start, self.stop = min(self.start, record.start), max(self.stop, record.stop)
+        self.workers.add(record.worker)
+        self.resources.update(record.resources or ("none",))
+        if record.misplaced:
+            self.violations += 1
+            if len(self.misplaced) < MISPLACED_MOST:
+                self.misplaced.append(record)
+        self.busy.append((record.start, record.stop))
+        while len(self.busy) > SPANS_MOST:
+            self.busy = union(self.busy, self._gap)
+            # Coarser until it halves: not again after each of the next records.
+            if len(self.busy) > SPANS_MOST // 2:
+                self._gap *= 2
+                self.busy = union(self.busy, self._gap)
+
+    @property
+    def records(self) -> Sequence[TaskRecord]:
+        """Records of the tasks, or of every so many where there are thousands."""
+        return self._records
+
+
+class TaskBook:
+    """Keeps the tasks of a run, whatever their number, in bounded memory."""
+
+    def __init__(self) -> None:
+        self.stages: dict[str, StageTotals] = {}
+        self._recent: deque[TaskRecord] = deque()
+        self._known: set[TaskRecord] = set()
+
+    def add(self, record: TaskRecord) -> bool:
+        """Enter a task; False if it was there: a result that is fetched twice brings its own."""
+        if record in self._known:
+            return False
+        self._known.add(record)
+        self._recent.append(record)
+        if len(self._recent) > RECENT:
+            self._known.discard(self._recent.popleft())
+        totals = self.stages.get(record.stage)
+        if totals is None:
+            totals = self.stages[record.stage] = StageTotals(record.stage, record.partition)
+        totals.add(record)
+        return True
+
+    @property
+    def records(self) -> list[TaskRecord]:
+        """Records of the tasks, stage by stage, of every so many where there are thousands."""
+        return [record for totals in self.stages.values() for record in totals.records]
+
+
+def union(spans: Iterable[tuple[float, float]], gap: float = 0.0) -> list[tuple[float, float]]:
+    """Merge spans that overlap, or lie no further apart than `gap`; in order."""
+    merged: list[tuple[float, float]] = []
+    for start, stop in sorted(spans):
+        if merged and start <= merged[-1][1] + gap:
+            merged[-1] = (merged[-1][0], max(stop, merged[-1][1]))
+        else:
+            merged.append((start, stop))
+    return merged
