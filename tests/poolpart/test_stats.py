@@ -1,0 +1,185 @@
+"""Statistics of partitions: each task counted once, whatever happens."""
+
+import threading
+
+import pytest
+from distributed import Client, get_worker, worker_client
+from distributed.diagnostics.plugin import SchedulerPlugin
+
+from poolpart import Partition
+from poolpart.stats import StageStats, partition_stats, unwatch, watch
+from poolpart.stats_plugin import MOST_STAGES, NAME, OTHER_STAGES, RECENT_TASKS, Statistics
+
+LONG_S = 30.0
+CLUSTER = {"A-0": {"resources": {"A": 2}, "nthreads": 2}, "B-0": {"resources": {"B": 1}}}
+
+go = threading.Event()  # the workers are threads of this process
+
+
+def held(_):
+    go.wait(LONG_S)
+
+
+def after(*_):
+    return str(get_worker().name)
+
+
+def broken(_):
+    raise ValueError("broken")
+
+
+def nesting():
+    with worker_client() as client:
+        client.submit(held, "nested", pure=False).result()
+
+
+@pytest.fixture
+def client(start):
+    go.clear()
+    yield start(CLUSTER)
+    go.set()
+
+
+def test_tasks_that_wait_run_and_end(client, wait_until):
+    part = Partition("A", client)
+    empty = part.stats()
+    assert (empty.name, empty.workers, empty.slots, empty.busy) == ("A", 1, 2, 0)
+    assert (empty.done, empty.occupancy, empty.stages, empty.exclusive) == (0, 0.0, {}, False)
+
+    running = [part.submit(held, i) for i in range(5)]
+    last = part.submit(after, running)
+    wait_until(lambda: part.stats().waiting == 1)
+    stats = part.stats()
+    assert (stats.running, stats.queued, stats.busy, stats.occupancy) == (2, 3, 2, 1.0)
+    assert stats.stages["held"] == StageStats(running=2, queued=3)
+
+    go.set()
+    assert last.result(LONG_S) == "A-0"
+    stats = part.stats()
+    assert (stats.waiting, stats.queued, stats.running, stats.done) == (0, 0, 0, 6)
+    assert stats.stages["held"].done == 5
+    assert 0 < stats.stages["held"].seconds <= stats.seconds
+
+
+def test_failures(client, wait_until):
+    part = Partition("A", client)
+    watch(client)
+    tasks = [part.submit(broken, i) for i in range(3)]
+    dependent = part.submit(after, tasks[0])
+    wait_until(lambda: dependent.status == "error" and all(t.done() for t in tasks))
+    stats = part.stats()
+    assert (stats.failed, stats.done) == (3, 0)  # the dependent one never ran
+
+
+def test_partitions_are_counted_apart_and_from_any_client(client):
+    watch(client)
+    a, b = Partition("A", client), Partition("B", client)
+    kept = client.gather([a.submit(after), b.submit(after), client.submit(after, 1)])
+    with Client(client.scheduler.address, set_as_default=False) as other:
+        assert Partition("A", other).stats().done == 1
+        assert partition_stats(other, "B").stages["after"].done == 1
+        assert partition_stats(other, "").done == 1  # asks for no resource
+        assert partition_stats(other, "nobody's").workers == 0
+    assert kept[0] == "A-0"
+
+
+def test_a_task_that_is_computed_again_is_done_once(start, wait_until):
+    client = start({"one": {"resources": {"A": 1}}, "two": {"resources": {"A": 1}}})
+    part = Partition("A", client)
+    watch(client)
+    results = [part.submit(after, i) for i in range(4)]
+    names = client.gather(results)
+    scheduler = client.cluster.scheduler
+    lost = names.count("one")
+    assert lost
+    [address] = [w.address for w in scheduler.workers.values() if w.name == "one"]
+    client.run_on_scheduler(lose, address=address)
+    wait_until(lambda: part.stats().recomputed == lost)
+    stats = part.stats()
+    assert (stats.done, stats.failed, stats.workers, stats.queued) == (4, 0, 1, 0)
+
+
+async def lose(address, dask_scheduler):
+    await dask_scheduler.remove_worker(address, stimulus_id="test", expected=True)
+
+
+def test_a_task_whose_worker_dies_while_it_runs(start, wait_until):
+    client = start({"one": {"resources": {"A": 1}}, "two": {"resources": {"A": 1}}})
+    go.clear()
+    part = Partition("A", client)
+    tasks = [part.submit(held, i) for i in range(2)]
+    wait_until(lambda: part.stats().running == 2)
+    address = next(iter(client.cluster.scheduler.workers))
+    client.run_on_scheduler(lose, address=address)
+    wait_until(lambda: part.stats().queued == 1)
+    assert (part.stats().running, part.stats().done) == (1, 0)
+    go.set()
+    client.gather(tasks)
+    assert (part.stats().done, part.stats().recomputed, part.stats().failed) == (2, 0, 0)
+
+
+def test_what_was_there_before_counting_began(client, wait_until):
+    tasks = [Partition("A", client).submit(held, i) for i in range(4)]
+    wait_until(lambda: len(client.cluster.scheduler.tasks) == 4)
+    assert Partition("A", client).stats().queued == 2
+    go.set()
+    client.gather(tasks)
+    assert Partition("A", client).stats().done == 4
+    del tasks
+    wait_until(lambda: not client.cluster.scheduler.tasks)
+    stats = Partition("A", client).stats()
+    assert (stats.queued, stats.running, stats.done) == (0, 0, 4)
+
+
+def test_nested_tasks_run_beside_the_slots(client, wait_until):
+    tasks = [
+        client.submit(nesting, resources={"A": 1}, key="nesting"),
+        client.submit(held, 1, resources={"A": 0}, key="nested-1"),
+    ]
+    part = Partition("A", client)
+    wait_until(lambda: part.stats().running == 2)
+    assert part.stats().queued == 0
+    go.set()
+    client.gather(tasks)
+
+
+def test_a_restart_starts_counting_anew(client, wait_until):
+    part = Partition("A", client)
+    tasks = [part.submit(held, i) for i in range(4)]
+    wait_until(lambda: part.stats().queued == 2)
+    go.set()
+    client.restart(wait_for_workers=False)
+    del tasks
+    wait_until(lambda: part.stats().workers == 0)
+    assert (part.stats().queued, part.stats().running) == (0, 0)
+
+
+def test_memory_is_bounded(client, monkeypatch, wait_until):
+    watch(client)
+    statistics = client.cluster.scheduler.plugins[NAME]
+    assert isinstance(statistics, SchedulerPlugin)
+    assert statistics.recent.maxlen == RECENT_TASKS
+    letters = "abcdefghijklmnopqrstuvwxyz"
+    stages = [a + b for a in letters for b in letters][: MOST_STAGES + 50]
+    client.gather([client.submit(after, i, key=f"{stage}-{i}") for i, stage in enumerate(stages)])
+    wait_until(lambda: statistics.ran == len(stages))
+    assert len(statistics.tallies) == MOST_STAGES + 1
+    assert partition_stats(client, "").done == len(stages)
+    assert partition_stats(client, "").stages[OTHER_STAGES].done == 50
+    wait_until(lambda: not statistics._done)  # keys that the scheduler has forgotten
+
+
+def test_totals_that_users_tell(client):
+    watch(client)
+    statistics: Statistics = client.cluster.scheduler.plugins[NAME]
+    client.log_event("poolpart-totals", {f"number {i}": i for i in range(30)})
+    client.log_event("poolpart-totals", "nonsense")
+    client.log_event("other", {"number": 1})
+    assert list(statistics.totals.values()) == list(range(10, 30))
+
+
+def test_unwatch(client):
+    watch(client)
+    unwatch(client)
+    unwatch(client)
+    assert NAME not in client.cluster.scheduler.plugins
