@@ -3,9 +3,11 @@
 from .asking import ask_workers
 from .backoff import Backoff
 from .errors import PipeClosed, PipeFailed, PoolError
+from .fence import lower_fence, raise_fence
 from .fetch import fetch_available
 from .ledger import Ledger
 from .local import local_cluster
+from .page import partitions_page, remove_partitions_page, tell_page
 from .partition import Partition
 from .pipe import Pipe
 from .pipe_parts import forget_pipes
@@ -13,6 +15,7 @@ from .placement import Recorder, TaskRecord, placement_violations, recorded
 from .pool import Pool
 from .rules import Rule, n_workers, named, per_gpu, per_host, rest
 from .slots import Slots, look_at_slots
+from .stats import PartitionStats, StageStats
 from .tracing import trace, trace_to
 from .whereabouts import TaskPlace, Whereabouts, look_for_tasks
 from .worker_info import WorkerInfo, assign_devices
@@ -21,6 +24,7 @@ __all__ = [
     "Backoff",
     "Ledger",
     "Partition",
+    "PartitionStats",
     "Pipe",
     "PipeClosed",
     "PipeFailed",
@@ -29,6 +33,7 @@ __all__ = [
     "Recorder",
     "Rule",
     "Slots",
+    "StageStats",
     "TaskPlace",
     "TaskRecord",
     "Whereabouts",
@@ -40,13 +45,18 @@ __all__ = [
     "local_cluster",
     "look_at_slots",
     "look_for_tasks",
+    "lower_fence",
     "n_workers",
     "named",
+    "partitions_page",
     "per_gpu",
     "per_host",
     "placement_violations",
+    "raise_fence",
     "recorded",
+    "remove_partitions_page",
     "rest",
+    "tell_page",
     "trace",
     "trace_to",
 ]
