@@ -18,7 +18,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 from distributed import Client, Scheduler, Security, SpecCluster
 
-import lidarpool
+import lidarpool.run
 from lidarpool import LidarpoolError, Scene, Survey
 from lidarpool.connection import connected
 from lidarpool.tls import NO_FILES, TlsFiles, security_for
@@ -322,13 +322,13 @@ def test_without_cryptography_one_is_told_what_to_install(monkeypatch):
 
 def test_simulate_with_tls(monkeypatch):
     seen: list[str] = []
-    before = lidarpool.simulate.__globals__["survey_pool"]
+    before = lidarpool.run.survey_pool
 
     def look(client: Client, *rest: Any) -> Any:
         seen.append(client.scheduler.address)
         return before(client, *rest)
 
-    monkeypatch.setitem(lidarpool.simulate.__globals__, "survey_pool", look)
+    monkeypatch.setattr(lidarpool.run, "survey_pool", look)
     survey = Survey(poses=[(0, 0, 1)], sensor=lidarpool.Sensor(layers=2, step_deg=30))
     result = lidarpool.simulate(Scene.seed(), survey, gpu_workers=1, other_workers=1, tls=True)
     assert result.rays > 0
