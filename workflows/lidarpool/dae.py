@@ -22,6 +22,8 @@ from .transform import Transform
 # What may be missing without changing the shape: textures, materials, lights, cameras.
 _HARMLESS = ("image", "surface", "material", "effect", "shading", "profile", "light", "camera")
 
+MOST_NODES = 100_000  # of a scene, each counted in each place where it stands
+
 
 def read_dae(path: Path) -> tuple[list[Mesh], float | None, str | None]:
     """Read the default scene of a COLLADA file.
@@ -41,7 +43,9 @@ def read_dae(path: Path) -> tuple[list[Mesh], float | None, str | None]:
         What pycollada raises on a broken file; ValueError for missing or unknown geometry.
     """
     document = collada.Collada(
-        str(path), ignore=[collada.common.DaeUnsupportedError, collada.common.DaeBrokenRefError]
+        str(path),
+        ignore=[collada.common.DaeUnsupportedError, collada.common.DaeBrokenRefError],
+        aux_file_loader=lambda name: None,  # no picture is read, wherever it is
     )
     for error in document.errors:
         text = str(error)
@@ -49,23 +53,40 @@ def read_dae(path: Path) -> tuple[list[Mesh], float | None, str | None]:
             raise ValueError(text)
     meshes: list[Mesh] = []
     if document.scene is not None:
-        for node in document.scene.nodes:
-            meshes += _walk(node, np.eye(4), "")
+        meshes += _meshes(document.scene)
     axis = document.assetInfo.upaxis
     return meshes, document.assetInfo.unitmeter, axis[0].lower() if axis else None
 
 
-def _walk(node: Any, above: NDArray[np.float64], name: str) -> Iterator[Mesh]:
-    """Meshes of a node and of those under it; `above` is the (4, 4) matrix of its parent."""
-    if isinstance(node, collada.scene.GeometryNode):
-        yield from _geometry(node.geometry, Transform.from_matrix(above), name)
-    elif isinstance(node, collada.scene.Node):
-        # <instance_node> gives a node of another place, with transforms of its own.
-        matrix = above
-        for step in node.transforms:
-            matrix = matrix @ _matrix(step)
-        for child in node.children:
-            yield from _walk(child, matrix, node.name or name)
+def _meshes(scene: Any) -> Iterator[Mesh]:
+    """Meshes of a scene, one for each place where there is a geometry."""
+    # A node of a library may stand in several others: a few lines can make any number of nodes.
+    visits = (visit for node in scene.nodes for visit in _walk(node, np.eye(4), ""))
+    for count, (node, matrix, name) in enumerate(visits):
+        if count >= MOST_NODES:
+            raise ValueError(f"its nodes contain each other more than {MOST_NODES:,} times")
+        if isinstance(node, collada.scene.GeometryNode):
+            yield from _geometry(node.geometry, Transform.from_matrix(matrix), name)
+
+
+def _walk(
+    node: Any, above: NDArray[np.float64], name: str
+) -> Iterator[tuple[Any, NDArray[np.float64], str]]:
+    """Yield a node and those under it, each with the matrix (4, 4) of its place and its name.
+
+    `above` is the matrix of the parent, `name` that of the nearest node that has one.
+    """
+    if isinstance(node, collada.scene.NodeNode):  # <instance_node>: one of another place
+        node = node.node
+    if not isinstance(node, collada.scene.Node):
+        yield node, above, name
+        return
+    matrix = above
+    for step in node.transforms:
+        matrix = matrix @ _matrix(step)
+    yield node, matrix, node.name or name
+    for child in node.children:
+        yield from _walk(child, matrix, node.name or name)
 
 
 def _geometry(geometry: Any, transform: Transform, name: str) -> Iterator[Mesh]:

@@ -13,6 +13,7 @@ from .dae import read_dae
 from .errors import LidarpoolError
 from .mesh import Mesh
 from .meshguard import find_fault
+from .threemf import placed_objects
 from .transform import UNITS_M, UP_AXES, Transform
 
 SUFFIXES = (".glb", ".gltf", ".obj", ".stl", ".ply", ".off", ".dae", ".3mf")
@@ -69,11 +70,9 @@ def load_meshes(
     if up_axis is not None and up_axis not in UP_AXES:
         raise LidarpoolError(f"up_axis is {up_axis!r}; it must be x, y or z.")
     data = _bytes_of(path)
-    fault = find_fault(path.suffix.lower(), data)
-    if fault:
-        raise LidarpoolError(f"{path} {fault}.")
     try:
-        meshes, own_unit_m, own_axis = _read(path, data)
+        fault = find_fault(path, data)
+        meshes, own_unit_m, own_axis = ([], None, None) if fault else _read(path, data)
     except MemoryError:
         raise
     except LidarpoolError as error:
@@ -85,6 +84,8 @@ def load_meshes(
         raise LidarpoolError(
             f"{path} is broken or cut short ({reason}): export it again."
         ) from error
+    if fault:
+        raise LidarpoolError(f"{path} {fault}.")
     if not meshes:
         raise LidarpoolError(
             f"{path} holds no triangles: it is empty, cut short, or not a {path.suffix} file."
@@ -121,8 +122,8 @@ def _read(path: Path, data: bytes) -> tuple[list[Mesh], float | None, str | None
     if suffix == ".dae":
         return read_dae(path)
     options: dict[str, Any] = {}
-    if suffix in (".glb", ".gltf", ".obj"):
-        options["skip_materials"] = True
+    if suffix in (".glb", ".gltf", ".obj", ".ply"):
+        options["skip_materials"] = True  # nor are their pictures looked for
     if suffix == ".obj":
         # Objects are split by name ('o', or 'g' where there is no 'o'), never by material.
         named = re.search(rb"^o\s", data, re.MULTILINE) is not None
@@ -132,12 +133,22 @@ def _read(path: Path, data: bytes) -> tuple[list[Mesh], float | None, str | None
     if suffix in (".glb", ".gltf"):
         return meshes, 1.0, "y"
     if suffix == ".3mf":
+        _check_complete(scene, placed_objects(data))
         stated = {mesh.metadata.get("units") for mesh in scene.geometry.values()}
         unknown = stated - set(_3MF_UNITS_M)
         if unknown:
             raise ValueError(f"unknown unit {', '.join(map(repr, unknown))}")
         return meshes, _3MF_UNITS_M[stated.pop()] if stated else None, "z"
     return meshes, None, None
+
+
+def _check_complete(scene: trimesh.Scene, placed: int | None) -> None:
+    found = len(scene.graph.nodes_geometry)
+    if placed is not None and placed != found:
+        raise LidarpoolError(
+            f"{found:,} of the {placed:,} objects that it places can be read: export it without "
+            "nested components and repeated part numbers, or as .glb."
+        )
 
 
 def _objects(scene: trimesh.Scene, path: Path) -> list[Mesh]:

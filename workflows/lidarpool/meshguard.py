@@ -1,7 +1,8 @@
 """What trimesh reads without complaint although it would read it wrong.
 
 Each function here looks at the bytes of one format and returns what is wrong with them, so
-that a cut or exotic file is refused instead of scanned with parts missing.
+that a cut or exotic file is refused instead of scanned with parts missing. What would be
+dangerous to read at all is looked for by `meshdanger`.
 """
 
 from __future__ import annotations
@@ -9,26 +10,35 @@ from __future__ import annotations
 import json
 import re
 import struct
+from pathlib import Path
 from typing import Any
+
+from .meshdanger import dae_danger, gltf_danger, threemf_danger
 
 # glTF extensions that change looks, not shapes.
 _LOOKS = re.compile(r"KHR_materials_|\w+_texture_|KHR_texture|KHR_lights|KHR_mesh_quantization")
 
 
-def find_fault(suffix: str, data: bytes) -> str | None:
+def find_fault(path: Path, data: bytes) -> str | None:
     """Say what is wrong with the bytes of a mesh file.
 
     Parameters
     ----------
-    suffix
-        Lower case, with its dot: '.ply'.
+    path
+        The file; its ending says the format.
     data
-        The whole file.
+        All that is in it.
 
     Returns
     -------
     A clause for a sentence, or None where nothing is known against the file.
+
+    Raises
+    ------
+    Exception
+        What one stumbles over in a file that is broken.
     """
+    suffix = path.suffix.lower()
     if suffix == ".obj":
         return _obj_fault(data)
     if suffix == ".off":
@@ -38,7 +48,11 @@ def find_fault(suffix: str, data: bytes) -> str | None:
     if suffix == ".stl":
         return _stl_fault(data)
     if suffix in (".gltf", ".glb"):
-        return _gltf_fault(suffix, data)
+        return _gltf_fault(path, data)
+    if suffix == ".dae":
+        return dae_danger(data)
+    if suffix == ".3mf":
+        return threemf_danger(data)
     return None
 
 
@@ -92,14 +106,15 @@ def _stl_fault(data: bytes) -> str | None:
     if data[:5].lower() != b"solid" or b"\0" in data[:1000]:
         return None
     text = data.lower()
-    if text.count(b"endsolid") < len(re.findall(rb"^\s*solid\b", text, re.MULTILINE)):
+    if text.count(b"endsolid") < len(re.findall(rb"^[ \t]*solid\b", text, re.MULTILINE)):
         return "is cut short: it does not end with 'endsolid'"
     return None
 
 
-def _gltf_fault(suffix: str, data: bytes) -> str | None:
+def _gltf_fault(path: Path, data: bytes) -> str | None:
     """Find compressed, sparse or normalised positions: read as zeros or on another scale."""
-    if suffix == ".glb":
+    whole = len(data)
+    if path.suffix.lower() == ".glb":
         if data[:4] != b"glTF" or len(data) < 20:
             return "is not a binary glTF file"
         total, size = struct.unpack_from("<II", data, 8)
@@ -117,7 +132,7 @@ def _gltf_fault(suffix: str, data: bytes) -> str | None:
         return f"needs {', '.join(map(str, foreign))}, which cannot be read: export without it"
     if not header.get("scenes"):
         return "has no scene: export it with one"
-    return _accessor_fault(header)
+    return gltf_danger(header, path, whole) or _accessor_fault(header)
 
 
 def _accessor_fault(header: dict[str, Any]) -> str | None:
