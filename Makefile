@@ -41,11 +41,12 @@ format:  ## rewrite the sources in the project's format
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-bench:  ## benchmarks: pipeline throughput, ray casting
+bench:  ## benchmarks: pipeline, planning, ray casting (more: python -m benchmarks.raycast --large)
 	@VENV=$(VENV) sh .ci/setup dev
 	$(BIN)/python -m benchmarks.pipeline
 	$(BIN)/python -m benchmarks.planning
 	$(BIN)/python -m benchmarks.raycast
+	$(BIN)/python -m benchmarks.trees
 
 clean:  ## remove the virtual environment and caches
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

@@ -157,6 +157,9 @@ def main(arguments: list[str] | None = None) -> int:
     """Run from the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--quick", action="store_true", help="toy scenes, few rays, two rounds")
+    parser.add_argument(
+        "--large", action="store_true", help="a city of 10 million triangles too: 13 GB, minutes"
+    )
     parser.add_argument("--scene", action="append", help="only this one; may be given again")
     parser.add_argument("--mesh", action="append", type=Path, default=[], help="a mesh file more")
     parser.add_argument("--rays", type=int, default=1 << 17, help="rays of a scan")
@@ -167,7 +170,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--json", type=Path, help="write the results here")
     chosen = parser.parse_args(arguments)
     quick = chosen.quick
-    makers = jobs(2_000 if quick else chosen.rays, chosen.mesh, quick)
+    makers = jobs(2_000 if quick else chosen.rays, chosen.mesh, quick, chosen.large)
     unknown = set(chosen.scene or ()) - set(makers)
     if unknown:
         parser.error(f"there is no scene {', '.join(unknown)}: {', '.join(makers)}")

@@ -115,9 +115,25 @@ def mesh_job(path: Path, rays: int) -> Job:
     return _job(path.stem, scene, [*middle[:2], low[2] + 1.5], _lidar(rays))
 
 
-def jobs(rays: int, meshes: list[Path], quick: bool) -> dict[str, Callable[[], Job]]:
-    """Makers of all jobs by the name that --scene takes; `quick` for toy sizes."""
-    cities = [2_000] if quick else [100_000, 1_000_000, 10_000_000]
+def jobs(
+    rays: int, meshes: list[Path], quick: bool, large: bool = False
+) -> dict[str, Callable[[], Job]]:
+    """Makers of jobs by the name that --scene takes.
+
+    Parameters
+    ----------
+    rays
+        Rays of a scan.
+    meshes
+        Mesh files more.
+    quick
+        Toy sizes.
+    large
+        The city of ten million triangles as well: with all engines it takes 13 GB and minutes.
+    """
+    cities = [2_000] if quick else [100_000, 1_000_000]
+    if large:
+        cities.append(10_000_000)
     hills = 2_000 if quick else 2_000_000
     out: dict[str, Callable[[], Job]] = {"survey": lambda: survey_job(rays)}
     for triangles in cities:

@@ -1,5 +1,6 @@
 // Builds the tables of intersect.cu on the device: a binary tree by parallel locally-ordered
-// clustering (Meister and Bittner, 2018), made four-wide from the root down.
+// clustering (Meister and Bittner, 2018) below and a sweep on the host above the last clusters,
+// made four-wide from the root down.
 //
 // Step by step the arithmetic and the choices among equals are those of ploc.py, tree.py and
 // layout.py, so the tables have the same bits as those built on the CPU (compiled with
@@ -200,6 +201,19 @@ KERNEL merge(
         children[node - triangles] = pair;
     }
     left_over[(int)(before & (FIRST - 1))] = node;
+}
+
+// Make nodes `from` to `from + count - 1` from their children, which are there already.
+KERNEL join_children(
+    const int2* __restrict__ children, int from, int count, int triangles,
+    float4* __restrict__ boxes)
+{
+    const int i = (int)thread_number();
+    if (i >= count) return;
+    const int2 pair = children[from - triangles + i];
+    const Box box = make_node(load_box(boxes, pair.x), load_box(boxes, pair.y));
+    boxes[2 * (Count)(from + i)] = box.low;
+    boxes[2 * (Count)(from + i) + 1] = box.high;
 }
 
 // Where the triangles under nodes `from` to `from + count - 1` begin when all are listed from

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from . import ploc
 from .cuda_module import Kernels, options
 from .layout import FLOOR, LEAF_SIZE, UNIT
 from .mesh import LocalMesh
@@ -99,7 +100,7 @@ def _order(cp: Any, kernels: Kernels, corners: Any) -> Any:
 
 
 def _cluster(cp: Any, kernels: Kernels, corners: Any, order: Any) -> _Binary:
-    """Merge pairs of nearest neighbours until one cluster is left."""
+    """Merge pairs of nearest neighbours until few clusters are left, and set a crown on them."""
     n = len(corners)
     boxes, children = cp.empty((2 * n - 1, 8), np.float32), cp.empty((n, 2), np.int32)
     ids, spare, partners = (cp.empty(n, np.int32) for _ in range(3))
@@ -107,7 +108,7 @@ def _cluster(cp: Any, kernels: Kernels, corners: Any, order: Any) -> _Binary:
     kernels.run("start_clusters", n, corners, order, np.int64(n), boxes, ids)
     rounds: list[tuple[int, int]] = []
     made, left = n, n
-    while left > 1:
+    while left > ploc.last(n):
         count = np.int32(left)
         kernels.run("find_partners", left, boxes, ids, count, partners)
         sums, pairs = _sums(cp, kernels, partners, votes, left)
@@ -121,7 +122,26 @@ def _cluster(cp: Any, kernels: Kernels, corners: Any, order: Any) -> _Binary:
         rounds.append((made, made + pairs))
         made += pairs
         left -= pairs
-    return _Binary(order, boxes, children, tuple(rounds))
+    upper = _crown(cp, kernels, boxes, children, ids[:left], made)
+    return _Binary(order, boxes, children, (*rounds, *upper))
+
+
+def _crown(
+    cp: Any, kernels: Kernels, boxes: Any, children: Any, ids: Any, made: int
+) -> list[tuple[int, int]]:
+    """Nodes above the last clusters, chosen on the host; returns their rounds."""
+    # low x, y, z, cost, high x, y, z, and the number of triangles above the leaf's bit
+    rows = cp.asnumpy(boxes[ids])
+    low, high = (np.ascontiguousarray(rows[:, k : k + 3].T) for k in (0, 4))
+    count = np.ascontiguousarray(rows[:, 7]).view(np.int32) >> 1
+    pairs, rounds = ploc.crown(low, high, count, cp.asnumpy(ids), made)
+    n = np.int32(len(children))
+    if len(pairs):
+        children[made - n : made - n + len(pairs)].set(pairs)
+    for start, stop in rounds:
+        nodes = (np.int32(start), np.int32(stop - start), n)
+        kernels.run("join_children", stop - start, children, *nodes, boxes)
+    return rounds
 
 
 def _sums(cp: Any, kernels: Kernels, partners: Any, votes: Any, count: int) -> tuple[Any, int]:

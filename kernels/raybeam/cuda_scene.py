@@ -15,7 +15,7 @@ from .mesh import LocalMesh
 # Bytes left free for a chunk of rays and for the walk's stacks, of which each resident thread has
 # one: 2048 for each of 132 multiprocessors, 64 places of 8 bytes, are 138 MB.
 WORK = 3 << 28
-_LAYOUT_BYTES = 290  # on the host a triangle, at the peak of a build by NumPy, the mesh apart
+_LAYOUT_BYTES = 330  # on the host a triangle, at the peak of a build by NumPy, the mesh apart
 _TABLE_BYTES = 124  # on the device a triangle in the finished tables, the nodes apart
 
 

@@ -33,6 +33,11 @@ typedef unsigned long long Sum;
 #define BOUNDS __launch_bounds__(128)
 #endif
 
+// What is counted when this runs on the CPU; on a device, nothing.
+#ifndef SEEN
+#define SEEN(what)
+#endif
+
 #define LEAF_BITS 3
 #define DONE ((int)0x80000000)
 #define TINY 8.673617379884035e-19  // 2^-60: stands for a direction component of zero
@@ -115,6 +120,7 @@ __device__ __forceinline__ int next_axis(int axis) { return axis == 2 ? 0 : axis
 
 __device__ __forceinline__ bool decide(const Scene& scene, const Ray& ray, int place, Exact& out)
 {
+    SEEN(DECISION);
     const double ax = fabs(ray.dx), ay = fabs(ray.dy), az = fabs(ray.dz);
     const int kz = ax >= ay ? (ax >= az ? 0 : 2) : (ay >= az ? 1 : 2);
     const int kx = next_axis(kz), ky = next_axis(kx);
@@ -270,6 +276,7 @@ __device__ __forceinline__ int pop(const Waiting* stack, int& top, float to)
 __device__ __forceinline__ int descend(
     const float4* nodes, int node, const Walk& w, Waiting* stack, int& top)
 {
+    SEEN(NODE);
     const float4* line = nodes + 8 * (Count)node;
     const float4 nx = line[w.nx], ny = line[w.ny], nz = line[w.nz];
     const float4 fx = line[3 - w.nx], fy = line[5 - w.ny], fz = line[7 - w.nz];
@@ -308,6 +315,7 @@ struct Guess {
 // it outside [from, to].
 __device__ __forceinline__ bool may_hit(const float4* record, const Walk& w, Guess& guess)
 {
+    SEEN(TRIANGLE);
     const float4 v = record[0], e = record[1], g = record[2];
     const float px = fmaf(w.dy, g.z, -(w.dz * g.y));
     const float py = fmaf(w.dz, g.x, -(w.dx * g.z));

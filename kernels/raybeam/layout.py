@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .mesh import LocalMesh
-from .tree import PAD, WideTree, build_tree
+from .tree import PAD, WideTree, build_tree, single
 
 _WIDTH = 4  # seven float4 a node: one 128-byte line
 LEAF_SIZE = 4
@@ -92,7 +92,7 @@ def _records(corners: NDArray[np.float64]) -> NDArray[np.float32]:
     edge, other = corners[:, 1] - first, corners[:, 2] - first
     e, g = _lengths(edge), _lengths(other)
     out = np.empty((len(corners), 3, 4), np.float32)
-    out[:, 0, :3], out[:, 1, :3], out[:, 2, :3] = first, edge, other
+    out[:, 0, :3], out[:, 1, :3], out[:, 2, :3] = single(first), single(edge), single(other)
     out[:, 0, 3] = UNIT * g * (48 + 24 * e) + FLOOR
     out[:, 1, 3] = UNIT * e * (56 + 24 * g) + FLOOR
     out[:, 2, 3] = UNIT * e * g * 144 + FLOOR

@@ -1,10 +1,12 @@
-"""A binary bounding volume hierarchy by agglomeration.
+"""A binary bounding volume hierarchy: agglomerated below, divided at the top.
 
 Parallel locally-ordered clustering, Meister and Bittner (2018): boxes are sorted along a space
 filling curve; then each looks at its neighbours in that order, and pairs that are each other's
-best partner (least area of the common box) are merged, until one is left. The trees are about
-as good as a full sweep with the surface area heuristic makes them, and every step is a few
-operations on whole arrays.
+best partner (least area of the common box) are merged. Every step is a few operations on whole
+arrays. Near the root there are few clusters left and the curve's neighbours are seldom the best:
+to go on until one is left cost rays a fifth to a half more nodes in cities. So the last ones are
+divided from the root down, by a full sweep with the surface area heuristic (sweep.py), which
+for so few takes a tenth of a second.
 """
 
 from __future__ import annotations
@@ -14,7 +16,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .sweep import divide
+
 _RADIUS = 8  # neighbours looked at on either side; twice as many gain 1 to 2 % of the tree's cost
+# Clusters that are left to the sweep: as many as that, but no more than an eighth of all boxes
+# where those are enough. Four times as many gain nothing, a quarter loses a twentieth.
+_MOST, _ENOUGH = 1 << 14, 1 << 10
 _GRID_BITS = 21  # a coordinate; three of them fill 63 bits
 
 
@@ -60,13 +67,15 @@ def build(low: NDArray[np.float32], high: NDArray[np.float32]) -> BinaryTree:
     left, right = np.full((2, 2 * n - 1), -1, np.int32)
     low, high, ids = low[:, order], high[:, order], order
     rounds: list[tuple[int, int]] = []
+    count = np.ones(2 * n - 1, np.int32)
     made = n
-    while len(ids) > 1:
+    while len(ids) > last(n):
         first, second = _partners(low, high)
         new = np.arange(made, made + len(first), dtype=np.int32)
         rounds.append((made, made + len(first)))
         made += len(first)
         left[new], right[new] = ids[first], ids[second]
+        count[new] = count[left[new]] + count[right[new]]
         low[:, first] = np.minimum(low[:, first], low[:, second])
         high[:, first] = np.maximum(high[:, first], high[:, second])
         all_low[:, new], all_high[:, new] = low[:, first], high[:, first]
@@ -74,7 +83,55 @@ def build(low: NDArray[np.float32], high: NDArray[np.float32]) -> BinaryTree:
         stay = np.ones(len(ids), np.bool_)
         stay[second] = False
         low, high, ids = low[:, stay], high[:, stay], ids[stay]
-    return BinaryTree(all_low, all_high, left, right, tuple(rounds))
+    children, upper = crown(low, high, count[ids], ids, made)
+    left[made:], right[made:] = children.T
+    for start, stop in upper:
+        both = left[start:stop], right[start:stop]
+        all_low[:, start:stop] = np.minimum(*(all_low[:, child] for child in both))
+        all_high[:, start:stop] = np.maximum(*(all_high[:, child] for child in both))
+    return BinaryTree(all_low, all_high, left, right, (*rounds, *upper))
+
+
+def last(boxes: int) -> int:
+    """How many clusters of so many boxes are left to `crown`."""
+    return min(_MOST, max(_ENOUGH, boxes // 8))
+
+
+def crown(
+    low: NDArray[np.float32],
+    high: NDArray[np.float32],
+    count: NDArray[np.int32],
+    ids: NDArray[np.int32],
+    made: int,
+) -> tuple[NDArray[np.int32], list[tuple[int, int]]]:
+    """Nodes above the last clusters, the root last.
+
+    Parameters
+    ----------
+    low, high
+        float32 (3, m): boxes of the clusters.
+    count, ids
+        int32 (m,): boxes in each cluster, and which node it is.
+    made
+        Nodes that there are already: the next one's number.
+
+    Returns
+    -------
+    children
+        int32 (m - 1, 2): of nodes `made` and on.
+    rounds
+        As in `BinaryTree`.
+    """
+    levels = divide(low, high, count.astype(np.float64))
+    children = [np.zeros((0, 2), np.int32)]
+    rounds: list[tuple[int, int]] = []
+    below = made  # where the level below begins
+    for nodes in reversed(levels):
+        number = np.where(nodes >= 0, ids[nodes], below - 1 - nodes)
+        children.append(number.astype(np.int32))
+        rounds.append((made, made + len(nodes)))
+        below, made = made, made + len(nodes)
+    return np.concatenate(children), rounds
 
 
 def _partners(

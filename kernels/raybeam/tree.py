@@ -61,8 +61,8 @@ def build_tree(corners: NDArray[np.float64], width: int, leaf_size: int) -> Wide
     if not len(corners):
         empty = np.full((1, 3, width), np.inf, np.float32)
         return WideTree(empty, -empty, np.zeros((1, width), np.int32), np.zeros(0, np.int32))
-    low = np.ascontiguousarray((corners.min(axis=1) - PAD).T.astype(np.float32))
-    high = np.ascontiguousarray((corners.max(axis=1) + PAD).T.astype(np.float32))
+    low = np.ascontiguousarray(single((corners.min(axis=1) - PAD).T))
+    high = np.ascontiguousarray(single((corners.max(axis=1) + PAD).T))
     binary = ploc.build(low, high)
     count, leaf = _leaves(binary, leaf_size)
     first = _positions(binary, count)
@@ -71,6 +71,13 @@ def build_tree(corners: NDArray[np.float64], width: int, leaf_size: int) -> Wide
     order[first[:n]] = np.arange(n, dtype=np.int32)
     code = np.where(leaf, ~(first << LEAF_BITS | (count - 1)), 0).astype(np.int32)
     return _widen(binary, leaf, code, order, width)
+
+
+def single(values: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Round to float32; what is not normal there becomes zero, as on a device (-ftz=true)."""
+    out = values.astype(np.float32)
+    out *= np.abs(out) >= np.finfo(np.float32).tiny  # keeps the sign
+    return out
 
 
 def _leaves(tree: ploc.BinaryTree, leaf_size: int) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:

@@ -92,6 +92,12 @@ def test_ratios_are_within_rounds():
     assert raycast.best_peer(row(a=[1])) is None
 
 
+def test_ten_million_triangles_only_when_asked_for():
+    usual, large = (list(jobs(2_000, [], quick=False, large=large)) for large in (False, True))
+    assert usual == ["survey", "city-1e5", "city-1e6", "terrain-2e6"]
+    assert set(large) - set(usual) == {"city-1e7"}
+
+
 def test_unknown_scene(capsys):
     with pytest.raises(SystemExit):
         raycast.main(["--quick", "--scene", "moon"])

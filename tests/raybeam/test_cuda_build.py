@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from raybeam import RayCaster, cuda_build, cuda_scene
+from raybeam import RayCaster, cuda_build, cuda_scene, ploc
 from raybeam.layout import lay_out
 from raybeam.mesh import local_mesh
 
@@ -60,6 +60,15 @@ def test_shapes(built, shapes, name):
 @pytest.mark.parametrize("kind", ["random", "sliver", "huge", "tiny"])
 def test_soups(built, shapes, kind):
     assert_same_as_numpy(built, local_mesh(*shapes["soup"](kind, count=5000)))
+
+
+@pytest.mark.parametrize("left", [1, 7, 500])
+def test_with_any_number_of_clusters_left_to_the_host(built, shapes, monkeypatch, left):
+    """As in meshes that are much larger, of which few clusters are left."""
+    monkeypatch.setattr(ploc, "_MOST", left)
+    monkeypatch.setattr(ploc, "_ENOUGH", left)
+    assert_same_as_numpy(built, local_mesh(*shapes["soup"]("random", count=3000)))
+    assert_same_as_numpy(built, local_mesh(*shapes["vase"]()))
 
 
 def test_far_away_and_many(built, shapes):

@@ -124,7 +124,7 @@ def test_more_triangles_than_numbers(backend):
         RayCaster(np.eye(3), faces, backend)
 
 
-@pytest.mark.parametrize(("name", "mebibytes"), [("numpy", 3), ("embree", 4), ("source", 3)])
+@pytest.mark.parametrize(("name", "mebibytes"), [("numpy", 3), ("embree", 4), ("source", 4)])
 def test_tree_that_does_not_fit(request, shapes, scarce, monkeypatch, name, mebibytes):
     local = mesh.local_mesh(*shapes["vase"]())
     classes = {"numpy": NumpyBackend, "embree": embree_backend.EmbreeBackend}
