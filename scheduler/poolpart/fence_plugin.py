@@ -24,19 +24,21 @@ import logging
 import pickle
 import time
 from collections.abc import Callable, Iterable
+from itertools import islice
 from typing import Any
 
 from distributed.core import Status
 from distributed.diagnostics.plugin import SchedulerPlugin
-from distributed.scheduler import WorkerState
 from distributed.shuffle._core import barrier_key
 
+from .ask_back import ask_back, forget_requests, requests_under_way
 from .override import Overrides
 
 logger = logging.getLogger(__name__)
 
 NAME = "poolpart-fences"
 COMPLAIN_EVERY_S = 10.0
+_LOOK_AT_MOST = 1000
 _SETTLE_S = 5.0  # longest wait for workers to give up tasks that they have not started
 
 
@@ -69,11 +71,14 @@ def fences_of(scheduler: Any) -> frozenset[str]:
 
 
 def kept_out(scheduler: Any) -> int:
-    """Tasks that wait because only workers behind fences could take them."""
+    """Count tasks that wait because only workers behind fences could take them.
+
+    Of those that no worker may take at all, the first thousand are looked at.
+    """
     fences: Fences | None = scheduler.plugins.get(NAME)
     if fences is None:
         return 0
-    waiting = sum(1 for task in scheduler.unrunnable if fences.stop(task))
+    waiting = sum(map(fences.holds_up, islice(scheduler.unrunnable, _LOOK_AT_MOST)))
     return waiting + (0 if fences.remainder else len(scheduler.queued))
 
 
@@ -120,8 +125,7 @@ class Fences(SchedulerPlugin):
         self._overrides.take_back()
         self.scheduler.handlers["set_resources"] = self.scheduler.add_resources
         self.scheduler.idle_task_count = set(self.scheduler.idle_task_count)
-        if stealing := self.scheduler.extensions.get("stealing"):
-            stealing.in_flight_tasks.pop(_departed(self.scheduler), None)
+        forget_requests(self.scheduler)
         self.scheduler.remove_plugin(NAME)
 
     # -- who is behind a fence ---------------------------------------------------------
@@ -154,29 +158,19 @@ class Fences(SchedulerPlugin):
                 self.scheduler.stimulus_queue_slots_maybe_opened(stimulus_id=stimulus)
 
     def _turn_out(self, worker: Any, asked: set[Any]) -> None:
-        """Ask a worker for tasks that it should not have, each once.
-
-        By the protocol of work stealing: a worker gives up what it has not started, and the
-        scheduler decides anew, since the thief is one that has left. A task that is being
-        stolen already is left for the next time.
-        """
-        if stealing := self.scheduler.extensions.get("stealing"):
-            for task in worker.processing - worker.long_running - asked:
-                if self.stop(task) and not task.actor and task not in stealing.in_flight:
-                    asked.add(task)
-                    stealing.move_task_request(task, worker, _departed(self.scheduler))
+        """Ask a worker for tasks that it should not have, each once."""
+        mine = (task for task in worker.processing - asked if self.stop(task))
+        asked.update(ask_back(self.scheduler, worker, mine))
 
     async def settle(self) -> None:
         """Turn out what has not started behind fences, and wait a moment for the answers."""
-        stealing = self.scheduler.extensions.get("stealing")
         asked: set[Any] = set()
         deadline = time.monotonic() + _SETTLE_S
-        while stealing and time.monotonic() < deadline:
+        while time.monotonic() < deadline:
             for worker in self.closed:
                 self._turn_out(worker, asked)
-            moves = stealing.in_flight.values()
             # Also what somebody behind a fence steals just now; it is turned out then.
-            if not any(move["thief"] in self.closed or _is_departed(move) for move in moves):
+            if not requests_under_way(self.scheduler, self.closed):
                 return
             await asyncio.sleep(0.005)
 
@@ -190,6 +184,15 @@ class Fences(SchedulerPlugin):
         """Whether fences keep a task out: it asks for none of their resources."""
         asked = task.resource_restrictions
         return not asked or self.names.isdisjoint(asked)
+
+    def holds_up(self, task: Any) -> bool:
+        """Whether fences are why no worker may take a task now."""
+        if not self.stop(task):
+            return False
+        # As Dask has it, without fences: what nobody could take anyhow is not our affair.
+        valid = type(self.scheduler).valid_workers(self.scheduler, task)
+        could = self.scheduler.running if valid is None else valid
+        return bool(could) and could <= self.closed
 
     def _add_resources(self, original: Callable[..., Any], worker: str, resources: Any) -> Any:
         answer = original(worker, resources)
@@ -242,11 +245,7 @@ class Fences(SchedulerPlugin):
             return
         now = time.monotonic()
         task = self.scheduler.tasks[key]
-        if now - self._complained_at < COMPLAIN_EVERY_S or not self.stop(task):
-            return
-        # `valid_workers` as Dask has it: a task that nobody could take is not our affair.
-        valid = type(self.scheduler).valid_workers(self.scheduler, task)
-        if self.closed.isdisjoint(self.scheduler.running if valid is None else valid):
+        if now - self._complained_at < COMPLAIN_EVERY_S or not self.holds_up(task):
             return
         self._complained_at = now
         fences = ", ".join(sorted(self.names))
@@ -270,23 +269,3 @@ class _OpenWorkers(set[Any]):
     def add(self, worker: Any) -> None:
         if worker not in self._closed:
             super().add(worker)
-
-
-def _departed(scheduler: Any) -> Any:
-    """State of a worker that is not there; what is moved to it is scheduled anew."""
-    return WorkerState(
-        address="tcp://0.0.0.0:0",
-        status=Status.closed,
-        pid=0,
-        name=NAME,
-        nthreads=1,
-        memory_limit=0,
-        local_directory="",
-        nanny=None,
-        server_id=NAME,
-        scheduler=scheduler,
-    )
-
-
-def _is_departed(move: Any) -> bool:
-    return bool(move["thief"].server_id == NAME)

@@ -257,6 +257,18 @@ def test_tasks_wait_where_all_workers_are_behind_fences_and_everybody_is_told(cl
     assert kept_out(scheduler_of(client)) == 0
 
 
+def test_a_task_for_a_worker_behind_a_fence_waits(client, wait_until):
+    raise_fence(client, "A")
+    unknown = client.submit(here, resources={"unknown": 1}, key="unknown")  # waits by itself
+    wait_until(lambda: "unknown" in scheduler_of(client).tasks)
+    with pytest.warns(UserWarning, match="such as 'wanted'"):
+        waiting = client.submit(here, workers=["A-0"], key="wanted")
+        wait_until(lambda: kept_out(scheduler_of(client)) == 1)
+    lower_fence(client, "A")
+    assert waiting.result(LONG_S) == "A-0"
+    assert not unknown.done()
+
+
 def test_a_fence_follows_what_workers_declare(client, wait_until):
     raise_fence(client, "A")
     declare(client, "plain", A=1)
