@@ -97,7 +97,7 @@ def _tell(number: int, outcome: Outcome, faults: int) -> None:
         flush=True,
     )
     if not outcome.sound:
-        print(f"  {outcome.error}\n  {outcome.verdict}\n  identical: {outcome.identical}")
+        print(f"  {outcome.error}  {outcome.verdict}\n  identical: {outcome.identical}")
         print("  faults:", dict(outcome.done))
 
 

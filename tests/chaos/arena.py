@@ -37,7 +37,7 @@ class Arena:
     slots
         Threads and slots of each.
     pauses
-        Seconds to hold each pass of some points of the workers.
+        Seconds a scan to hold at some points of the workers.
     """
 
     def __init__(

@@ -8,7 +8,6 @@ that was restarted meanwhile knows as much as the others.
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import json
 import logging
@@ -17,6 +16,7 @@ import resource
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,7 +44,7 @@ SIGNALS = {
 }
 
 HOLD_S = 5.0  # longest time that a point is held for somebody else to carry a fault out
-_EVENTS, _ARMED, _FIRED = "events", "armed", "fired"
+_EVENTS, _ARMED, _FIRED, _HURRY = "events", "armed", "fired", "hurry"
 
 
 @dataclass(frozen=True)
@@ -101,6 +101,21 @@ class Board:
         for name in (_EVENTS, _ARMED, _FIRED):
             (folder / name).mkdir(parents=True, exist_ok=True)
 
+    @contextmanager
+    def hurry(self) -> Iterator[None]:
+        """Have nobody pause at points meanwhile."""
+        flag = self.folder / _HURRY
+        flag.touch()
+        try:
+            yield
+        finally:
+            flag.unlink()
+
+    @property
+    def is_in_a_hurry(self) -> bool:
+        """Whether nobody is to pause."""
+        return (self.folder / _HURRY).exists()
+
     def arm(self, order: Order) -> None:
         """Have the next process that comes to the point carry it out."""
         (self.folder / _ARMED / order.file_name).touch()
@@ -109,7 +124,7 @@ class Board:
         """Take back the orders that nobody has come to."""
         left = []
         for path in sorted((self.folder / _ARMED).iterdir()):
-            with contextlib.suppress(FileNotFoundError):  # taken at this moment
+            with suppress(FileNotFoundError):  # taken at this moment
                 path.unlink()
                 left.append(Order.parse(path.name))
         return left
@@ -171,8 +186,8 @@ class Sink:
     strike
         Carries an order out that was taken here.
     pauses
-        Seconds to hold the thread at some points, by name: it paces a run that would be over
-        before anything could happen to it.
+        Seconds to hold the thread at some points, by name, for each scan that it is about: it
+        paces a run that would be over before anything could happen to it.
     """
 
     def __init__(
@@ -197,8 +212,8 @@ class Sink:
                 **fields,
             }
         )
-        if pause := self.pauses.get(point):
-            time.sleep(pause)
+        if (pause := self.pauses.get(point)) and not self.board.is_in_a_hurry:
+            time.sleep(pause * len(scans))
         if fired := self.board.claim(point, max(scans, default=0), self.worker):
             self.strike(fired)
 

@@ -132,10 +132,12 @@ class Nemesis:
     faults
         What is to happen. Faults at points are armed at once; those at random times follow
         one another, from when the driver passes its first point.
+    drives
+        Whether this process is the driver's. Otherwise faults come from the beginning on.
     """
 
-    def __init__(self, arena: Arena, faults: Sequence[Fault]) -> None:
-        self.arena = arena
+    def __init__(self, arena: Arena, faults: Sequence[Fault], drives: bool = True) -> None:
+        self.arena, self._drives = arena, drives
         self.faults = {fault.number: fault for fault in faults}
         self.done: Counter[tuple[str, str]] = Counter()  # {(kind, point): times}
         self.left: list[Fault] = []  # afterwards: those that were not carried out
@@ -151,7 +153,8 @@ class Nemesis:
         for fault in self.faults.values():
             if fault.point != RANDOM:
                 self.arena.board.arm(fault.order)
-        trace_to(_DriverSink(self))
+        if self._drives:
+            trace_to(_DriverSink(self))
         self._looker.start()
         return self
 
@@ -171,7 +174,7 @@ class Nemesis:
     # -- in the nemesis' own thread ----------------------------------------------------
 
     def _watch(self) -> None:
-        due = float("inf")
+        due = float("inf") if self._drives else time.monotonic()
         timed = [fault for fault in self.faults.values() if fault.point == RANDOM]
         while not self._over.is_set():
             if self.run and due == float("inf"):  # it has begun

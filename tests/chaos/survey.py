@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import time
+import traceback
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,8 +20,8 @@ from .checker import Verdict, judge
 from .nemesis import Fault, Nemesis
 
 STEPS, POSES = 360, 2
-# Where the generator is held, so that there is time for things to go wrong.
-PAUSES = {"generate.put": 0.06}
+# Seconds a scan for which the generator is held, so that there is time for things to go wrong.
+PAUSES = {"generate.put": 0.006}
 PLANNING = Planning((25, 25), (-30, -20), [(0, 0)], 2.0, trials=12, particles=60, iterations=60)
 
 
@@ -111,7 +112,7 @@ def disturbed(
                 room(), what, planning, client=arena.client, backend="numpy", **options
             )
         except Exception as failure:
-            error = f"{type(failure).__name__}: {failure}"
+            error = "".join(traceback.format_exception(failure))
     return Outcome(
         verdict=judge(
             arena.board.events(nemesis.run),

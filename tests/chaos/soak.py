@@ -1,0 +1,192 @@
+"""A long survey with a worker killed every few seconds: `python -m tests.chaos.soak`.
+
+The driver is a process of its own, the scheduler is in this one, so that the memory of each
+is seen. Afterwards nothing may be left that was not there before.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import random
+import sys
+import time
+from collections import Counter
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+
+from lidarpool import Survey
+
+from .arena import Arena
+from .checker import Verdict, judge
+from .driver import Delivered, Driver
+from .events import KILL, SEGV, TERM
+from .nemesis import PARTITIONS, RANDOM, Fault, Nemesis
+from .survey import STEPS, reference, survey
+from .traces import Footprint, differences, own_temporary_folder, scheduler_state
+
+PACE_S = 0.02  # a scan
+SAMPLE_EVERY_S = 0.5
+EVERY_S = (1.0, 4.0)  # between two faults
+SETTLE_S = 10.0  # for a scheduler to have forgotten what it is told to forget
+LETHAL = (KILL, KILL, TERM, SEGV)
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Resident memory at one moment, in MiB."""
+
+    seconds: float
+    driver: float
+    scheduler: float
+
+    @classmethod
+    def now(cls, seconds: float, driver: int | None) -> Sample:
+        """Look at a driver's process, and at this one."""
+        return cls(seconds, _resident(driver), _resident(None))
+
+
+def _resident(pid: int | None) -> float:
+    try:
+        return float(psutil.Process(pid).memory_info().rss) / (1 << 20)
+    except psutil.NoSuchProcess:  # it has just ended
+        return float("nan")
+
+
+@dataclass(frozen=True)
+class Soaked:
+    """What a soak has shown."""
+
+    samples: list[Sample]
+    faults: Counter[str]
+    delivered: Delivered
+    verdict: Verdict
+    identical: bool
+    left_on_scheduler: list[str]
+    left_behind: list[str]
+
+    @property
+    def sound(self) -> bool:
+        """Whether nothing is lost and nothing is left."""
+        return (
+            self.verdict.sound
+            and self.identical
+            and not (self.left_on_scheduler or self.left_behind or self.delivered.misplaced)
+        )
+
+    def growth(self, who: str) -> float:
+        """MiB by which memory grew from the second quarter of the time to the last."""
+        values = [getattr(sample, who) for sample in self.samples]
+        quarter = max(1, len(values) // 4)
+        return float(np.nanmedian(values[-quarter:]) - np.nanmedian(values[quarter : 2 * quarter]))
+
+
+def soak(scans: int, seed: int, pace_s: float = PACE_S) -> Soaked:
+    """Survey at least so many scans while workers are killed all the time."""
+    with own_temporary_folder() as temporary:
+        before = Footprint.now(temporary)
+        soaked = _soak(survey(-(-scans // STEPS)), seed, pace_s)
+        return replace(soaked, left_behind=before.left_in(Footprint.now(temporary)))
+
+
+def _soak(what: Survey, seed: int, pace_s: float) -> Soaked:
+    samples: list[Sample] = []
+    with Arena(pauses={"generate.put": pace_s}) as arena:
+        known = scheduler_state(arena.client)
+        with arena.board.hurry():
+            expected = reference(arena, what, None)
+        with Nemesis(arena, _faults(random.Random(seed)), drives=False) as nemesis:
+            driver = Driver(arena.client.scheduler.address, what, None, arena.board.folder)
+            started = time.monotonic()
+            while not driver.is_done:
+                samples.append(Sample.now(time.monotonic() - started, driver.process.pid))
+                time.sleep(SAMPLE_EVERY_S)
+            delivered = driver.delivered()
+        arena.wait_until_whole()
+        left = _left_on_scheduler(arena, known)
+        events = arena.board.events(delivered.run)
+    rows = () if delivered.reference is None else delivered.reference.rows
+    return Soaked(
+        samples,
+        Counter({kind: number for (kind, _), number in nemesis.done.items()}),
+        delivered,
+        judge(events, what.scan_count, rows, expected.rows),
+        delivered.reference == expected,
+        left,
+        [],
+    )
+
+
+def _faults(chance: random.Random) -> list[Fault]:
+    """More than any soak lasts."""
+    return [
+        Fault(
+            number,
+            chance.choice(LETHAL),
+            RANDOM,
+            after_s=chance.uniform(*EVERY_S),
+            partition=chance.choice(PARTITIONS),
+            pick=chance.random(),
+        )
+        for number in range(10_000)
+    ]
+
+
+def _left_on_scheduler(arena: Arena, known: dict[str, Any]) -> list[str]:
+    """What the scheduler knows that it did not know, once it has settled."""
+    deadline = time.monotonic() + SETTLE_S
+    while (left := differences(known, scheduler_state(arena.client))) and (
+        time.monotonic() < deadline
+    ):
+        time.sleep(0.2)
+    return left
+
+
+def draw(soaked: Soaked, path: Path) -> None:
+    """Draw the memory curves."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 4), layout="constrained")
+    axes = figure.subplots()
+    seconds = [sample.seconds for sample in soaked.samples]
+    for who in ("driver", "scheduler"):
+        axes.plot(seconds, [getattr(sample, who) for sample in soaked.samples], label=who)
+    axes.set(xlabel="seconds", ylabel="resident memory, MiB", ylim=(0, None))
+    axes.set_title(f"{soaked.verdict.expected} scans, {soaked.faults.total()} workers killed")
+    axes.legend()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=120)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Soak, and say what was found; returns 0 if all was well."""
+    parser = argparse.ArgumentParser(prog="tests.chaos.soak", description=__doc__)
+    parser.add_argument("--scans", type=int, default=10_000)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--picture", type=Path, help="draw the memory into this file")
+    options = parser.parse_args(arguments)
+    logging.disable(logging.CRITICAL)  # that workers die here is no news
+    soaked = soak(options.scans, options.seed)
+    print(" seconds   driver  scheduler (MiB)")
+    for sample in soaked.samples[:: max(1, len(soaked.samples) // 24)]:
+        print(f"{sample.seconds:8.0f} {sample.driver:8.1f} {sample.scheduler:10.1f}")
+    for who in ("driver", "scheduler"):
+        print(f"{who}: {soaked.growth(who):+.1f} MiB from the second to the last quarter")
+    print(soaked.delivered.error or soaked.verdict)
+    print(f"faults: {dict(soaked.faults)}")
+    print(f"identical: {soaked.identical}, misplaced tasks: {soaked.delivered.misplaced}")
+    print("left on the scheduler:", soaked.left_on_scheduler or "nothing")
+    print("left on the machine:", soaked.left_behind or "nothing")
+    if options.picture:
+        draw(soaked, options.picture)
+        print("drawn:", options.picture)
+    print("sound" if soaked.sound else f"not sound; seed {options.seed}")
+    return 0 if soaked.sound else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
