@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import os
 import re
 import signal
 import subprocess
 import sys
 import time
-import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -27,115 +26,34 @@ planning: {{trials: 100000}}
 """
 SHORT = "sensor: {layers: 4}\nplanning: {trials: 2}\n"
 
-COMMAND = "from lidarpool.cli import main; main()"
-ENDS_WITHIN_S = 20  # on a busy machine; a second or two on an idle one
 SURVEYING = r"survey  [1-9]"
 WRITING = r"writing the cloud"
 
 
-class Run:
-    """The command in a process group of its own, as a shell starts it."""
-
-    def __init__(self, folder: Path, scenario: str, *options: str, prelude: str = "") -> None:
-        (folder / "s.yaml").write_text(scenario)
-        self.tag = uuid.uuid4().hex
-        self.log = folder / f"{self.tag}.log"
-        with self.log.open("wb") as log:
-            self.process = subprocess.Popen(
-                [
-                    sys.executable,
-                    "-c",
-                    prelude + COMMAND,
-                    "run",
-                    "s.yaml",
-                    "--out",
-                    "out",
-                    *options,
-                ],
-                cwd=folder,
-                stdout=log,
-                stderr=log,
-                start_new_session=True,
-                env={
-                    **os.environ,
-                    "PYTHONPATH": os.pathsep.join(sys.path),
-                    "TEST_RUN_TAG": self.tag,
-                },
-            )
-
-    def wait_for(self, pattern: str) -> Run:
-        """Wait until the run says something."""
-        stop = time.monotonic() + 90
-        while not re.search(pattern, self.said):
-            assert self.process.poll() is None, self.said
-            assert time.monotonic() < stop, self.said
-            time.sleep(0.02)
-        return self
-
-    @property
-    def said(self) -> str:
-        """What it has written so far, its workers included."""
-        return self.log.read_text()
-
-    def signal(self, number: int, *, group: bool = False) -> int:
-        """Send a signal, wait for the end, return the exit code."""
-        (os.killpg if group else os.kill)(self.process.pid, number)
-        return self.process.wait(ENDS_WITHIN_S)
-
-    @property
-    def processes(self) -> set[int]:
-        """Processes of this run that are alive, workers included."""
-        found = set()
-        for entry in Path("/proc").iterdir():
-            if entry.name.isdigit():
-                try:
-                    if self.tag.encode() in (entry / "environ").read_bytes():
-                        found.add(int(entry.name))
-                except (OSError, ProcessLookupError):
-                    continue  # it has ended, or is another user's
-        return found
-
-    def wait_until_alone(self, seconds: float = ENDS_WITHIN_S) -> None:
-        """Wait until no process is left."""
-        stop = time.monotonic() + seconds
-        while self.processes:
-            assert time.monotonic() < stop, self.processes
-            time.sleep(0.1)
-
-    def close(self) -> None:
-        for process in self.processes:
-            os.kill(process, signal.SIGKILL)
-        self.process.wait(10)
-
-
 @pytest.fixture
-def start(tmp_path: Path) -> Iterator[Callable[..., Run]]:
+def start(tmp_path: Path, start_command: Callable[..., Any]) -> Callable[..., Any]:
     """Start runs whose result goes to a folder with an earlier one."""
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "cloud.ply").write_text("an earlier cloud")
-    runs: list[Run] = []
-
-    def start(*arguments: str, prelude: str = "") -> Run:
-        runs.append(Run(tmp_path, *arguments, prelude=prelude))
-        return runs[-1]
-
-    yield start
-    for run in runs:
-        run.close()
+    return start_command
 
 
 @pytest.fixture
 def untouched(tmp_path: Path) -> Callable[[], bool]:
-    def untouched() -> bool:
-        files = list((tmp_path / "out").iterdir())
-        return files == [tmp_path / "out" / "cloud.ply"] and (
-            files[0].read_text() == "an earlier cloud"
-        )
+    """Whether the earlier result is all there is, besides a journal if there is to be one."""
+
+    def untouched(*, journal: bool = False) -> bool:
+        names = {path.name for path in (tmp_path / "out").iterdir()}
+        earlier = (tmp_path / "out" / "cloud.ply").read_text() == "an earlier cloud"
+        return earlier and names == ({"cloud.ply", "journal"} if journal else {"cloud.ply"})
 
     return untouched
 
 
-def check_interrupted(run: Run, code: int) -> None:
+KEPT = r"[\d,]+ of 360,000 scans are kept in out/journal: continue with --resume\.$"
+
+
+def check_interrupted(run: Any, code: int) -> None:
     assert code == 130
     assert run.said.splitlines()[-1].startswith("lidarpool: interrupted; everything was stopped")
     assert said_besides_progress(run) == run.said.splitlines()[-1:]
@@ -143,7 +61,7 @@ def check_interrupted(run: Run, code: int) -> None:
     run.wait_until_alone(seconds=3)
 
 
-def said_besides_progress(run: Run) -> list[str]:
+def said_besides_progress(run: Any) -> list[str]:
     """What it said but for lines with a time stamp."""
     lines = [line for line in run.said.splitlines() if line.strip()]
     return [line for line in lines if not re.match(r"\d\d:\d\d:\d\d  ", line)]
@@ -157,6 +75,29 @@ def said_besides_progress(run: Run) -> list[str]:
 def test_an_interrupted_survey_ends_cleanly(number, group, start, untouched):
     run = start(LONG).wait_for(SURVEYING)
     check_interrupted(run, run.signal(number, group=group))
+    assert re.search(rf"everything was stopped\. {KEPT}", run.said)
+    assert untouched(journal=True)
+
+
+ANNOUNCE = """
+import signal, sys
+arm = signal.signal
+def announce(*what):
+    arm(*what)
+    print("armed", flush=True)
+signal.signal = announce
+"""
+
+
+@pytest.mark.parametrize("after", [0.0, 0.1, 0.3, 0.6])
+def test_ctrl_c_while_python_imports(after, start, untouched):
+    run = start(LONG, prelude=ANNOUNCE).wait_for("armed\narmed")
+    time.sleep(after)
+    assert run.signal(signal.SIGINT, group=True) == 130
+    assert {*run.said.splitlines()} == {
+        "armed", "lidarpool: interrupted; everything was stopped, and the output folder is as "
+        "it was.",
+    }  # fmt: skip
     assert untouched()
 
 
@@ -170,7 +111,8 @@ def test_ctrl_c_while_the_workers_start(start, untouched):
 def test_ctrl_c_while_pictures_are_written(start, untouched):
     run = start(SHORT).wait_for(WRITING)
     check_interrupted(run, run.signal(signal.SIGINT, group=True))
-    assert untouched()
+    assert "stopped. 108 of 108 scans are kept in out/journal" in run.said
+    assert untouched(journal=True)
 
 
 def test_a_second_ctrl_c_ends_it_at_once():
@@ -196,7 +138,7 @@ def test_workers_follow_a_driver_that_was_killed(start, untouched):
     assert run.signal(signal.SIGKILL) == -signal.SIGKILL
     run.wait_until_alone()
     assert "Traceback" not in run.said
-    assert untouched()
+    assert untouched(journal=True)
 
 
 def test_the_run_after_one_that_was_killed_while_writing(start, untouched, tmp_path):
@@ -204,8 +146,15 @@ def test_the_run_after_one_that_was_killed_while_writing(start, untouched, tmp_p
     killed.signal(signal.SIGKILL)
     killed.wait_until_alone()
     assert (tmp_path / "out" / "cloud.ply").read_text() == "an earlier cloud"
-    run = start(SHORT)
+    refused = start(SHORT)
+    assert refused.process.wait(30) == 2
+    assert refused.said == (
+        "lidarpool: out/journal holds an unfinished run, 108 of 108 scans: continue it with "
+        "--resume, or drop it with --fresh.\n"
+    )
+    run = start(SHORT, "--resume")
     assert run.process.wait(90) == 0, run.said
+    assert "starting the workers" not in run.said
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert names == {
         "cloud.ply", "scene.png", "intensity.png", "cloud.png", "path.png", "report.json",
@@ -224,7 +173,8 @@ def test_the_scheduler_of_an_outside_cluster_is_killed(start, untouched, outside
     assert message.startswith(
         f"lidarpool: The cluster at {cluster.address} cannot be reached any more"
     )
-    assert untouched()
+    assert re.search(KEPT, message)
+    assert untouched(journal=True)
 
 
 def test_the_last_worker_of_a_partition_is_killed(start, untouched, outside):
@@ -239,5 +189,6 @@ def test_the_last_worker_of_a_partition_is_killed(start, untouched, outside):
     (message,) = said_besides_progress(run)
     assert "Partition 'GPU' has had no workers for 2 s" in message
     assert '--resources "GPU=1"' in message
-    assert untouched()
+    assert re.search(KEPT, message)
+    assert untouched(journal=True)
     assert "Traceback" not in cluster.log()

@@ -95,13 +95,15 @@ class Run:
             for pump in pumps:
                 pump.finish()
         except BaseException as error:
+            # A client that loses its scheduler cancels all futures: tasks seem to be cancelled.
+            lost = self.client.status == "connecting"
             reason = str(error) or type(error).__name__
             _stop(pumps, f"the run was stopped: {reason}")
             if error is self.callers_error:
                 raise
-            if isinstance(error, PoolError):
+            if isinstance(error, PoolError) and not lost:
                 raise LidarpoolError(str(error)) from error
-            if isinstance(error, _CLUSTER_LOST):
+            if isinstance(error, _CLUSTER_LOST) or (lost and isinstance(error, Exception)):
                 raise LidarpoolError(
                     f"The cluster at {self.client.scheduler.address} cannot be reached any more, "
                     "or somebody cancelled the tasks of this run; it has ended without a result."
