@@ -44,6 +44,7 @@ format:  ## rewrite the sources in the project's format
 bench:  ## benchmarks: pipeline, planning, ray casting (more: python -m benchmarks.raycast --large)
 	@VENV=$(VENV) sh .ci/setup dev
 	$(BIN)/python -m benchmarks.pipeline
+	$(BIN)/python -m benchmarks.scale
 	$(BIN)/python -m benchmarks.planning
 	$(BIN)/python -m benchmarks.raycast
 	$(BIN)/python -m benchmarks.trees

@@ -7,6 +7,7 @@ from .fence import lower_fence, raise_fence
 from .fetch import fetch_available
 from .ledger import Ledger
 from .local import local_cluster
+from .mapping import Results
 from .page import partitions_page, remove_partitions_page, tell_page
 from .partition import Partition
 from .pipe import Pipe
@@ -31,6 +32,7 @@ __all__ = [
     "Pool",
     "PoolError",
     "Recorder",
+    "Results",
     "Rule",
     "Slots",
     "StageStats",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 
-from benchmarks import pipeline
+from benchmarks import pipeline, scale
 
 
 def test_pipeline(tmp_path, capsys):
@@ -14,3 +14,15 @@ def test_pipeline(tmp_path, capsys):
     assert figures["scans_per_second"] > 0
     assert set(figures["stage_ms_per_scan"]) == {"generate", "intersect", "sort", "collect"}
     assert "scans/s" in capsys.readouterr().out
+
+
+def test_scale(tmp_path, capsys):
+    path = tmp_path / "figures.json"
+    sizes = ["--workers", "4", "8", "--tasks", "80", "--json", str(path)]
+    figures = scale.main(sizes)
+    assert json.loads(path.read_text())["growth"] == figures["growth"]
+    assert set(figures["growth"]) == set(scale.WAYS)
+    for cluster in figures["workers"].values():
+        assert cluster["misplaced"] == 0
+        assert all(cluster[way]["tasks_per_second"] > 0 for way in scale.WAYS)
+    assert "growth from 4 to 8 workers" in capsys.readouterr().out

@@ -1,0 +1,206 @@
+"""What a task costs as the cluster grows: `python -m benchmarks.scale`.
+
+Scheduler, driver and workers are three processes, so that what each takes can be told apart:
+all the workers are threads of one process, and the tasks do nothing. The workers are divided
+into four partitions.
+
+- `submit`: one task a message; `submit_many`: all of a partition in one; `map`: results one by
+  one, a bounded number of tasks under way. `map_small` puts several items into a task, as
+  `Partition.map` does by itself, and its figures are for an item: at least two tasks for each
+  slot are needed, so that they grow with the cluster.
+- The scheduler's time is CPU time, less what it takes in as long a time with nothing to do
+  (heartbeats), which is given by itself; the driver's is CPU time of its process.
+- Growth is that of driver and scheduler together, from the smallest cluster to the largest.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import logging
+import math
+import multiprocessing
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import dask
+import psutil
+from distributed import Client, Scheduler, Worker, get_worker
+
+from poolpart import Partition, Pool
+
+NAMES = ("A", "B", "C", "D")
+# Of 200 workers in one process, the statistical profilers alone would take a core, and each
+# worker's monitor of the system tells the same.
+SPARING = {
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.system-monitor.interval": "60s",
+}
+
+
+async def _scheduler(connection: Connection) -> None:
+    options = {"host": "127.0.0.1", "port": 0, "dashboard_address": "127.0.0.1:0"}
+    async with Scheduler(**options, dashboard=False) as scheduler:
+        connection.send(scheduler.address)
+        await asyncio.to_thread(connection.recv)
+
+
+async def _workers(connection: Connection, address: str, count: int) -> None:
+    options = {"nthreads": 1, "dashboard": False, "memory_limit": 0, "host": "127.0.0.1"}
+    workers = [Worker(address, name=str(number), **options) for number in range(count)]
+    await asyncio.gather(*workers)
+    connection.send(address)
+    await asyncio.to_thread(connection.recv)
+    await asyncio.gather(*(worker.close(nanny=False) for worker in workers))
+
+
+def _serve(main: Callable[..., Any], connection: Connection, *arguments: Any) -> None:
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    with dask.config.set(SPARING):
+        asyncio.run(main(connection, *arguments))
+
+
+@contextmanager
+def process(main: Callable[..., Any], *arguments: Any) -> Iterator[tuple[psutil.Process, str]]:
+    """Run `main` in a process of its own; gives it, and the address that it sends when ready."""
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    child = context.Process(target=_serve, args=(main, theirs, *arguments), daemon=True)
+    child.start()
+    theirs.close()  # so that the end of the process is the end of the pipe
+    try:
+        yield psutil.Process(child.pid), ours.recv()
+        ours.send(None)
+        child.join(30)
+    finally:
+        child.kill()
+        child.join()
+
+
+def name_of_worker(_: object = None) -> str:
+    return str(get_worker().name)
+
+
+def divide(client: Client) -> tuple[list[Partition], float]:
+    """Divide all workers into four partitions; gives those and the seconds it took."""
+    start = time.perf_counter()
+    rest = Pool.from_client(client)
+    each, parts = len(rest) // len(NAMES), []
+    for name in NAMES[:-1]:
+        part, rest = rest.partition(name, n_workers=each)
+        parts.append(part)
+    parts.append(rest.partition(NAMES[-1], n_workers=len(rest))[0])
+    return parts, time.perf_counter() - start
+
+
+def by_submit(partition: Partition, tasks: int) -> list[str]:
+    futures = [partition.submit(name_of_worker) for _ in range(tasks)]
+    return list(partition.client.gather(futures))
+
+
+def by_submit_many(partition: Partition, tasks: int) -> list[str]:
+    return list(partition.client.gather(partition.submit_many(name_of_worker, [None] * tasks)))
+
+
+def by_map(partition: Partition, tasks: int) -> list[str]:
+    return list(partition.map(name_of_worker, [None] * tasks, chunk=1))
+
+
+def by_map_small(partition: Partition, tasks: int) -> list[str]:
+    return list(partition.map(name_of_worker, [None] * tasks))
+
+
+# {name: function, how many tasks compared with `--tasks`}
+WAYS = {
+    "submit": (by_submit, 0.25),
+    "submit_many": (by_submit_many, 1),
+    "map": (by_map, 0.25),
+    "map_small": (by_map_small, 5),
+}
+
+
+def cpu_s(process: psutil.Process) -> float:
+    times = process.cpu_times()
+    return float(times.user + times.system)
+
+
+def measure(workers: int, tasks: int) -> dict[str, Any]:
+    """Figures of a cluster of so many workers."""
+    with (
+        process(_scheduler) as (scheduler, address),
+        process(_workers, address, workers),
+        Client(address) as client,
+    ):
+        parts, seconds = divide(client)
+        members = {part.name: {worker.name for worker in part.workers} for part in parts}
+        before = cpu_s(scheduler)
+        time.sleep(2)
+        idle = (cpu_s(scheduler) - before) / 2
+        figures: dict[str, Any] = {
+            "seconds_to_partition": round(seconds, 3),
+            "scheduler_idle_percent": round(100 * idle, 1),
+            "misplaced": 0,
+        }
+        by_submit(parts[0], workers)  # the first tasks import things
+        for way, (run, share) in WAYS.items():
+            start, driver, before = time.perf_counter(), time.process_time(), cpu_s(scheduler)
+            names = {part.name: run(part, math.ceil(share * tasks / len(parts))) for part in parts}
+            wall = time.perf_counter() - start
+            done = sum(map(len, names.values()))
+            busy = cpu_s(scheduler) - before - idle * wall
+            figures[way] = {
+                "tasks_per_second": round(done / wall, 1),
+                "driver_ms": round(1e3 * (time.process_time() - driver) / done, 4),
+                "scheduler_ms": round(1e3 * max(0.0, busy) / done, 4),
+            }
+            figures["misplaced"] += sum(
+                worker not in members[name] for name, ran in names.items() for worker in ran
+            )
+        return figures
+
+
+def growth(smallest: dict[str, float], largest: dict[str, float]) -> float | None:
+    """Of driver and scheduler together; None where the smallest took no time to speak of."""
+    least, most = (
+        figures["driver_ms"] + figures["scheduler_ms"] for figures in (smallest, largest)
+    )
+    return round(most / least, 2) if least else None
+
+
+def main(arguments: list[str] | None = None) -> dict[str, Any]:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--workers", type=int, nargs="+", default=[10, 50, 200])
+    parser.add_argument("--tasks", type=int, default=20_000, help="of each way to submit them")
+    parser.add_argument("--json", type=Path, help="also write the figures to this file")
+    options = parser.parse_args(arguments)
+
+    clusters = {}
+    for count in options.workers:
+        clusters[count] = figures = measure(count, options.tasks)
+        print(
+            f"{count} workers: {figures['seconds_to_partition']} s to partition, "
+            f"{figures['misplaced']} tasks misplaced, scheduler idle at "
+            f"{figures['scheduler_idle_percent']}% of a core"
+        )
+        for way in WAYS:
+            a_second, driver, scheduler = figures[way].values()
+            print(
+                f"  {way:<11} {a_second:9.1f} a second, driver {driver:.3f} ms, "
+                f"scheduler {scheduler:.3f} ms"
+            )
+    ends = clusters[min(clusters)], clusters[max(clusters)]
+    grown = {way: growth(ends[0][way], ends[1][way]) for way in WAYS}
+    print(f"growth from {min(clusters)} to {max(clusters)} workers: {grown}")
+    results = {"tasks": options.tasks, "workers": clusters, "growth": grown}
+    if options.json:
+        options.json.write_text(json.dumps(results, indent=1) + "\n")
+    return results
+
+
+if __name__ == "__main__":
+    main()
