@@ -14,7 +14,7 @@ from distributed import get_worker, wait, worker_client
 
 from poolpart import Partition, Pool, PoolError
 from poolpart.fence import lower_fence, raise_fence, raised_fences
-from poolpart.fence_plugin import kept_out
+from poolpart.fence_plugin import NAME, kept_out
 from poolpart.override import Overrides
 
 LONG_S = 30.0
@@ -309,6 +309,36 @@ def test_it_holds_after_a_restart(nannies, wait_until):
     seen |= set(nannies.gather([nannies.submit(here, pure=False) for _ in range(10)]))
     assert seen == {"0"}
     assert set(nannies.gather(waiting)) == {"1"}
+    nannies.restart()
+    assert set(nannies.gather([nannies.submit(here, pure=False) for _ in range(10)])) == {"0"}
+    assert part.submit(here).result(LONG_S) == "1"
+
+
+def place(*_, pause_s=0.001):
+    time.sleep(pause_s)
+    return sorted(get_worker().state.total_resources)
+
+
+def test_nothing_is_lost_while_workers_move_to_and_fro(start):
+    client = start({name: {"nthreads": 2} for name in ("a", "b", "c", "d")})
+    client.cluster.scheduler.validate = True
+    pool = Pool.from_client(client)
+    part, _ = pool.partition("P", n_workers=1, exclusive=True)
+    inside, outside = [], []
+    for move in (part.grow, part.grow, part.shrink, part.grow, part.shrink, part.shrink):
+        inside += [part.submit(place, pause_s=0.02) for _ in range(20)]
+        outside += client.map(place, range(40), pause_s=0.01, pure=False)
+        outside += [
+            client.submit(place, i, key=f"{move.__name__}-{i}-{len(outside)}", pause_s=0.01)
+            for i in range(4)
+        ]
+        move(1)
+    assert client.gather(inside) == [["P"]] * len(inside)
+    assert client.gather(outside).count([]) > len(outside) / 2  # some ran where P was to come
+    settled = client.gather([client.submit(place, i, pure=False) for i in range(50)])
+    assert settled == [[]] * 50
+    pool.dissolve()
+    assert NAME not in client.cluster.scheduler.plugins
 
 
 def test_a_lowered_fence_leaves_nothing(client):
