@@ -183,6 +183,21 @@ def test_many_objects_fit_the_legend(tmp_path):
     pixels(draw_scene(tmp_path / "s.png", Scene.from_meshes(meshes), **SMALL))
 
 
+@pytest.mark.parametrize("name", ["$\\frac{x$", "_hidden", "a\x1b]0;b\x07\nc", "\u202egnp", " "])
+def test_names_from_files_are_words_and_nothing_else(tmp_path, monkeypatch, name):
+    from lidarpool.view.page import Page
+
+    kept = []
+    save = Page.save
+    monkeypatch.setattr(Page, "save", lambda page, path: kept.append(page) or save(page, path))
+    scene = Scene.from_meshes([Mesh(name, *solid(0)), Mesh("plain", *solid(1))])
+    pixels(draw_scene(tmp_path / "s.png", scene, **SMALL))
+    (legend,) = kept[0].figure.legends
+    first, second = (text.get_text() for text in legend.get_texts())
+    assert (len(first), second) == (len(name), "plain")
+    assert first.isprintable()
+
+
 def solid(k):
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=float)
     place = np.array([2 * (k % 8), 2 * (k // 8), 0])

@@ -218,5 +218,7 @@ def _notes(error: BaseException) -> list[str]:
 
 
 def _die(message: str, code: int) -> NoReturn:
+    # Names in it may come from files, and a terminal obeys what cannot be printed.
+    message = "".join(c if c.isprintable() or c == "\n" else "\ufffd" for c in message)
     click.echo(f"lidarpool: {message}", err=True)
     sys.exit(code)

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
+_GIVEN_LETTERS = 160  # of what was given
 _LINES = 2  # messages shown; a reader puts them right one by one anyway
 
 _EXPECTED = {
@@ -175,4 +176,6 @@ def _given(value: Any) -> str:
         return "true" if value else "false"
     short = reprlib.Repr()
     short.maxstring = short.maxother = short.maxlong = 40
-    return short.repr(value)
+    short.maxlevel = 3  # lists of lists of lists, which YAML's aliases make of a few letters
+    text = short.repr(value)
+    return text if len(text) <= _GIVEN_LETTERS else f"{text[:_GIVEN_LETTERS]}…"

@@ -149,11 +149,16 @@ class Page:
     def key(self, handles: list[Line2D], size: float) -> None:
         """Put a legend of handles into the page's right margin; `size` of the font in points."""
         if handles:
-            self.figure.legend(
-                handles=handles, loc="center left", bbox_to_anchor=(0.842, 0.5), frameon=False,
-                labelcolor=self.theme.ink, labelspacing=0.55, handletextpad=0.5, borderpad=0,
-                handlelength=1.4, prop={"family": FONT, "size": size * self.unit},
+            legend = self.figure.legend(
+                handles, ["x"] * len(handles), loc="center left", bbox_to_anchor=(0.842, 0.5),
+                frameon=False, labelcolor=self.theme.ink, labelspacing=0.55, handletextpad=0.5,
+                borderpad=0, handlelength=1.4, prop={"family": FONT, "size": size * self.unit},
             )  # fmt: skip
+            # Names come from files: matplotlib leaves out those that begin with an underscore,
+            # and stumbles over what looks like a formula and is none ("$\\frac{x$").
+            for text, handle in zip(legend.get_texts(), handles, strict=True):
+                text.set_parse_math(False)
+                text.set_text(str(handle.get_label()))
 
     def colour_bar(self, colours: Floats, norm: Normalize, title: str) -> None:
         """Draw a colour bar of colours (n, 3) in the right margin, its title beside it."""
@@ -217,7 +222,8 @@ def cannot_write(target: Path, error: OSError) -> LidarpoolError:
 
 
 def shortened(name: str) -> str:
-    """Cut a long name in its middle, so that it fits the legend."""
+    """Cut a long name in its middle, so that it fits the legend; control characters show."""
+    name = "".join(letter if letter.isprintable() else "\ufffd" for letter in name)
     if len(name) <= LEGEND_LETTERS:
         return name
     keep = LEGEND_LETTERS - 1
