@@ -7,6 +7,13 @@
 // -fmad=false). Nothing depends on the order in which threads run: there are no atomics here,
 // and places are handed out by prefix sums between the kernels. cuda_build.py drives them.
 //
+// Between the blocks of a launch nothing passes: a kernel reads what earlier launches wrote, and
+// no two of its threads write to one place or read what another writes. (merge() and
+// join_children() read and write `boxes`, but nodes of earlier rounds and of this one;
+// place_children() reads a parent's place and writes its children's, of an earlier round.) The
+// stream puts launches in order, so neither fences nor barriers are needed. Nodes are numbered
+// below 2^29 and leaves' codes below 2^31; offsets are 64 bits wide.
+//
 // Compiled by NVRTC, which has no standard headers, so there are none here; the tests compile the
 // same text for the CPU. One thread an item, blocks of 128 threads, a grid of one dimension.
 // Defined on the command line: RADIUS (neighbours looked at on either side), LEAF_SIZE (most

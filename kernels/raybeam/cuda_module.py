@@ -28,7 +28,10 @@ class Kernels:
         self.module = _module(cupy, device, file, flags)
 
     def run(self, kernel: str, threads: int, *arguments: Any) -> None:
-        """Launch a kernel with one thread an item; nothing happens when there are none."""
+        """Launch a kernel with one thread an item; nothing happens when there are none.
+
+        A grid has one dimension, of fewer than 2**31 blocks: room for 2**38 items.
+        """
         if threads:
             grid = (-(-threads // _BLOCK),)
             self.module.get_function(kernel)(grid, (_BLOCK,), arguments)

@@ -5,6 +5,16 @@
 // STACK (a number) is defined on the command line: places for nodes that wait their turn. BLOCKS
 // may be: blocks that must find room on a multiprocessor, which bounds the registers of a thread.
 //
+// Threads know nothing of each other: no shared memory, no barriers, no votes of a warp, so it
+// does not matter which of them run together. All that they share is counted by atomics, in whole
+// numbers, so the order does not matter either. Offsets into tables are 64 bits wide; what an int
+// holds is bounded by layout: fewer than 2^28 triangles, so places shifted by LEAF_BITS fit, and
+// the greatest code of a leaf is not DONE. A chunk of rays is far below 2^31 (cuda_backend.py).
+// Tables of float4 are allocations of their own, which the device aligns to 256 bytes.
+//
+// CuPy adds -ftz=true: what is not normal in float counts as zero. The bands below have room for
+// that (FLOOR of layout.py), and nodes never come near it: a box is as wide as its padding.
+//
 // All lengths are local: coordinates within [-1, 1], see mesh.py. layout.py makes the tables:
 //   nodes      8 float4 (one 128-byte line) a node: low x, y, z of four children, then high x, y,
 //              z, then the children's codes as integer bits, then nothing. A code >= 0 is a
