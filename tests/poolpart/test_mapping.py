@@ -6,6 +6,8 @@ import os
 import signal
 import time
 import uuid
+import weakref
+from typing import ClassVar
 
 import pytest
 from distributed import CancelledError, Client, Event, wait
@@ -71,6 +73,15 @@ def die_at_3(x):
     if x == 3:
         os.kill(os.getpid(), signal.SIGKILL)
     return x
+
+
+class Thing:
+    """Something that knows of all the others."""
+
+    alive: ClassVar = weakref.WeakSet()
+
+    def __init__(self, _):
+        self.alive.add(self)
 
 
 @pytest.fixture
@@ -152,6 +163,15 @@ def test_hundred_thousand_items_are_a_few_tasks_at_a_time(a, client):
         most, total = max(most, task_count(client)), total + result
     assert total == 100_000 * 99_999
     assert most <= 4 * a.slots
+
+
+def test_results_that_were_taken_are_dropped_everywhere(a):
+    # Driver, scheduler and workers are one process here: these are all there are.
+    most = 0
+    for result in a.map(Thing, range(2000), window=4, chunk=5):
+        most = max(most, len(Thing.alive))
+        assert isinstance(result, Thing)
+    assert 0 < most <= 200
 
 
 def test_the_first_tasks_start_at_once(a, client, wait_until):
