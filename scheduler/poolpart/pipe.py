@@ -36,7 +36,8 @@ class Pipe:
 
     One `distributed.Queue` carries the items and one `distributed.Variable` the state, both
     under the pipe's name. Whoever makes the pipe calls `create`, hands it (it is small when
-    pickled) to the tasks on both ends, and calls `delete` in the end. Any number of
+    pickled) to the tasks on both ends, and calls `delete` in the end; it is deleted as well
+    when the client that made it closes or dies. Any number of
     producers and consumers may share it, in any process and thread; threads may share the
     object itself.
 

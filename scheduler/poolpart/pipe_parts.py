@@ -14,6 +14,7 @@ from typing import Any
 
 from distributed import Client, Queue
 
+from .pipe_owners import drop_owners, note_owner
 from .remote import on_scheduler
 
 _LATE_WORD_S = 2.0  # clients send such words every few milliseconds
@@ -42,7 +43,8 @@ class AttachedQueue(Queue):
 
 def open_pipe(client: Client, name: str) -> bool:
     """Make both parts; False if there is a pipe of that name."""
-    return bool(on_scheduler(client, _open, name=name, state=asdict(PipeState())))
+    state = asdict(PipeState())
+    return bool(on_scheduler(client, _open, name=name, owner=client.id, state=state))
 
 
 def change_pipe(client: Client, name: str, **changes: Any) -> PipeState | None:
@@ -56,13 +58,14 @@ def forget_pipes(client: Client, names: Sequence[str]) -> None:
     on_scheduler(client, _forget, names=list(names))
 
 
-async def _open(name: str, state: dict[str, Any], dask_scheduler: Any = None) -> bool:
+async def _open(name: str, owner: str, state: dict[str, Any], dask_scheduler: Any = None) -> bool:
     queues = dask_scheduler.extensions["queues"]
     variables = dask_scheduler.extensions["variables"]
     if name in queues.queues or name in variables.variables:
         return False
     # Without `maxsize`: see `Pipe.put`.
     queues.create(name=name)
+    note_owner(dask_scheduler, name, owner, _forget)
     await variables.set(name=name, data=state)
     return True
 
@@ -84,6 +87,7 @@ async def _change(
 async def _forget(names: list[str], dask_scheduler: Any = None) -> None:
     queues = dask_scheduler.extensions["queues"]
     variables = dask_scheduler.extensions["variables"]
+    drop_owners(dask_scheduler, names)
     for name in names:
         while name in queues.queues:
             queues.release(name=name, client="poolpart")

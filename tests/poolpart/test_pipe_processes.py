@@ -131,3 +131,41 @@ def test_a_pipe_whose_scheduler_has_died_raises():
     finally:
         scheduler.kill()
         scheduler.communicate()
+
+
+MAKER = """
+import sys, time
+from distributed import Client
+from poolpart import Partition, Pipe
+client = Client(sys.argv[1])
+pipe = Pipe("of-a-process", 3, client).create()
+print("made", flush=True)
+time.sleep(60)
+"""
+
+
+def test_a_pipe_ends_with_the_process_that_made_it(processes, make_pipe):
+    """Tasks that wait at its ends would keep their slots for ever."""
+
+    def plugins(dask_scheduler):
+        return sorted(name for name in dask_scheduler.plugins if name.startswith("poolpart"))
+
+    before = processes.run_on_scheduler(plugins)
+    maker = subprocess.Popen(
+        [sys.executable, "-c", MAKER, processes.scheduler.address], stdout=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )  # fmt: skip
+    assert maker.stdout.readline() == b"made\n"
+    other = make_pipe(processes)
+    consumer = Partition("OTHER", processes).submit(consume, Pipe("of-a-process", 3))
+    time.sleep(0.2)
+    assert consumer.status == "pending"
+    maker.kill()
+    maker.wait(10)
+    maker.stdout.close()
+    with pytest.raises(PipeFailed, match="does not exist"):
+        consumer.result(LONG_S)
+    other.put("another's pipe is untouched")
+    assert other.get() == "another's pipe is untouched"
+    other.delete()
+    assert processes.run_on_scheduler(plugins) == before
