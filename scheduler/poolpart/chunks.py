@@ -15,6 +15,7 @@ from distributed.core import clean_exception, error_message
 
 NOTE = "poolpart: "  # how the notes that name a failed item start
 MOST_ITEMS = 1024
+GROWTH = 4  # from one size that was tried to the next
 MOST_BYTES = 2**20
 
 Call = tuple[Any, ...]  # the arguments of one call
@@ -130,8 +131,8 @@ def _shown(call: Call) -> str:
 class ChunkSize:
     """How many items make a task of about `target_s` seconds, learned from those that ran.
 
-    It starts with one, at most doubles what was tried, and keeps a task's items and results
-    to about a mebibyte.
+    It starts with one, takes at most four times what was tried, and keeps a task's items and
+    results to about a mebibyte.
 
     Examples
     --------
@@ -141,9 +142,9 @@ class ChunkSize:
     >>> for _ in range(3):  # each item takes 10 ms
     ...     size.learn(items=size.items(0.1), seconds=0.01 * size.items(0.1), nbytes=100)
     ...     print(size.items(target_s=0.1))
-    2
     4
-    8
+    10
+    10
     """
 
     def __init__(self) -> None:
@@ -161,4 +162,4 @@ class ChunkSize:
         """Items to put into the next chunk."""
         by_time = target_s / max(self._item_s, 1e-9)
         by_bytes = MOST_BYTES / max(self._item_bytes, 1.0)
-        return int(max(1, min(2 * self._tried, by_time, by_bytes, MOST_ITEMS)))
+        return int(max(1, min(GROWTH * self._tried, by_time, by_bytes, MOST_ITEMS)))

@@ -7,7 +7,7 @@ from distributed import Reschedule
 from hypothesis import given
 from hypothesis import strategies as st
 
-from poolpart.chunks import MOST_BYTES, MOST_ITEMS, Chunk, ChunkSize, run_chunk
+from poolpart.chunks import GROWTH, MOST_BYTES, MOST_ITEMS, Chunk, ChunkSize, run_chunk
 
 
 def invert(x):
@@ -88,9 +88,9 @@ def test_chunks_get_small_again_when_items_take_longer():
 
 
 @given(st.lists(st.tuples(st.integers(1, 1000), st.floats(0, 1e3), st.integers(0, 2**40))))
-def test_a_chunk_has_an_item_and_at_most_twice_what_was_tried(chunks):
+def test_a_chunk_has_an_item_and_at_most_four_times_what_was_tried(chunks):
     size = ChunkSize()
     for items, seconds, nbytes in chunks:
         size.learn(items, seconds, nbytes)
     tried = max((items for items, _, _ in chunks), default=0)
-    assert 1 <= size.items(0.1) <= max(1, min(2 * tried, MOST_ITEMS))
+    assert 1 <= size.items(0.1) <= max(1, min(GROWTH * tried, MOST_ITEMS))
