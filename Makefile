@@ -41,13 +41,14 @@ format:  ## rewrite the sources in the project's format
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-bench:  ## benchmarks: pipeline, planning, ray casting (more: python -m benchmarks.raycast --large)
+bench:  ## benchmarks: pipeline, planning, ray casting; figures of the last in build/ as JSON
 	@VENV=$(VENV) sh .ci/setup dev
 	$(BIN)/python -m benchmarks.pipeline
 	$(BIN)/python -m benchmarks.scale
 	$(BIN)/python -m benchmarks.planning
-	$(BIN)/python -m benchmarks.raycast
-	$(BIN)/python -m benchmarks.trees
+	@mkdir -p build
+	$(BIN)/python -m benchmarks.raycast --json build/raycast.json
+	$(BIN)/python -m benchmarks.trees --json build/trees.json
 
 clean:  ## remove the virtual environment and caches
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
