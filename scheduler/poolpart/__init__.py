@@ -8,7 +8,12 @@ from .fetch import fetch_available
 from .ledger import Ledger
 from .local import local_cluster
 from .mapping import Results
-from .page import partitions_page, remove_partitions_page, tell_page
+from .page import (
+    has_partitions_page,
+    partitions_page,
+    remove_partitions_page,
+    tell_page,
+)
 from .partition import Partition
 from .pipe import Pipe
 from .pipe_parts import forget_pipes
@@ -44,6 +49,7 @@ __all__ = [
     "assign_devices",
     "fetch_available",
     "forget_pipes",
+    "has_partitions_page",
     "local_cluster",
     "look_at_slots",
     "look_for_tasks",

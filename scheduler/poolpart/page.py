@@ -7,7 +7,7 @@ from typing import Any
 from distributed import Client
 
 from .errors import PoolError
-from .page_server import PATH, close_page, open_page
+from .page_server import PATH, close_page, is_open, open_page
 from .remote import on_scheduler
 from .stats_plugin import TOTALS_TOPIC
 
@@ -39,6 +39,11 @@ def partitions_page(client: Client) -> str:
     return link.removesuffix("/").removesuffix("/status") + f"/{PATH}"
 
 
+def has_partitions_page(client: Client) -> bool:
+    """Whether somebody has added the page."""
+    return bool(on_scheduler(client, _is_open))
+
+
 def remove_partitions_page(client: Client) -> None:
     """Take the page away; a browser that has it open shows that it is gone."""
     on_scheduler(client, _close)
@@ -51,6 +56,10 @@ def tell_page(client: Client, **totals: Any) -> None:
 
 async def _open(dask_scheduler: Any = None) -> None:
     open_page(dask_scheduler)
+
+
+async def _is_open(dask_scheduler: Any = None) -> bool:
+    return is_open(dask_scheduler)
 
 
 async def _close(dask_scheduler: Any = None) -> None:

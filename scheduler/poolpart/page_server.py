@@ -130,15 +130,20 @@ class PageApplication(web.Application):
 
 def open_page(scheduler: Any) -> None:
     """Serve the page from the scheduler's own HTTP server."""
-    application = scheduler.http_application
-    if not any(isinstance(other, PageApplication) for other in application.applications):
+    if not is_open(scheduler):
         # A `dask scheduler --dashboard-prefix` is part of the path.
         handlers = [
             (r"(?:/.*)?/" + PATH, PageHandler, {"scheduler": scheduler}),
             (r"(?:/.*)?/" + PATH + r"/data", DataHandler, {"scheduler": scheduler}),
         ]
-        application.add_application(PageApplication(handlers))
+        scheduler.http_application.add_application(PageApplication(handlers))
     statistics_of(scheduler)
+
+
+def is_open(scheduler: Any) -> bool:
+    """Whether the page is served."""
+    applications = scheduler.http_application.applications
+    return any(isinstance(other, PageApplication) for other in applications)
 
 
 def close_page(scheduler: Any) -> None:

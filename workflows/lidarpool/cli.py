@@ -34,6 +34,7 @@ _out = click.option(
 )
 _quiet = click.option("--quiet", "-q", is_flag=True, help="No progress, only the result.")
 
+_page = click.option("--page", is_flag=True, help="Serve a live page, and say where.")
 _tls = click.option("--tls", is_flag=True, help="Encrypt the traffic of the local cluster.")
 
 
@@ -75,8 +76,9 @@ cli.add_command(scene)
 @cli.command()
 @_out
 @_tls
+@_page
 @_quiet
-def demo(out: Path, tls: bool, quiet: bool) -> None:
+def demo(out: Path, tls: bool, page: bool, quiet: bool) -> None:
     """Run the default survey and path planning on a cluster on this machine.
 
     \b
@@ -84,7 +86,7 @@ def demo(out: Path, tls: bool, quiet: bool) -> None:
       lidarpool demo
       lidarpool demo --out /tmp/demo
     """  # noqa: D301 - click wants the character, not its name
-    run_scenario(Scenario(), RunOptions(out, tls=tls, journal=False, quiet=quiet))
+    run_scenario(Scenario(), RunOptions(out, tls=tls, journal=False, quiet=quiet, page=page))
 
 
 @cli.command()
@@ -101,6 +103,7 @@ def demo(out: Path, tls: bool, quiet: bool) -> None:
 @click.option("--no-plan", is_flag=True, help="Leave the path planning out.")
 @click.option("--resume", is_flag=True, help="Go on with an unfinished run, if there is one.")
 @click.option("--fresh", is_flag=True, help="Drop an unfinished run.")
+@_page
 @_quiet
 def run(
     scenario: Path,
@@ -110,6 +113,7 @@ def run(
     no_plan: bool,
     resume: bool,
     fresh: bool,
+    page: bool,
     quiet: bool,
     tls: bool,
     tls_ca: Path | None,
@@ -132,7 +136,16 @@ def run(
     if resume and fresh:
         raise click.UsageError("--resume goes on with what --fresh drops: give one of them.")
     options = RunOptions(
-        out, scheduler, files, tls, backend, no_plan, resume=resume, fresh=fresh, quiet=quiet
+        out,
+        scheduler,
+        files,
+        tls,
+        backend,
+        no_plan,
+        resume=resume,
+        fresh=fresh,
+        quiet=quiet,
+        page=page,
     )
     run_scenario(Scenario.load(scenario), options)
 

@@ -17,6 +17,7 @@ from .deliveries import Deliveries
 from .job import Job
 from .journal import COMMAND_TERMS, open_journal
 from .journal_folder import remove_journal
+from .live_page import shown_on_page
 from .quiet import QuietWorkers
 from .result import Result
 from .run import Run, make_result
@@ -44,6 +45,7 @@ class RunOptions:
     resume: bool = False
     fresh: bool = False
     quiet: bool = False
+    page: bool = False
 
 
 def run_scenario(scenario: Scenario, options: RunOptions) -> None:
@@ -112,8 +114,12 @@ def _conduct(scenario: Scenario, kept: Deliveries, options: RunOptions) -> Resul
         cluster = _local_client(scenario, options.quiet, options.tls)
     else:
         cluster = connected(options.scheduler, options.files)
-    with cluster as client, shown_progress(options.quiet) as show:
-        return Run(client, kept).drive(None, show)
+    with (
+        cluster as client,
+        shown_progress(options.quiet) as show,
+        shown_on_page(client, options.page, show) as show_both,
+    ):
+        return Run(client, kept).drive(None, show_both)
 
 
 @contextmanager
