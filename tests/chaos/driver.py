@@ -68,6 +68,7 @@ class Driver:
         answer: Delivered = self._answers.recv()
         self._answers.close()
         self.process.join(30)
+        self.process.close()
         return answer
 
 

@@ -16,7 +16,7 @@ import resource
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,7 +44,7 @@ SIGNALS = {
 }
 
 HOLD_S = 5.0  # longest time that a point is held for somebody else to carry a fault out
-_EVENTS, _ARMED, _FIRED, _HURRY = "events", "armed", "fired", "hurry"
+_EVENTS, _ARMED, _FIRED = "events", "armed", "fired"
 
 
 @dataclass(frozen=True)
@@ -101,21 +101,6 @@ class Board:
         for name in (_EVENTS, _ARMED, _FIRED):
             (folder / name).mkdir(parents=True, exist_ok=True)
 
-    @contextmanager
-    def hurry(self) -> Iterator[None]:
-        """Have nobody pause at points meanwhile."""
-        flag = self.folder / _HURRY
-        flag.touch()
-        try:
-            yield
-        finally:
-            flag.unlink()
-
-    @property
-    def is_in_a_hurry(self) -> bool:
-        """Whether nobody is to pause."""
-        return (self.folder / _HURRY).exists()
-
     def arm(self, order: Order) -> None:
         """Have the next process that comes to the point carry it out."""
         (self.folder / _ARMED / order.file_name).touch()
@@ -168,6 +153,11 @@ class Board:
         events = [json.loads(line) for line in lines if run is None or run in line]
         return [event for event in events if run is None or event.get("run") == run]
 
+    @property
+    def has_events(self) -> bool:
+        """Whether anything was logged."""
+        return any((self.folder / _EVENTS).iterdir())
+
     def forget_events(self) -> None:
         """Start over with an empty log."""
         for path in (self.folder / _EVENTS).iterdir():
@@ -212,7 +202,7 @@ class Sink:
                 **fields,
             }
         )
-        if (pause := self.pauses.get(point)) and not self.board.is_in_a_hurry:
+        if pause := self.pauses.get(point):
             time.sleep(pause * len(scans))
         if fired := self.board.claim(point, max(scans, default=0), self.worker):
             self.strike(fired)

@@ -131,9 +131,9 @@ class Nemesis:
         Where.
     faults
         What is to happen. Faults at points are armed at once; those at random times follow
-        one another, from when the driver passes its first point.
+        one another, from when anybody passes a point.
     drives
-        Whether this process is the driver's. Otherwise faults come from the beginning on.
+        Whether the driver is in this process, and passes its points here.
     """
 
     def __init__(self, arena: Arena, faults: Sequence[Fault], drives: bool = True) -> None:
@@ -174,10 +174,10 @@ class Nemesis:
     # -- in the nemesis' own thread ----------------------------------------------------
 
     def _watch(self) -> None:
-        due = float("inf") if self._drives else time.monotonic()
+        due = float("inf")
         timed = [fault for fault in self.faults.values() if fault.point == RANDOM]
         while not self._over.is_set():
-            if self.run and due == float("inf"):  # it has begun
+            if due == float("inf") and self.arena.board.has_events:  # it has begun
                 due = time.monotonic()
             if timed and time.monotonic() >= due + timed[0].after_s:
                 due = time.monotonic()

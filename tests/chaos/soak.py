@@ -26,7 +26,7 @@ from .checker import Verdict, judge
 from .driver import Delivered, Driver
 from .events import KILL, SEGV, TERM
 from .nemesis import PARTITIONS, RANDOM, Fault, Nemesis
-from .survey import STEPS, reference, survey
+from .survey import STEPS, Reference, reference, survey
 from .traces import Footprint, differences, own_temporary_folder, scheduler_state
 
 PACE_S = 0.02  # a scan
@@ -87,20 +87,23 @@ class Soaked:
 
 def soak(scans: int, seed: int, pace_s: float = PACE_S) -> Soaked:
     """Survey at least so many scans while workers are killed all the time."""
+    what = survey(-(-scans // STEPS))
     with own_temporary_folder() as temporary:
+        with Arena() as arena:  # of its own, so that all is imported when it begins
+            expected = reference(arena, what, None)
         before = Footprint.now(temporary)
-        soaked = _soak(survey(-(-scans // STEPS)), seed, pace_s)
+        soaked = _soak(what, expected, seed, pace_s)
         return replace(soaked, left_behind=before.left_in(Footprint.now(temporary)))
 
 
-def _soak(what: Survey, seed: int, pace_s: float) -> Soaked:
+def _soak(what: Survey, expected: Reference, seed: int, pace_s: float) -> Soaked:
     samples: list[Sample] = []
     with Arena(pauses={"generate.put": pace_s}) as arena:
         known = scheduler_state(arena.client)
-        with arena.board.hurry():
-            expected = reference(arena, what, None)
         with Nemesis(arena, _faults(random.Random(seed)), drives=False) as nemesis:
             driver = Driver(arena.client.scheduler.address, what, None, arena.board.folder)
+            while not driver.is_done and not arena.board.has_events:
+                time.sleep(0.01)
             started = time.monotonic()
             while not driver.is_done:
                 samples.append(Sample.now(time.monotonic() - started, driver.process.pid))

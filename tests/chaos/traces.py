@@ -5,9 +5,11 @@ from __future__ import annotations
 import gc
 import os
 import tempfile
+from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +76,7 @@ def differences(before: dict[str, Any], after: dict[str, Any]) -> list[str]:
 class Footprint:
     """What this process holds of the machine."""
 
-    descriptors: int
+    descriptors: Counter[str]  # what they lead to
     processes: frozenset[str]
     files: frozenset[str]
 
@@ -82,10 +84,10 @@ class Footprint:
     def now(cls, folder: Path) -> Footprint:
         """Look; `folder` is the one for temporary files."""
         gc.collect()
+        resource_tracker.ensure_running()  # it stays as long as this process
         children = psutil.Process().children(recursive=True)
         return cls(
-            descriptors=psutil.Process().num_fds(),
-            # The helper of multiprocessing stays as long as this process.
+            descriptors=Counter(_targets()),
             processes=frozenset(
                 f"{child.pid} {' '.join(child.cmdline())}"
                 for child in children
@@ -103,9 +105,19 @@ class Footprint:
         """Say what there is later that there was not at first."""
         left = [f"process {process}" for process in sorted(after.processes - self.processes)]
         left += [f"file {file}" for file in sorted(after.files - self.files)]
-        if (more := after.descriptors - self.descriptors) > 0:
-            left.append(f"{more} file descriptors")
+        left += [
+            f"{count} descriptors of {target}"
+            for target, count in sorted((after.descriptors - self.descriptors).items())
+        ]
         return left
+
+
+def _targets() -> Iterator[str]:
+    """What the descriptors of this process lead to; sockets and pipes without their numbers."""
+    for path in Path("/proc/self/fd").iterdir():
+        with suppress(OSError):  # the one that lists them is gone again
+            target = str(path.readlink())
+            yield target.partition(":[")[0]
 
 
 @contextmanager

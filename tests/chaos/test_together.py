@@ -1,0 +1,69 @@
+"""Several who share a cluster and do not see each other."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+from distributed import Client, Queue
+from tests.chaos.arena import Arena
+from tests.chaos.driver import Driver
+from tests.chaos.survey import reference, survey
+from tests.chaos.traces import differences, scheduler_state
+
+FIRST, SECOND = survey(1, layers=4), survey(1, layers=6)
+
+
+class Foreigner(threading.Thread):
+    """Somebody who knows nothing of partitions: own client, own tasks, own queue."""
+
+    def __init__(self, address: str) -> None:
+        super().__init__(name="foreigner")
+        self.address = address
+        self.over = threading.Event()
+        self.results: list[int] = []
+        self.taken: list[int] = []
+
+    def run(self) -> None:
+        with Client(self.address) as client:
+            queue = Queue("foreign", client=client)
+            while not self.over.is_set():
+                count = len(self.results)
+                queue.put(count)
+                future = client.submit(pow, count, 2, pure=False)
+                self.results.append(future.result(timeout=60))
+                self.taken.append(queue.get(timeout=60))
+            queue.close()
+
+
+@pytest.mark.slow
+def test_two_surveys_and_a_foreign_user_do_not_see_each_other():
+    with Arena(lidar=2, slots=5) as arena:
+        alone = [reference(arena, what) for what in (FIRST, SECOND)]
+        before = scheduler_state(arena.client)
+        foreigner = Foreigner(arena.client.scheduler.address)
+        foreigner.start()
+        drivers = [
+            Driver(arena.client.scheduler.address, what, None, arena.board.folder)
+            for what in (FIRST, SECOND)
+        ]
+        delivered = [driver.delivered() for driver in drivers]
+        foreigner.over.set()
+        foreigner.join(60)
+        assert not foreigner.is_alive()
+        spans = [
+            (min(times), max(times))
+            for one in delivered
+            for times in [[event["t"] for event in arena.board.events(one.run)]]
+        ]
+        after = scheduler_state(arena.client)
+    for one, other in zip(delivered, alone, strict=True):
+        assert one.error == ""
+        assert one.reference == other
+        assert (one.misplaced, one.replayed, one.dropped) == (0, 0, 0)
+    # They did run at a time.
+    assert max(start for start, _ in spans) < min(end for _, end in spans)
+    assert len(foreigner.results) > 10
+    assert foreigner.results == [count**2 for count in range(len(foreigner.results))]
+    assert foreigner.taken == list(range(len(foreigner.taken)))
+    assert differences(before, after) == []
