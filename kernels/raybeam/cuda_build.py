@@ -130,16 +130,16 @@ def _crown(
     cp: Any, kernels: Kernels, boxes: Any, children: Any, ids: Any, made: int
 ) -> list[tuple[int, int]]:
     """Nodes above the last clusters, chosen on the host; returns their rounds."""
-    # low x, y, z, cost, high x, y, z, and the number of triangles above the leaf's bit
-    rows = cp.asnumpy(boxes[ids])
-    low, high = (np.ascontiguousarray(rows[:, k : k + 3].T) for k in (0, 4))
-    count = np.ascontiguousarray(rows[:, 7]).view(np.int32) >> 1
-    pairs, rounds = ploc.crown(low, high, count, cp.asnumpy(ids), made)
-    n = np.int32(len(children))
+    # low x, y, z, cost, high x, y, z, and the number of triangles above the leaf's bit: taken as
+    # bits, for as float32 such numbers are not normal and might be lost on the way
+    bits = cp.asnumpy(boxes.view(np.int32)[ids])
+    low, high = (np.ascontiguousarray(bits[:, k : k + 3].T).view(np.float32) for k in (0, 4))
+    pairs, rounds = ploc.crown(low, high, bits[:, 7] >> 1, cp.asnumpy(ids), made)
+    n = len(children)
     if len(pairs):
         children[made - n : made - n + len(pairs)].set(pairs)
     for start, stop in rounds:
-        nodes = (np.int32(start), np.int32(stop - start), n)
+        nodes = (np.int32(start), np.int32(stop - start), np.int32(n))
         kernels.run("join_children", stop - start, children, *nodes, boxes)
     return rounds
 
