@@ -9,8 +9,6 @@ from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-from poolpart import TaskRecord, placement_violations
-
 from ._version import __version__
 from .cloud import counts_by_object
 from .plan import Planning
@@ -18,6 +16,7 @@ from .result import Result
 from .scan import COLLECT, GENERATE, INTERSECT, SORT
 from .scene import Scene
 from .survey import Survey
+from .task_book import StageTotals, union
 from .trials import TRIAL
 
 _ORDER = (GENERATE, INTERSECT, SORT, COLLECT, TRIAL)  # in which stages are listed
@@ -57,7 +56,6 @@ def make_report(
 
     Lengths are in metres, times in seconds; what is infinite or unknown is None.
     """
-    violations = placement_violations(result.records)
     return {
         "versions": versions(),
         "machine": {"system": platform.platform(), "processor": platform.machine()},
@@ -73,12 +71,14 @@ def make_report(
             "total": round(result.seconds, 3),
             "survey": round(result.survey_seconds, 3),
             "planning": round(result.planning_seconds, 3),
-            "survey_and_planning_overlap": round(overlap_seconds(result.records), 3),
+            "survey_and_planning_overlap": round(overlap_seconds(result.stages), 3),
         },
-        "stages": _stages(result.records),
-        "tasks": _tasks(result.records),
-        "placement_violations": len(violations),
-        "misplaced_tasks": [asdict(record) for record in violations[:20]],
+        "stages": _stages(result.stages),
+        "tasks": _tasks(result.stages),
+        "placement_violations": sum(stage.violations for stage in result.stages),
+        "misplaced_tasks": [
+            asdict(record) for stage in result.stages for record in stage.misplaced
+        ][:20],
         "replayed": result.replayed,
         "duplicates_dropped": result.duplicates_dropped,
         "resumed_scans": result.resumed,
@@ -108,52 +108,35 @@ def _points_by_object(result: Result, scene: Scene) -> dict[str, int]:
     return {name: int(count) for name, count in zip(scene.names, counts, strict=True)}
 
 
-def _stages(records: Iterable[TaskRecord]) -> dict[str, dict[str, Any]]:
+def _stages(totals: Iterable[StageTotals]) -> dict[str, dict[str, Any]]:
     """For each stage: tasks, items, seconds of work, and the span from first start to last stop."""
-    stages: dict[str, list[TaskRecord]] = {stage: [] for stage in _ORDER}
-    for record in records:
-        stages.setdefault(record.stage, []).append(record)
     return {
-        stage: {
-            "partition": group[0].partition,
-            "tasks": len(group),
-            "items": sum(record.items for record in group),
-            "task_seconds": round(sum(record.seconds for record in group), 4),
-            "span_seconds": round(max(r.stop for r in group) - min(r.start for r in group), 4),
-            "workers": sorted({record.worker for record in group}),
+        stage.stage: {
+            "partition": stage.partition,
+            "tasks": stage.tasks,
+            "items": stage.items,
+            "task_seconds": round(stage.seconds, 4),
+            "span_seconds": round(stage.stop - stage.start, 4),
+            "workers": sorted(stage.workers),
         }
-        for stage, group in stages.items()
-        if group
+        for stage in sorted(totals, key=lambda totals: _ORDER.index(totals.stage))
     }
 
 
-def _tasks(records: Iterable[TaskRecord]) -> dict[str, dict[str, int]]:
+def _tasks(totals: Iterable[StageTotals]) -> dict[str, dict[str, int]]:
     """Tasks by the partition that they really ran on, and by stage."""
     tasks: dict[str, dict[str, int]] = {}
-    for record in records:
-        for name in record.resources or ("none",):
-            stages = tasks.setdefault(name, {})
-            stages[record.stage] = stages.get(record.stage, 0) + 1
+    for stage in totals:
+        for name, count in stage.resources.items():
+            tasks.setdefault(name, {})[stage.stage] = count
     return tasks
 
 
-def overlap_seconds(records: Sequence[TaskRecord]) -> float:
+def overlap_seconds(totals: Iterable[StageTotals]) -> float:
     """Time during which stage 2 and planning trials were both under way."""
-    spans = [
-        [(r.start, r.stop) for r in records if r.stage == stage] for stage in (INTERSECT, TRIAL)
-    ]
-    casting, planning = ([*_union(span)] for span in spans)
+    busy = {stage.stage: union(stage.busy) for stage in totals}
+    casting, planning = (busy.get(stage, []) for stage in (INTERSECT, TRIAL))
     return sum(max(0.0, min(a[1], b[1]) - max(a[0], b[0])) for a in casting for b in planning)
-
-
-def _union(spans: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    merged: list[tuple[float, float]] = []
-    for start, stop in sorted(spans):
-        if merged and start <= merged[-1][1]:
-            merged[-1] = (merged[-1][0], max(stop, merged[-1][1]))
-        else:
-            merged.append((start, stop))
-    return merged
 
 
 def _planning(result: Result, planning: Planning | None) -> dict[str, Any] | None:

@@ -13,6 +13,7 @@ from poolpart import TaskRecord
 from .cloud import Cloud
 from .plan import Plan, Trial
 from .scan import StoredCloud
+from .task_book import StageTotals
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +36,9 @@ class Result:
     rays, hits
         Rays fired, and those that hit something.
     records
-        Each task of the run: where it ran and when.
+        Tasks of the run: where each ran and when; of a stage with thousands, every so many.
+    stages
+        All tasks of each stage together.
     seconds, survey_seconds, planning_seconds
         Wall time of all, of the survey and of the planning.
     replayed, duplicates_dropped
@@ -56,6 +59,7 @@ class Result:
     rays: int
     hits: int
     records: tuple[TaskRecord, ...]
+    stages: tuple[StageTotals, ...]
     seconds: float
     survey_seconds: float
     planning_seconds: float

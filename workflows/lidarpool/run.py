@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from typing import TypeVar
 
@@ -17,7 +17,6 @@ from poolpart import (
     PipeClosed,
     PipeFailed,
     PoolError,
-    TaskRecord,
     assign_devices,
 )
 
@@ -28,6 +27,7 @@ from .plan import best
 from .progress import Progress
 from .result import Result
 from .scan import GPU, LIDAR, OTHER, Frame, SurveyPump, SurveySetup
+from .task_book import TaskBook
 from .trials import TrialPump
 from .watch import Watch
 
@@ -112,7 +112,7 @@ class Run:
         self.kept.save()
         return make_result(
             self.kept,
-            records=survey.records + (trials.records if trials else []),
+            books=[survey.book, *([trials.book] if trials else [])],
             seconds=time.monotonic() - started,
             survey_seconds=times[SurveyPump],
             planning_seconds=times.get(TrialPump, 0.0),
@@ -138,6 +138,7 @@ class Run:
             self.job.collectors,
             self.kept.cloud,
             self.kept.totals.frames,
+            scans_per_second=self.job.scans_per_second,
         )
 
     def _call(self, callback: Callable[[T], None], argument: T) -> None:
@@ -198,7 +199,7 @@ class Run:
 
 def make_result(
     kept: Deliveries,
-    records: Iterable[TaskRecord] = (),
+    books: Sequence[TaskBook] = (),
     seconds: float = 0.0,
     survey_seconds: float = 0.0,
     planning_seconds: float = 0.0,
@@ -218,7 +219,8 @@ def make_result(
         backend=kept.backend,
         rays=job.survey.ray_count,
         hits=kept.totals.hits,
-        records=tuple(records),
+        records=tuple(record for book in books for record in book.records),
+        stages=tuple(totals for book in books for totals in book.stages.values()),
         seconds=seconds,
         survey_seconds=survey_seconds,
         planning_seconds=planning_seconds,

@@ -33,6 +33,7 @@ def simulate(
     on_progress: Callable[[Progress], None] | None = None,
     queue_capacity: int = 10,
     collectors: int = 2,
+    scans_per_second: float | None = None,
     gpu_workers: int | None = None,
     other_workers: int | None = None,
     tls: bool = False,
@@ -61,6 +62,9 @@ def simulate(
         Items that stage 1 may be ahead of stage 2.
     collectors
         Tasks of stage 4.
+    scans_per_second
+        How fast scans are made, as by a sensor that takes its time; by default as fast as
+        they are cast.
     gpu_workers, other_workers
         Workers of a local cluster; by default what suits the machine.
     tls
@@ -95,7 +99,7 @@ def simulate(
     ...     result = simulate(Scene.seed(), Survey(poses=[(0, 0, 1)]))
     ...     print(len(result.cloud), "points")
     """
-    job = Job(scene, survey, planning, backend, queue_capacity, collectors)
+    job = Job(scene, survey, planning, backend, queue_capacity, collectors, scans_per_second)
     check_counts(gpu_workers=gpu_workers, other_workers=other_workers)
     if client is None:
         check_backend_here(backend)

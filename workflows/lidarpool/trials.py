@@ -8,10 +8,11 @@ from collections.abc import Sequence
 
 from distributed import Client, Future
 
-from poolpart import Partition, TaskRecord, recorded
+from poolpart import Partition, recorded
 
 from .errors import LidarpoolError
 from .plan import Plan, Planning, Trial, best, run_trial
+from .task_book import TaskBook
 
 TRIAL = "trial"
 
@@ -40,7 +41,7 @@ class TrialPump:
     ) -> None:
         self.client, self.partition, self.planning = client, partition, planning
         self.trials: list[Trial] = list(done)
-        self.records: list[TaskRecord] = []
+        self.book = TaskBook()
         self._run_id = uuid.uuid4().hex[:8]
         known = {trial.trial for trial in done}
         self._waiting = deque(n for n in range(planning.trials) if n not in known)  # numbers
@@ -73,7 +74,7 @@ class TrialPump:
                 )
             trial, record = future.result(timeout=30)
             self.trials.append(trial)
-            self.records.append(record)
+            self.book.add(record)
         room = min(self._most - len(self._running), len(self._waiting))
         for _ in range(room):
             number = self._waiting.popleft()

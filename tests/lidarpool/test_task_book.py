@@ -1,0 +1,83 @@
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+
+from lidarpool.task_book import (
+    MISPLACED_MOST,
+    RECORDS_MOST,
+    SPANS_MOST,
+    StageTotals,
+    TaskBook,
+    union,
+)
+from poolpart import TaskRecord
+
+
+def record(number: int, resources: tuple[str, ...] = ("GPU",), every: float = 1.0) -> TaskRecord:
+    start = every * number
+    return TaskRecord("intersect", "GPU", f"w{number % 3}", resources, start, start + 0.5, 2)
+
+
+def test_totals_are_exact_however_many_tasks_there_are():
+    book, count = TaskBook(), 5 * RECORDS_MOST
+    assert all(book.add(record(number)) for number in range(count))
+    totals = book.stages["intersect"]
+    assert (totals.tasks, totals.items) == (count, 2 * count)
+    assert totals.seconds == pytest.approx(0.5 * count)
+    assert (totals.start, totals.stop) == (0, count - 0.5)
+    assert totals.workers == {"w0", "w1", "w2"}
+    assert totals.resources == {"GPU": count}
+    assert totals.violations == 0
+
+
+def test_the_timeline_is_thinned_evenly():
+    totals = StageTotals("intersect", "GPU")
+    for number in range(5 * RECORDS_MOST):
+        totals.add(record(number))
+    kept = [r.start for r in totals.records]
+    assert RECORDS_MOST / 2 <= len(kept) <= RECORDS_MOST
+    steps = {b - a for a, b in pairwise(kept)}
+    assert len(steps) == 1 and kept[0] == 0
+
+
+def test_few_records_are_all_kept():
+    book = TaskBook()
+    for number in range(100):
+        book.add(record(number))
+    assert book.records == [record(number) for number in range(100)]
+
+
+def test_a_record_that_comes_again_counts_once():
+    book = TaskBook()
+    assert book.add(record(1))
+    assert not book.add(record(1))
+    assert book.stages["intersect"].tasks == 1
+
+
+def test_tasks_elsewhere_are_counted_and_the_first_are_kept():
+    totals = StageTotals("intersect", "GPU")
+    for number in range(3 * MISPLACED_MOST):
+        totals.add(record(number, ("OTHER",) if number % 2 else ()))
+    assert totals.violations == 3 * MISPLACED_MOST
+    assert totals.misplaced == [
+        record(n, ("OTHER",) if n % 2 else ()) for n in range(MISPLACED_MOST)
+    ]
+    assert totals.resources == {"OTHER": 30, "none": 30}
+
+
+def test_busy_times_are_bounded_and_hardly_wrong():
+    totals = StageTotals("intersect", "GPU")
+    for number in range(4 * SPANS_MOST):
+        totals.add(record(number, every=0.5 + 1e-5))  # pauses of 10 microseconds
+    assert len(totals.busy) <= SPANS_MOST
+    spans = union(totals.busy)
+    assert sum(stop - start for start, stop in spans) == pytest.approx(totals.seconds, rel=1e-3)
+
+
+def test_union_merges_what_overlaps_or_lies_near():
+    spans = [(3.0, 4.0), (0.0, 1.0), (0.5, 2.0), (4.5, 5.0)]
+    assert union(spans) == [(0.0, 2.0), (3.0, 4.0), (4.5, 5.0)]
+    assert union(spans, gap=0.6) == [(0.0, 2.0), (3.0, 5.0)]
+    assert union([]) == []
