@@ -241,7 +241,10 @@ class Fences(SchedulerPlugin):
 
     def transition(self, key: Any, start: str, finish: str, *args: Any, **kwargs: Any) -> None:
         """Say so when a task waits because of fences."""
-        if finish not in ("no-worker", "queued") or (self.remainder and finish == "queued"):
+        if finish not in ("no-worker", "queued"):
+            return
+        # In the queue tasks wait for their turn as well.
+        if finish == "queued" and not self.scheduler.running <= self.closed:
             return
         now = time.monotonic()
         task = self.scheduler.tasks[key]
