@@ -1,60 +1,59 @@
-"""Thumbnails: decode on CPU workers, shrink on GPU workers, write in order on one more.
+"""Thumbnails: decode on CPU workers, shrink on GPU workers, append to a file in order."""
 
-``python examples/thumbnails.py out.npy``. The pictures are noise: put your own `decode` and
-`shrink` in their place. The pipe bounds how far decoding runs ahead of writing.
-"""
-
-import argparse
-import uuid
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
-from distributed import Client, LocalCluster, secede
+from distributed import Client, get_client
 
-from poolpart import Pipe, Pool
+from poolpart import Ledger, Pipe, Pool, fetch_available, n_workers, per_gpu, rest
+
+SIZE, WINDOW = 30 * 40 * 3, 8  # bytes of a thumbnail; thumbnails under way
 
 
-def decode(number):
+def decode(number):  # noise: put your own functions in place of these
     return np.random.default_rng(number).integers(0, 256, (240, 320, 3), np.uint8)
 
 
-def shrink(picture, factor=8):
-    height, width, colours = picture.shape
-    blocks = picture.reshape(height // factor, factor, width // factor, factor, colours)
-    return blocks.mean(axis=(1, 3)).astype(np.uint8)
+def shrink(picture):
+    return picture.reshape(30, 8, 40, 8, 3).mean(axis=(1, 3)).astype(np.uint8)
 
 
-def write(inlet: Pipe, path: Path):
-    secede()  # it mostly waits: leave the worker's thread to others
-    try:
-        np.save(path, thumbnails := [future.result() for future in inlet])
-    except BaseException as error:
-        inlet.fail(f"writing {path} failed: {error}")  # or the other end would wait for ever
-        raise
-    return len(thumbnails)
+def write(keys, written, path):
+    with path.open("ab", buffering=0) as file:  # where a writer may have died, with its keys
+        written.put([file.truncate(file.tell() // SIZE * SIZE) // SIZE, "again"])
+        for number, key in keys:
+            if number == file.tell() // SIZE:  # else it is on its way again
+                found = fetch_available(get_client(), [key])  # none if its worker has died
+                file.write(b"".join(found.values()))
+                written.put([file.tell() // SIZE, "" if found else "again"])
 
 
-def run(client: Client, path: Path, count: int):
-    gpu, rest = Pool.from_client(client).partition("GPU", max_workers_per_gpu=1)
-    writer, rest = rest.partition("WRITER", n_workers=1)
-    cpu, _ = rest.partition("CPU", workers=rest.names)
-    print(gpu, writer, cpu, sep="\n")
-    pipe = Pipe(f"thumbnails-{uuid.uuid4().hex}", capacity=8, client=client).create()
-    try:
-        written = writer.submit(write, pipe, path)
-        for number in range(count):
-            pipe.put(gpu.submit(shrink, cpu.submit(decode, number)))
-        pipe.close()
-        print(f"{written.result()} thumbnails in {path}")
-    finally:
-        pipe.delete()
+def run(client, path, total=24):
+    rules = {"WRITER": n_workers(1), "GPU": per_gpu(1), "CPU": rest()}
+    writer, gpu, cpu = Pool.from_client(client).divide(rules).values()
+    pipes = [Pipe(f"{way}-{client.id}", 2 * WINDOW, client) for way in ("keys", "written")]
+    ledger, futures, sent = Ledger(total), {}, 0  # {number: future of the thumbnail}
+    with pipes[0].create() as keys, pipes[1].create() as written:
+        task = writer.submit(write, keys, written, path)
+        while not ledger.complete and not task.done():
+            for number in range(ledger.delivered + len(futures), min(sent + WINDOW, total)):
+                futures[number] = gpu.submit(shrink, cpu.submit(decode, number))
+            while sent in futures and futures[sent].done():
+                if error := futures[sent].exception():
+                    keys.fail(f"picture {sent}: {error}")
+                keys.put([sent, futures[sent].key])
+                sent += 1
+            for count, again in written.poll():
+                for number in filter(ledger.accept, range(ledger.delivered, count)):
+                    del futures[number]
+                sent = count if again else sent
+            time.sleep(0.005)
+        keys.close()
+        task.result()
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("path", type=Path)
-    parser.add_argument("--count", type=int, default=24)
-    given = parser.parse_args()
-    options = {"n_workers": 4, "threads_per_worker": 1, "host": "127.0.0.1"}
-    with LocalCluster(**options, dashboard_address="127.0.0.1:0") as cluster:
-        run(cluster.get_client(), given.path.absolute(), given.count)
+    with Client(n_workers=4, threads_per_worker=1, dashboard_address="127.0.0.1:0") as client:
+        run(client, Path(sys.argv[1]).absolute())

@@ -122,6 +122,12 @@ class Pipe:
         """Forget the pipe on the scheduler, with what is still in it; no error if it is gone."""
         forget_pipes(self.client, [self.name])
 
+    def __enter__(self) -> Pipe:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.delete()
+
     def _missing(self) -> PipeFailed:
         return PipeFailed(f"Pipe {self.name!r} does not exist: never created, or deleted.")
 

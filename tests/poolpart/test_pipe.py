@@ -413,6 +413,15 @@ def test_deleting_takes_items_futures_and_a_state_along(client, make_pipe, wait_
     wait_until(lambda: known(client) == before)
 
 
+def test_leaving_its_block_deletes_a_pipe_also_after_an_error(client):
+    queues = client.cluster.scheduler.extensions["queues"].queues
+    with pytest.raises(ZeroDivisionError), Pipe("in-a-block", 2, client).create() as pipe:
+        pipe.put(1)
+        assert "in-a-block" in queues
+        raise ZeroDivisionError
+    assert "in-a-block" not in queues
+
+
 def test_two_pipes_of_one_name(client, make_pipe):
     pipe = make_pipe(client)
     pipe.put("mine")
