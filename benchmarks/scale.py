@@ -28,19 +28,12 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-import dask
 import psutil
 from distributed import Client, Scheduler, Worker, get_worker
 
 from poolpart import Partition, Pool
 
 NAMES = ("A", "B", "C", "D")
-# Of 200 workers in one process, the statistical profilers alone would take a core, and each
-# worker's monitor of the system tells the same.
-SPARING = {
-    "distributed.worker.profile.enabled": False,
-    "distributed.admin.system-monitor.interval": "60s",
-}
 
 
 async def _scheduler(connection: Connection) -> None:
@@ -61,8 +54,7 @@ async def _workers(connection: Connection, address: str, count: int) -> None:
 
 def _serve(main: Callable[..., Any], connection: Connection, *arguments: Any) -> None:
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
-    with dask.config.set(SPARING):
-        asyncio.run(main(connection, *arguments))
+    asyncio.run(main(connection, *arguments))
 
 
 @contextmanager

@@ -1,6 +1,5 @@
 """Two hundred workers: nothing is misplaced, whichever way it was submitted."""
 
-import dask
 import pytest
 from distributed import get_worker
 
@@ -16,13 +15,7 @@ def here(_=None):
 @pytest.fixture
 def two_hundred(start):
     """Client of a cluster of 200 workers, all threads of this process."""
-    # Each worker's profiler and monitor wake up by themselves, those of 200 all the time.
-    sparing = {
-        "distributed.worker.profile.enabled": False,
-        "distributed.admin.system-monitor.interval": "60s",
-    }
-    with dask.config.set(sparing):
-        yield start({f"worker-{number}": {} for number in range(200)})
+    return start({f"worker-{number}": {} for number in range(200)})
 
 
 @pytest.mark.slow
