@@ -163,8 +163,8 @@ def test_without_a_fence_they_come_in(client):
 def test_tasks_of_the_partition_pass(client):
     raise_fence(client, "A")
     raise_fence(client, "B")
-    assert set(client.gather(Partition("A", client).map(here, range(20)))) == {"A-0", "A-1"}
-    assert set(client.gather(Partition("B", client).map(here, range(5)))) == {"B-0"}
+    assert set(Partition("A", client).map(here, range(20))) == {"A-0", "A-1"}
+    assert set(Partition("B", client).map(here, range(5))) == {"B-0"}
     assert set(submitted(client)) == {"plain"}
     assert len(client.run(os.getpid)) == 4  # not a task
 
@@ -275,7 +275,7 @@ def test_a_fence_follows_what_workers_declare(client, wait_until):
     assert set(submitted(client)) == {"B-0"}
     declare(client, "A-0", A=0)
     assert set(submitted(client)) == {"A-0", "B-0"}
-    assert set(client.gather(Partition("A", client).map(here, range(10)))) == {"A-1", "plain"}
+    assert set(Partition("A", client).map(here, range(10))) == {"A-1", "plain"}
 
 
 def test_a_worker_that_joins_a_partition_gives_away_what_it_has_not_started(client, wait_until):
