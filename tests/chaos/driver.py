@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import multiprocessing
 import traceback
-import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
+from multiprocessing.synchronize import Barrier
 from pathlib import Path
 
 from distributed import Client
@@ -17,6 +17,8 @@ from poolpart import placement_violations, trace_to
 
 from .events import Board, Sink
 from .survey import Reference, room
+
+START_S = 120.0  # for all drivers to be there
 
 
 @dataclass(frozen=True)
@@ -41,16 +43,23 @@ class Driver:
     what, planning
         The survey and what is planned meanwhile.
     folder
-        Of a board to log to, or None.
+        Of the board to log to.
+    start
+        Where to wait for others before the survey starts.
     """
 
     def __init__(
-        self, address: str, what: Survey, planning: Planning | None, folder: Path | None = None
+        self,
+        address: str,
+        what: Survey,
+        planning: Planning | None,
+        folder: Path,
+        start: Barrier | None = None,
     ) -> None:
         context = multiprocessing.get_context("spawn")
         self._answers, outlet = context.Pipe(duplex=False)
         self.process = context.Process(
-            target=_drive, args=(outlet, address, what, planning, folder), daemon=True
+            target=_drive, args=(outlet, address, what, planning, folder, start), daemon=True
         )
         self.process.start()
         outlet.close()
@@ -77,20 +86,22 @@ def _drive(
     address: str,
     what: Survey,
     planning: Planning | None,
-    folder: Path | None,
+    folder: Path,
+    start: Barrier | None,
 ) -> None:
     run = ""
+    log = Sink(Board(folder), "driver", lambda _: None)
 
     def note(point: str, fields: Mapping[str, object]) -> None:
         nonlocal run
         run = str(fields.get("run", ""))
-        if log is not None:
-            log(point, dict(fields))
+        log(point, fields)
 
-    log = None if folder is None else Sink(Board(folder), uuid.uuid4().hex, lambda _: None)
     trace_to(note)
     try:
         with Client(address) as client:
+            if start is not None:
+                start.wait(START_S)
             result = simulate(room(), what, planning, client=client, backend="numpy")
             outlet.send(
                 Delivered(

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import threading
 
 import pytest
 from distributed import Client, Queue
 from tests.chaos.arena import Arena
 from tests.chaos.driver import Driver
-from tests.chaos.survey import reference, survey
+from tests.chaos.survey import PAUSES, PLANNING, reference, survey
 from tests.chaos.traces import differences, scheduler_state
 
 FIRST, SECOND = survey(1, layers=4), survey(1, layers=6)
@@ -38,14 +39,15 @@ class Foreigner(threading.Thread):
 
 @pytest.mark.slow
 def test_two_surveys_and_a_foreign_user_do_not_see_each_other():
-    with Arena(lidar=2, slots=5) as arena:
+    spawn = multiprocessing.get_context("spawn")
+    with Arena(lidar=2, slots=5, pauses=PAUSES) as arena:
         alone = [reference(arena, what) for what in (FIRST, SECOND)]
         before = scheduler_state(arena.client)
         foreigner = Foreigner(arena.client.scheduler.address)
         foreigner.start()
+        address, start = arena.client.scheduler.address, spawn.Barrier(2)
         drivers = [
-            Driver(arena.client.scheduler.address, what, None, arena.board.folder)
-            for what in (FIRST, SECOND)
+            Driver(address, what, PLANNING, arena.board.folder, start) for what in (FIRST, SECOND)
         ]
         delivered = [driver.delivered() for driver in drivers]
         foreigner.over.set()
