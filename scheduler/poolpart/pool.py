@@ -2,32 +2,24 @@
 
 from __future__ import annotations
 
-import logging
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import replace
-from typing import Any
 
 from distributed import Client
 
 from .asking import ask_workers
-from .declare import declare
 from .dissolve import dissolve
 from .errors import PoolError
-from .fence import raise_fence
-from .inherit import inherit
+from .making import make_partitions
 from .moves import follow, unfollow
 from .page import partitions_page
 from .partition import Partition
 from .probe import probe_worker
 from .rebalancing import Help
-from .rules import Count, Named, PerGpu, PerHost, Rule, check_rule, check_rules, divide
+from .rules import Rule, check_rule, check_rules, divide, rule_of
 from .selection import check_request, choose
-from .stats import watch
 from .worker_info import WorkerInfo
-
-logger = logging.getLogger(__name__)
 
 
 class Pool:
@@ -191,7 +183,7 @@ class Pool:
         cluster = self._cluster_now()
         mine = [cluster[worker.name] for worker in self.workers if worker.name in cluster]
         chosen, notes = divide(rules, mine)
-        return self._make(rules, chosen, notes, cluster)
+        return make_partitions(self.client, rules, chosen, notes, cluster.values())
 
     def partition(
         self,
@@ -262,38 +254,14 @@ class Pool:
             workers=workers,
         )
         common = {"slots": slots, "minimum": minimum, "exclusive": exclusive}
-        rule = _rule(given, [worker.name for worker in chosen], common)
+        rule = rule_of(given, [worker.name for worker in chosen], common)
         check_rule(name, rule)
-        made = self._make({name: rule}, {name: chosen}, {name: note}, cluster)
+        made = make_partitions(
+            self.client, {name: rule}, {name: chosen}, {name: note}, cluster.values()
+        )
         names = {worker.name for worker in chosen}
         rest = Pool(self.client, [worker for worker in mine if worker.name not in names])
         return made[name], rest
-
-    def _make(
-        self,
-        rules: Mapping[str, Rule],
-        chosen: Mapping[str, Sequence[WorkerInfo]],
-        notes: Mapping[str, str],
-        cluster: Mapping[str, WorkerInfo],
-    ) -> dict[str, Partition]:
-        """Make partitions of workers that were chosen for them."""
-        for name in rules:
-            names = {worker.name for worker in chosen[name]}
-            _check_sole(name, [worker for worker in cluster.values() if worker.name not in names])
-            if note := notes.get(name):
-                logger.warning("Partition %r: %s", name, note)
-        declare(self.client, rules, chosen, list(cluster.values()))
-        try:
-            watch(self.client)
-            for name, rule in rules.items():
-                inherit(self.client, name)
-                if rule.exclusive:
-                    raise_fence(self.client, name)
-        except PoolError:
-            with suppress(PoolError):  # the first error is the one to tell of
-                dissolve(self.client, list(rules), timeout_s=0)
-            raise
-        return {name: Partition(name, self.client, notes.get(name, "")) for name in rules}
 
     def page(self) -> str:
         """Add a page of partitions to Dask's dashboard, see `partitions_page`; returns its URL."""
@@ -365,22 +333,3 @@ class Pool:
         identities = self.client.scheduler_info(n_workers=-1)["workers"]
         workers = (WorkerInfo.from_identity(a, i) for a, i in identities.items())
         return {w.name: replace(w, gpus=gpus.get(w.name, ())) for w in workers}
-
-
-def _rule(given: Mapping[str, Any], names: Sequence[str], common: Mapping[str, Any]) -> Rule:
-    """Rule that goes on choosing as a selector of `Pool.partition` does."""
-    if given["max_workers_per_gpu"] is not None:
-        return PerGpu(most=given["max_workers_per_gpu"], **common)
-    if given["max_workers_per_host"] is not None:
-        return PerHost(most=given["max_workers_per_host"], **common)
-    if given["n_workers"] is not None:
-        return Count(workers=given["n_workers"], **common)
-    return Named(names=tuple(names), **common)
-
-
-def _check_sole(name: str, others: Iterable[WorkerInfo]) -> None:
-    if members := [worker.name for worker in others if name in worker.partitions]:
-        raise PoolError(
-            f"There is a partition {name!r} already, with {', '.join(members)}, which this "
-            f"call does not choose: give another name, or use Pool.partitions()[{name!r}]."
-        )

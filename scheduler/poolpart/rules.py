@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from .errors import PoolError
 from .selection import NO_GPU, by_gpu, by_host
@@ -163,6 +164,17 @@ def named(
 def rest(*, slots: int | None = None, minimum: int = 0, exclusive: bool = False) -> Rest:
     """Every worker that no rule before it wants; also where others find more workers."""
     return Rest(slots=slots, minimum=minimum, exclusive=exclusive)
+
+
+def rule_of(given: Mapping[str, Any], names: Sequence[str], common: Mapping[str, Any]) -> Rule:
+    """Make the rule that goes on choosing as a selector of `Pool.partition` does."""
+    if given["max_workers_per_gpu"] is not None:
+        return PerGpu(most=given["max_workers_per_gpu"], **common)
+    if given["max_workers_per_host"] is not None:
+        return PerHost(most=given["max_workers_per_host"], **common)
+    if given["n_workers"] is not None:
+        return Count(workers=given["n_workers"], **common)
+    return Named(names=tuple(names), **common)
 
 
 def divide(
