@@ -157,7 +157,7 @@ def _worker_spec(
 
 
 class _NannyCluster(SpecCluster):
-    """A cluster that leaves dead workers to their nannies.
+    """A cluster that leaves dead workers to their nannies, and keeps the workers it has.
 
     A SpecCluster looks 15 seconds after a worker was lost whether one of its name is there,
     and if not closes the nanny for good. A worker that dies twice within that time may be
@@ -166,6 +166,13 @@ class _NannyCluster(SpecCluster):
 
     def _update_worker_status(self, op: str, msg: Any) -> None:
         super(SpecCluster, self)._update_worker_status(op, msg)
+
+    def scale(self, *_: Any, **__: Any) -> None:
+        """Refuse: SpecCluster would drop the workers described last, whatever their kind."""
+        raise PoolError(
+            "A cluster of local_cluster has a fixed number of workers: give it when you start "
+            "one, or move workers with Partition.grow and Partition.shrink."
+        )
 
 
 def _check_count(name: str, count: int) -> None:

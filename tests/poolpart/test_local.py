@@ -86,6 +86,12 @@ def test_three_partitions(processes):
     }
 
 
+def test_a_number_of_workers_says_nothing_of_their_kinds(processes):
+    with pytest.raises(PoolError, match=r"fixed number of workers: .* Partition\.grow"):
+        processes.cluster.scale(2)
+    assert len(Pool.from_client(processes)) == 3
+
+
 def test_no_dashboard_environment_and_nothing_left_after_an_error():
     before = children()
     with (
