@@ -1,6 +1,7 @@
 """Pool partitions, pipes and a delivery ledger for Dask clusters."""
 
 from .asking import ask_workers
+from .awaiting import await_news
 from .backoff import Backoff
 from .errors import PipeClosed, PipeFailed, PoolError
 from .fence import lower_fence, raise_fence
@@ -47,6 +48,7 @@ __all__ = [
     "WorkerInfo",
     "ask_workers",
     "assign_devices",
+    "await_news",
     "fetch_available",
     "forget_pipes",
     "has_partitions_page",

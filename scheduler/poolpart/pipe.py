@@ -4,9 +4,10 @@ Why not a bare `distributed.Queue`: a consumer that dies while it blocks in `Que
 leaves its request on the scheduler, and the next item goes to nobody; a queue cannot be
 closed, so its consumers cannot end; and a blocking `put` or `get` does not notice that the
 other side has failed. A `Pipe` therefore never blocks inside the scheduler. Consumers take
-what is there with ``get(batch=True)``, which returns at once, and pause between empty
-answers. (`get(timeout=…)` is no way out: each time-out is logged as an error on the
-scheduler, and a request that waits is the very thing that loses items.)
+what is there with ``get(batch=True)``, which returns at once, and between empty answers let
+the scheduler look out for items, which takes none. (`get(timeout=…)` is no way out: each
+time-out is logged as an error on the scheduler, and a request that waits for an item is the
+very thing that loses it.)
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from typing import Any, TypeVar
 
 from distributed import Client, Queue, Variable, get_client
 
+from .awaiting import await_news
 from .backoff import Backoff
 from .errors import PipeClosed, PipeFailed
 from .pipe_parts import AttachedQueue, PipeState, change_pipe, forget_pipes, open_pipe
@@ -267,7 +269,6 @@ class Pipe:
             If nothing came for so long.
         """
         deadline = _deadline(timeout_s)
-        pause = Backoff()
         while True:
             # The state is read before the queue: items put before the closing are seen.
             closed = self._read_state().closed
@@ -277,7 +278,8 @@ class Pipe:
                 raise PipeClosed(f"Pipe {self.name!r} is closed and empty.")
             if time.monotonic() > deadline:
                 raise TimeoutError(f"Nothing came through pipe {self.name!r} for {timeout_s} s.")
-            pause.sleep()
+            wait_s = min(_STATE_MAX_AGE_S, max(0.0, deadline - time.monotonic()))
+            await_news(self.client, wait_s, [self.name])
 
     def get(self, timeout_s: float | None = None) -> Any:
         """Take the next item; waits for one, and raises as `get_all` does."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 from distributed import Client
@@ -21,15 +23,20 @@ def undisturbed(client):
     return simulate(Scene.seed(), SURVEY, client=client)
 
 
-def scheduler_state(client: Client) -> tuple[set[str], set[str], set[str]]:
-    """What the scheduler knows: tasks, queues, variables."""
+def scheduler_state(client: Client, expected=None) -> tuple[set[str], set[str], set[str]]:
+    """What the scheduler knows: tasks, queues, variables; waits a moment for what is expected."""
 
     def look(dask_scheduler):
         queues = dask_scheduler.extensions["queues"].queues
         variables = dask_scheduler.extensions["variables"].variables
         return set(map(str, dask_scheduler.tasks)), set(queues), set(variables)
 
-    return client.run_on_scheduler(look)
+    until = time.monotonic() + 5  # cancelling is told to the scheduler, not asked
+    while (found := client.run_on_scheduler(look)) != expected is not None:
+        if time.monotonic() > until:
+            break
+        time.sleep(0.05)
+    return found
 
 
 def test_frames_come_in_order_and_every_scan_once(client, undisturbed, same_cloud):
@@ -67,7 +74,7 @@ def test_a_killed_worker_changes_nothing(client, undisturbed, same_cloud, kill, 
 def test_nothing_is_left_on_the_scheduler(client):
     before = scheduler_state(client)
     simulate(Scene.seed(), SURVEY, client=client)
-    assert scheduler_state(client) == before
+    assert scheduler_state(client, before) == before
 
 
 def test_a_failing_task_ends_the_run_with_stage_and_scan(client, monkeypatch):
@@ -76,7 +83,7 @@ def test_a_failing_task_ends_the_run_with_stage_and_scan(client, monkeypatch):
     message = r"stage intersect, scans \d+ to \d+ failed: .*the lens is dirty"
     with pytest.raises(LidarpoolError, match=message):
         simulate(Scene.seed(), SURVEY, client=client)
-    assert scheduler_state(client) == before
+    assert scheduler_state(client, before) == before
 
 
 def failing_intersect(setup, wire, run):
@@ -93,7 +100,7 @@ def test_an_error_in_the_callback_passes_through_and_stops_the_run(client, kind)
 
     with pytest.raises(kind, match="mine"):
         simulate(Scene.seed(), SURVEY, client=client, on_frame=on_frame)
-    assert scheduler_state(client) == before
+    assert scheduler_state(client, before) == before
 
 
 def test_an_interrupt_stops_the_run_and_the_cluster_can_be_used_again(

@@ -180,7 +180,7 @@ class Run:
             if moved:
                 pause.reset()
             else:
-                pause.sleep()
+                (time.sleep if survey.finished else survey.wait)(pause.next())
         return times
 
     def _progress(self, survey: SurveyPump, trials: TrialPump | None, seconds: float) -> Progress:

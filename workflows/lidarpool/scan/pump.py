@@ -16,7 +16,16 @@ from contextlib import suppress
 
 from distributed import Client
 
-from poolpart import Ledger, Partition, Pipe, PipeFailed, TaskRecord, fetch_available, forget_pipes
+from poolpart import (
+    Ledger,
+    Partition,
+    Pipe,
+    PipeFailed,
+    TaskRecord,
+    await_news,
+    fetch_available,
+    forget_pipes,
+)
 
 from ..errors import LidarpoolError
 from ..survey import Survey
@@ -212,6 +221,19 @@ class SurveyPump:
             self._moved_at = time.monotonic()
         return moved
 
+    def wait(self, seconds: float) -> None:
+        """Wait until there may be something to do, but no longer than so."""
+        if self._closed_at is not None:
+            time.sleep(min(seconds, 0.001))
+            return
+        pipes = [self._deliveries.name]
+        if self._has_room:
+            pipes.append(self._scans.name)
+        casts = [cast for item in self._under_way if item.running for cast in item.casts]
+        futures = [future for cast in casts for future in (cast.batch, cast.frames)]
+        keys = [future.key for future in futures if future.status == "pending"]
+        await_news(self.client, seconds, pipes, keys)
+
     def _check_stages(self) -> None:
         for name, future in self._stages.futures.items():
             if not (future.status == "error" and was_killed(future)):
@@ -219,9 +241,8 @@ class SurveyPump:
 
     def _take_scans(self) -> bool:
         """Submit a stage-2 task for each item of stage 1, as far as the credit goes."""
-        most = self._caster.running_most + 2 * self._queue_capacity
-        self._handover.capacity = most + self._queue_capacity
-        if self._caster.room <= 0 or len(self._under_way) >= most:
+        self._handover.capacity = self._most + self._queue_capacity
+        if not self._has_room:
             return False
         items = self._scans.poll()
         for item in items:
@@ -229,6 +250,18 @@ class SurveyPump:
             for batch in self._under_way.add(wire):
                 self._caster.submit(batch)
         return bool(items)
+
+    @property
+    def _most(self) -> int:
+        """Batches that may be under way."""
+        return self._caster.running_most + 2 * self._queue_capacity
+
+    @property
+    def _has_room(self) -> bool:
+        """Whether more may be submitted now."""
+        if self._under_way.condemned or len(self._under_way) >= self._most:
+            return False
+        return self._caster.room > 0
 
     def _new_scans(self, item: Wire) -> Wire:
         """Leave out what a generator that was run again has described again."""
