@@ -145,6 +145,7 @@ class Results(Iterator[Any]):
     def _submit(self, wait: bool) -> None:
         """Send chunks, several in one message, up to the window."""
         window = self._options.window or max(2, 2 * self._slots)
+        window = min(window, 2 * self._sender.most)  # of its quota's tasks, some are done
         free = window - len(self._running)
         # One at a time would be many messages; the rest keeps the slots busy meanwhile.
         if self._running and free < window // 4:
