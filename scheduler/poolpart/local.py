@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
-from distributed import Nanny, Scheduler, Security, SpecCluster
+from distributed import Nanny, Scheduler, Security, SpecCluster, Status
 
 from .errors import PoolError
 from .probe import visible_gpus
@@ -167,8 +167,11 @@ class _NannyCluster(SpecCluster):
     def _update_worker_status(self, op: str, msg: Any) -> None:
         super(SpecCluster, self)._update_worker_status(op, msg)
 
-    def scale(self, *_: Any, **__: Any) -> None:
+    def scale(self, n: int = 0, **options: Any) -> None:
         """Refuse: SpecCluster would drop the workers described last, whatever their kind."""
+        if self.status == Status.closing:  # it stops its workers by this
+            super().scale(n, **options)
+            return
         raise PoolError(
             "A cluster of local_cluster has a fixed number of workers: give it when you start "
             "one, or move workers with Partition.grow and Partition.shrink."
