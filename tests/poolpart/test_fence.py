@@ -224,6 +224,33 @@ def test_nothing_is_stolen_into_a_partition(client, wait_until):
     assert set(client.gather(futures)) == OUTSIDE
 
 
+def test_nor_is_what_may_run_anywhere_but_would_rather_not(client, wait_until):
+    raise_fence(client, "A")
+    scheduler = scheduler_of(client)
+    wish = {"workers": ["plain"], "allow_other_workers": True, "pure": False}
+    futures = [client.submit(here, i, pause_s=0.05, **wish) for i in range(20)]
+    wait_until(lambda: len(scheduler.tasks) == 20)
+    idle = {state_of(client, "A-0"), state_of(client, "A-1")}
+    task = next(iter(scheduler.tasks.values()))
+    occupancies = dict.fromkeys(scheduler.workers.values(), 0.0)
+    stealing = scheduler.extensions["stealing"]
+    assert stealing._get_thief(scheduler, task, idle, occupancies=occupancies) is None
+    del task
+    client.run_on_scheduler(steal)
+    assert set(client.gather(futures)) <= OUTSIDE
+
+
+def test_wishes_do_not_open_the_last_worker(client, wait_until):
+    for name in ("A", "B"):
+        raise_fence(client, name)
+    declare(client, "plain", A=1)
+    with pytest.warns(UserWarning, match="Tasks wait"):
+        waiting = client.submit(here, workers=["A-0"], allow_other_workers=True, pure=False)
+        wait_until(lambda: kept_out(scheduler_of(client)) == 1)
+    lower_fence(client, "B")
+    assert waiting.result(LONG_S) == "B-0"
+
+
 def test_what_is_computed_again_stays_out(start):
     client = start({"A-0": {"resources": {"A": 1}}, "one": {}, "two": {}})
     first = client.submit(here, workers=["one"], allow_other_workers=True, pure=False)
