@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +16,8 @@ from lidarpool.cloud import Cloud, counts_by_object, even_choice
 from lidarpool.ply import read_cloud, save_cloud
 from lidarpool.scan.builder import CloudBuilder
 from lidarpool.scan.messages import POINT, Part
+
+ROOT = Path(__file__).parents[2]
 
 
 def table(scan, count):
@@ -202,3 +205,15 @@ def test_a_cloud_larger_than_memory(tmp_path):
     rows = np.memmap(tmp_path / "c.ply", dtype=np.uint8, mode="r")[-22 * scans * per_scan :]
     scan = np.ndarray(scans * per_scan, "<i4", rows, 12, 22)
     assert (scan[::per_scan] == np.arange(scans)).all() and (np.diff(scan) >= 0).all()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits memory as Linux does")
+def test_the_benchmark_at_toy_size(tmp_path):
+    """In a process of its own, since it limits its memory."""
+    done = subprocess.run(
+        [sys.executable, "-m", "benchmarks.big_cloud", "--points", "1e5", "--folder", tmp_path],
+        capture_output=True, text=True, cwd=ROOT, check=False,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+    )  # fmt: skip
+    assert done.stdout.startswith("100,000 points, 0.00 GB of .ply\n"), done.stderr
+    assert list(tmp_path.iterdir()) == []
