@@ -11,6 +11,7 @@ from distributed import Client
 from .asking import ask_workers
 from .dissolve import dissolve
 from .errors import PoolError
+from .identities import worker_identities
 from .making import make_partitions
 from .moves import follow, unfollow
 from .page import partitions_page
@@ -60,7 +61,7 @@ class Pool:
         PoolError
             If the cluster has no workers, or one cannot import this package.
         """
-        identities = client.scheduler_info(n_workers=-1)["workers"]
+        identities = worker_identities(client)
         if not identities:
             raise PoolError(
                 f"The cluster at {client.scheduler.address} has no workers: start some with "
@@ -273,7 +274,8 @@ class Pool:
         While tasks of `helps` wait for a slot, workers of `lender` that have had nothing to
         do for a while are moved there, as far as its minimum allows. They go back as soon as
         tasks of `lender` wait, once what they have begun has ended, or when they have had
-        nothing to do there either. The scheduler does this, also when this client has gone.
+        nothing to do there either, for two seconds longer. The scheduler does this, also when
+        this client has gone.
 
         Parameters
         ----------
@@ -330,6 +332,6 @@ class Pool:
     def _cluster_now(self) -> dict[str, WorkerInfo]:
         """Every worker of the cluster by name; the GPUs of those in this pool are known."""
         gpus = {worker.name: worker.gpus for worker in self.workers}
-        identities = self.client.scheduler_info(n_workers=-1)["workers"]
+        identities = worker_identities(self.client)
         workers = (WorkerInfo.from_identity(a, i) for a, i in identities.items())
         return {w.name: replace(w, gpus=gpus.get(w.name, ())) for w in workers}

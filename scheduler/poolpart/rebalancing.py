@@ -9,6 +9,10 @@ from typing import Any
 from .book import Book, Seat
 from .placing import asks_for
 
+# Longer than an idle worker waits to be lent: whoever submits may need a moment to notice it,
+# and a worker that goes back and forth is of no use to anybody.
+SETTLE_IN_S = 2.0
+
 
 @dataclass(frozen=True)
 class Help:
@@ -76,7 +80,8 @@ class Rebalancing:
             elif more := self.backlog(rule.borrower):
                 self._lend(rule, more, now)
             else:
-                self._give_back([s for s in lent if self._idle(s, rule.idle_s, now)])
+                patience = rule.idle_s + SETTLE_IN_S
+                self._give_back([seat for seat in lent if self._idle(seat, patience, now)])
 
     def backlog(self, name: str) -> int:
         """Tasks of a partition that wait for a slot of it."""
