@@ -6,6 +6,7 @@ from .backoff import Backoff
 from .errors import PipeClosed, PipeFailed, PoolError
 from .fence import lower_fence, raise_fence
 from .fetch import fetch_available
+from .identities import worker_identities
 from .ledger import Ledger
 from .local import local_cluster
 from .mapping import Results
@@ -69,4 +70,5 @@ __all__ = [
     "tell_page",
     "trace",
     "trace_to",
+    "worker_identities",
 ]

@@ -8,6 +8,8 @@ from typing import Any
 from distributed import Client
 from distributed.comm.core import CommClosedError
 
+from .identities import worker_identities
+
 
 def ask_workers(
     client: Client, question: Callable[..., Any], addresses: Sequence[str]
@@ -34,7 +36,7 @@ def ask_workers(
     answers = client.run(question, workers=list(addresses), on_error="return")
     if not any(isinstance(answer, OSError) for answer in answers.values()):
         return dict(answers)
-    here = client.scheduler_info(n_workers=-1)["workers"]
+    here = worker_identities(client)
     return {a: answer for a, answer in answers.items() if not _has_died(answer, a in here)}
 
 

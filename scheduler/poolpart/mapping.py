@@ -9,6 +9,7 @@ import queue
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
@@ -203,15 +204,14 @@ class Results(Iterator[Any]):
         """Wait until tasks are done."""
         done: list[Future] = []
         while not done:
+            if self._sender.client.status in ("closing", "closed"):
+                raise CancelledError(
+                    f"The client of partition {self._sender.resource!r} was closed."
+                )
             if time.monotonic() > self._next_look:
                 self._look()
-            try:
+            with suppress(queue.Empty):
                 done.append(self._done.get(timeout=1))
-            except queue.Empty:
-                if self._sender.client.status in ("closing", "closed"):
-                    raise CancelledError(
-                        f"The client of partition {self._sender.resource!r} was closed."
-                    ) from None
         while not self._done.empty():
             done.append(self._done.get())
         return done

@@ -11,6 +11,7 @@ from . import moves
 from .backoff import Backoff
 from .dissolve import dissolve
 from .errors import PoolError
+from .identities import worker_identities
 from .stats import PartitionStats, partition_stats
 from .submitter import Submitter
 from .worker_info import WorkerInfo
@@ -43,7 +44,7 @@ class Partition(Submitter):
     @property
     def workers(self) -> tuple[WorkerInfo, ...]:
         """The members now, by name."""
-        identities = self.client.scheduler_info(n_workers=-1)["workers"]
+        identities = worker_identities(self.client)
         members = (WorkerInfo.from_identity(a, i) for a, i in identities.items())
         return tuple(sorted((w for w in members if w.resources.get(self.name)), key=_by_name))
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from distributed import Client
 
-from poolpart import Pool, PoolError, WorkerInfo, ask_workers
+from poolpart import Pool, PoolError, WorkerInfo, ask_workers, worker_identities
 from raybeam import available_backends
 
 from ._version import __version__
@@ -68,7 +68,7 @@ def survey_pool(client: Client, collectors: int, planning: bool) -> Pool:
         raise LidarpoolError("The client is asynchronous: give one made without asynchronous=True.")
     names = {GPU, LIDAR, OTHER} if planning else {GPU, LIDAR}
     try:
-        workers = client.scheduler_info(n_workers=-1)["workers"]
+        workers = worker_identities(client)
         if not workers:
             raise PoolError(
                 f"The cluster at {client.scheduler.address} has no workers: start some, for "

@@ -1,0 +1,19 @@
+"""What the scheduler knows of its workers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from distributed import Client
+
+
+def worker_identities(client: Client) -> dict[str, dict[str, Any]]:
+    """Ask the scheduler for all its workers, by address.
+
+    `Client.scheduler_info(n_workers=-1)` asks too, but returns what is in an attribute by then.
+    Every two seconds the client itself puts an answer there that has no workers, so that on a
+    busy machine a cluster of hundreds looks empty now and then.
+    """
+    identity: dict[str, Any] = client.sync(client.scheduler.identity, n_workers=-1)
+    workers: dict[str, dict[str, Any]] = identity["workers"]
+    return workers
