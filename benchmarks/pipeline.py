@@ -1,7 +1,12 @@
-"""Throughput of the four stages when casting costs nothing: `python -m benchmarks.pipeline`.
+"""What the pipeline itself costs, when casting costs nothing: `python -m benchmarks.pipeline`.
 
 The rays are trivial (a few towards one cube), so what is measured is the pipeline: pipes,
-scheduler, ledger. Several runs on one local cluster; the median counts.
+scheduler, ledgers. All on one local cluster:
+
+- throughput of the four stages; several runs, the median counts;
+- the way of a scan from stage 1 to `on_frame`, with scans at a sensor's pace;
+- processor time of driver and scheduler, which share a process, for a million rays, in
+  surveys of growing length.
 """
 
 from __future__ import annotations
@@ -10,16 +15,20 @@ import argparse
 import json
 import statistics
 import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from distributed import Client
 
 from lidarpool import Result, Scene, Sensor, Survey, simulate
 from lidarpool.mesh import Mesh
-from poolpart import local_cluster, placement_violations
+from poolpart import local_cluster, trace_to
 
 STAGES = ("generate", "intersect", "sort", "collect")
+COST_RAYS = 64  # a scan, where the time for a million rays is measured
+WARM_SCANS = 3  # of a paced run, which are not judged
 
 
 def cube() -> Scene:
@@ -30,54 +39,128 @@ def cube() -> Scene:
     return Scene.from_meshes([Mesh("cube", corners, np.array(faces))])
 
 
-def measure(client: Client, scans: int, rays: int) -> Result:
+def measure(client: Client, scans: int, rays: int, **options: Any) -> Result:
     """Run one survey of `scans` scans, each of `rays` rays."""
     sensor = Sensor(rays_per_revolution=360, layers=rays, step_deg=1)
     poses = [(0.0, 0.0, 0.0)] * -(-scans // 360)
     survey = Survey(sensor, poses=poses, steps=min(scans, 360))
-    return simulate(cube(), survey, client=client)
+    result = simulate(cube(), survey, client=client, **options)
+    assert sum(stage.violations for stage in result.stages) == 0
+    return result
 
 
-def main(arguments: list[str] | None = None) -> dict[str, object]:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--scans", type=int, default=3600)
-    parser.add_argument("--rays", type=int, default=4, help="rays a scan")
-    parser.add_argument("--runs", type=int, default=5)
-    parser.add_argument("--json", type=Path, help="also write the figures to this file")
-    options = parser.parse_args(arguments)
-
+def throughput(client: Client, scans: int, rays: int, runs: int) -> dict[str, Any]:
+    """Measure scans a second through all stages, and the time of each stage."""
     rates, cpu, per_item = [], [], {stage: [] for stage in STAGES}
-    with local_cluster() as cluster, Client(cluster) as client:
-        measure(client, 36, options.rays)  # the first run imports everything on the workers
-        for _ in range(options.runs):
-            before = time.process_time()
-            result = measure(client, options.scans, options.rays)
-            cpu.append((time.process_time() - before) / options.scans)
-            rates.append(options.scans / result.survey_seconds)
-            assert not placement_violations(result.records)
-            for stage in STAGES:
-                records = [r for r in result.records if r.stage == stage]
-                work = sum(r.seconds for r in records)
-                per_item[stage].append(work / sum(r.items for r in records))
-            tasks = sum(r.stage == "intersect" for r in result.records)
-
-    figures: dict[str, object] = {
-        "scans": options.scans,
-        "rays_per_scan": options.rays,
+    for _ in range(runs):
+        before = time.process_time()
+        result = measure(client, scans, rays)
+        cpu.append((time.process_time() - before) / scans)
+        rates.append(scans / result.survey_seconds)
+        totals = {stage.stage: stage for stage in result.stages}
+        for stage in STAGES:
+            per_item[stage].append(totals[stage].seconds / totals[stage].items)
+    return {
+        "scans": scans,
+        "rays_per_scan": rays,
         "scans_per_second": round(statistics.median(rates), 1),
         "spread": [round(min(rates), 1), round(max(rates), 1)],
-        "scans_per_batch": round(options.scans / tasks, 1),
+        "scans_per_batch": round(scans / totals["intersect"].tasks, 1),
         "driver_and_scheduler_ms_per_scan": round(1e3 * statistics.median(cpu), 3),
         "stage_ms_per_scan": {s: round(1e3 * statistics.median(v), 3) for s, v in per_item.items()},
     }
-    print(f"{figures['scans_per_second']} scans/s (runs from {min(rates):.0f} to {max(rates):.0f})")
-    print(f"{figures['scans_per_batch']} scans in a batch at the end")
-    print(f"driver and scheduler: {figures['driver_and_scheduler_ms_per_scan']} ms CPU a scan")
-    for stage, milliseconds in figures["stage_ms_per_scan"].items():
-        print(f"  {stage:<10} {milliseconds:8.3f} ms a scan, waiting included")
+
+
+def latency(client: Client, scans: int, rays: int, pace: float) -> dict[str, float]:
+    """Time from when stage 1 puts a scan until its frame is handed out."""
+    framed: dict[int, float] = {}
+    client.run(_note_puts)
+    try:
+        start, cpu = time.monotonic(), time.process_time()
+        measure(
+            client,
+            scans,
+            rays,
+            scans_per_second=pace,
+            on_frame=lambda frame: framed.setdefault(frame.scan, time.time()),
+        )
+        share = (time.process_time() - cpu) / (time.monotonic() - start)
+        put = {scan: at for found in client.run(_noted_puts).values() for scan, at in found.items()}
+    finally:
+        client.run(trace_to, None)
+    ways = sorted(1e3 * (framed[s] - put[s]) for s in framed if s >= min(WARM_SCANS, scans - 1))
+    return {
+        "scans_per_second": pace,
+        "median_ms": round(statistics.median(ways), 1),
+        "p95_ms": round(ways[int(0.95 * len(ways))], 1),
+        "driver_and_scheduler_cpu": round(share, 3),
+    }
+
+
+def cost(client: Client, sizes: Sequence[int], rays: int) -> dict[str, float]:
+    """Processor seconds of driver and scheduler for a million rays, by the number of scans."""
+    seconds = {}
+    for scans in sizes:
+        before = time.process_time()
+        result = measure(client, scans, rays)
+        seconds[str(scans)] = round((time.process_time() - before) / (result.rays / 1e6), 3)
+    return seconds
+
+
+def _note_puts(dask_worker: Any) -> None:
+    """Have a worker note when stage 1 puts a scan; runs there."""
+    # With the worker, not in a global: a function of a script travels without its module.
+    noted = dask_worker.noted_puts = {}
+
+    def sink(point: str, fields: Mapping[str, Any]) -> None:
+        if point == "generate.put":
+            noted.update(dict.fromkeys(fields["scans"], time.time()))
+
+    trace_to(sink)
+
+
+def _noted_puts(dask_worker: Any) -> dict[int, float]:
+    return dask_worker.noted_puts
+
+
+def main(arguments: list[str] | None = None) -> dict[str, Any]:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--scans", type=int, default=3600)
+    parser.add_argument("--rays", type=int, default=4, help="rays a scan")
+    parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--pace", type=float, default=10.0, help="scans a second, for the latency")
+    parser.add_argument("--paced-scans", type=int, default=100)
+    parser.add_argument("--sizes", type=int, nargs="+", default=[100, 1000, 10_000])
+    parser.add_argument("--json", type=Path, help="also write the figures to this file")
+    options = parser.parse_args(arguments)
+
+    with local_cluster() as cluster, Client(cluster) as client:
+        measure(client, 36, options.rays)  # the first run imports everything on the workers
+        figures = throughput(client, options.scans, options.rays, options.runs)
+        figures["latency"] = latency(client, options.paced_scans, options.rays, options.pace)
+        figures["cpu_seconds_per_million_rays"] = cost(client, options.sizes, COST_RAYS)
+
+    show(figures)
     if options.json:
         options.json.write_text(json.dumps(figures, indent=1) + "\n")
     return figures
+
+
+def show(figures: Mapping[str, Any]) -> None:
+    """Print the figures for people."""
+    low, high = figures["spread"]
+    print(f"{figures['scans_per_second']} scans/s (runs from {low:.0f} to {high:.0f})")
+    print(f"{figures['scans_per_batch']} scans in a batch")
+    print(f"driver and scheduler: {figures['driver_and_scheduler_ms_per_scan']} ms CPU a scan")
+    for stage, milliseconds in figures["stage_ms_per_scan"].items():
+        print(f"  {stage:<10} {milliseconds:8.3f} ms a scan, waiting included")
+    way = figures["latency"]
+    print(
+        f"from stage 1 to its frame at {way['scans_per_second']} scans/s: {way['median_ms']} ms "
+        f"(median), {way['p95_ms']} ms (95 %), with {way['driver_and_scheduler_cpu']:.0%} of a core"
+    )
+    for scans, seconds in figures["cpu_seconds_per_million_rays"].items():
+        print(f"  {scans:>6} scans: {seconds} s of driver and scheduler for a million rays")
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ _LOOK_EVERY_S = (0.002, 0.005)  # on the scheduler, first and then; some microse
 
 def await_news(
     client: Client, seconds: float, pipes: Collection[str] = (), keys: Collection[str] = ()
-) -> None:
+) -> bool:
     """Wait until there is something in a pipe, or a task has ended, but no longer than so.
 
     Parameters
@@ -36,20 +36,26 @@ def await_news(
         Names of pipes; one that was closed, has failed or is gone ends the wait as well.
     keys
         Keys of tasks; one that the scheduler does not know ends the wait as well.
+
+    Returns
+    -------
+    bool
+        Whether something happened.
     """
-    on_scheduler(client, _wait, seconds=seconds, pipes=list(pipes), keys=list(keys))
+    return bool(on_scheduler(client, _wait, seconds=seconds, pipes=list(pipes), keys=list(keys)))
 
 
 async def _wait(
     seconds: float, pipes: list[str], keys: list[str], dask_scheduler: Any = None
-) -> None:
+) -> bool:
     start = time.monotonic()
     while not (_any_item(dask_scheduler, pipes) or _any_ended(dask_scheduler, keys)):
         waited = time.monotonic() - start
         if waited >= seconds:
-            return
+            return False
         pause = _LOOK_EVERY_S[waited > _SOON_S]
         await asyncio.sleep(min(pause, seconds - waited))
+    return True
 
 
 def _any_item(scheduler: Any, pipes: list[str]) -> bool:

@@ -45,6 +45,9 @@ def test_a_task_that_ends_or_is_not_known_ends_the_wait(client, pipe):
 
 def test_without_news_the_wait_is_as_long_as_was_said(client, pipe):
     assert seconds_of(client, 0.1, pipes=[pipe.name]) >= 0.1
+    assert not await_news(client, 0.0, [pipe.name])
+    pipe.put("item")
+    assert await_news(client, 0.0, [pipe.name])
 
 
 def test_one_that_waits_does_not_take_the_item(client, pipe):

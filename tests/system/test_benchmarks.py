@@ -9,10 +9,13 @@ from benchmarks import pipeline, scale
 
 def test_pipeline(tmp_path, capsys):
     path = tmp_path / "figures.json"
-    figures = pipeline.main(["--scans", "40", "--runs", "1", "--json", str(path)])
+    sizes = ["--scans", "40", "--runs", "1", "--paced-scans", "5", "--pace", "20", "--sizes", "20"]
+    figures = pipeline.main([*sizes, "--json", str(path)])
     assert json.loads(path.read_text()) == figures
     assert figures["scans_per_second"] > 0
     assert set(figures["stage_ms_per_scan"]) == {"generate", "intersect", "sort", "collect"}
+    assert 0 < figures["latency"]["median_ms"] <= figures["latency"]["p95_ms"]
+    assert figures["cpu_seconds_per_million_rays"]["20"] > 0
     assert "scans/s" in capsys.readouterr().out
 
 

@@ -32,10 +32,10 @@ def scheduler_state(client: Client, expected=None) -> tuple[set[str], set[str], 
         return set(map(str, dask_scheduler.tasks)), set(queues), set(variables)
 
     until = time.monotonic() + 5  # cancelling is told to the scheduler, not asked
-    while (found := client.run_on_scheduler(look)) != expected is not None:
-        if time.monotonic() > until:
-            break
+    found = client.run_on_scheduler(look)
+    while expected is not None and found != expected and time.monotonic() < until:
         time.sleep(0.05)
+        found = client.run_on_scheduler(look)
     return found
 
 

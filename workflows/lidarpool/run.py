@@ -158,7 +158,7 @@ class Run:
         started: float,
     ) -> dict[type, float]:
         """Step the pumps until all have finished; returns when each did, in seconds."""
-        pause = Backoff(least_s=0.001, most_s=0.016)
+        pause = Backoff(least_s=0.001, most_s=0.05)
         watch = Watch(self.client, {GPU, LIDAR} | ({OTHER} if trials else set()))
         times: dict[type, float] = {}
         told = float("-inf")

@@ -126,6 +126,7 @@ class SurveyPump:
             on_deaths=lambda names: self._handover.note_deaths([n.split("-")[0] for n in names]),
             where=self._where,
         )
+        self._empty: list[str] = []  # pipes in which nothing came while this waited
         self._moved_at = time.monotonic()  # when something was last handed on or delivered
         self._closed_at: float | None = None  # when all had arrived and the pipes were closed
 
@@ -201,7 +202,8 @@ class SurveyPump:
             If a task of the survey has failed, naming stage and scans.
         """
         self._check_stages()
-        moved = self._take_deliveries()
+        empty, self._empty = self._empty, []
+        moved = self._deliveries.name not in empty and self._take_deliveries()
         if self._closed_at is not None:  # last words only
             return moved
         moved |= self._caster.step()
@@ -211,7 +213,7 @@ class SurveyPump:
             self._moved_at = time.monotonic()
         if self._under_way.condemned:
             self._end_condemned()
-        else:
+        elif self._scans.name not in empty:
             moved |= self._take_scans()
         if self.complete:
             self._handover.close()
@@ -232,7 +234,8 @@ class SurveyPump:
         casts = [cast for item in self._under_way if item.running for cast in item.casts]
         futures = [future for cast in casts for future in (cast.batch, cast.frames)]
         keys = [future.key for future in futures if future.status == "pending"]
-        await_news(self.client, seconds, pipes, keys)
+        if not await_news(self.client, seconds, pipes, keys):
+            self._empty = pipes
 
     def _check_stages(self) -> None:
         for name, future in self._stages.futures.items():
