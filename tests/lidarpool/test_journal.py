@@ -239,7 +239,8 @@ def test_another_version_is_refused(path, monkeypatch):
 
 def test_another_format_is_refused(path, monkeypatch):
     interrupted(path, 9)
-    monkeypatch.setattr("lidarpool.journal.FORMAT", 2)
+    for module in ("journal", "journal_format"):
+        monkeypatch.setattr(f"lidarpool.{module}.FORMAT", 2)
     with pytest.raises(LidarpoolError, match="is of format 1, and this version reads 2"):
         reopen(path)
 

@@ -77,8 +77,7 @@ def test_what_a_crash_left_is_cut_off_and_written_over(path, tail):
         file.write(tail)
     file = RecordFile(path)
     assert len(list(file.records())) == len(PAYLOADS)
-    file.truncate()
-    assert path.stat().st_size == size
+    assert path.stat().st_size > size  # reading changes nothing
     file.append(1, b"after")
     file.close()
     assert read(path)[0] == [*PAYLOADS, b"after"]

@@ -8,16 +8,12 @@ while. Everything in them is numbers and JSON; nothing is ever unpickled.
 
 from __future__ import annotations
 
-import json
-import struct
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from .deliveries import Deliveries
@@ -25,8 +21,6 @@ from .errors import LidarpoolError
 from .identity import Identity
 from .job import Job
 from .journal_folder import (
-    FRAMES,
-    FRESH,
     RECORDS,
     check_ours,
     flush_folder,
@@ -34,25 +28,21 @@ from .journal_folder import (
     remove_folder,
     remove_journal,
 )
+from .journal_format import (
+    FORMAT,
+    HEADER,
+    POINTS,
+    TRIAL,
+    UNREADABLE,
+    pack_header,
+    pack_points,
+    unpack_header,
+    unpack_points,
+)
 from .plan import Trial
-from .records import DamagedFileError, Record, RecordFile
-from .scan.messages import POINT
+from .records import Record, RecordFile
+from .totals_file import TotalsFile
 from .trial_record import trial_from_json, trial_to_json
-
-FORMAT = 1
-
-_HEADER, _POINTS, _TRIAL, _TOTALS = 1, 2, 3, 4  # kinds of records
-_COUNT = struct.Struct("<I")
-
-# What reading may raise of bytes that are not what they should be.
-_UNREADABLE = (
-    ValueError, KeyError, TypeError, IndexError, AttributeError,
-    OverflowError, RecursionError, struct.error,
-)  # fmt: skip
-
-TOTALS_EVERY_S = 3.0
-TOTALS_SHARE = 20  # writing the totals may take one part in so many of the time
-_BYTES_PER_S = 100e6  # what a disk takes, until it is known
 
 
 @dataclass(frozen=True)
@@ -128,9 +118,7 @@ class Journal(Deliveries):
         self.path, self.terms = path, terms
         self.identity = Identity.of(job.scene, job.survey, job.planning)
         self._file: RecordFile | None = None
-        self._totals_kept = 0  # frames that are in the totals on disk
-        costs = TOTALS_SHARE * self.totals.nbytes / _BYTES_PER_S
-        self._totals_due = time.monotonic() + max(TOTALS_EVERY_S, costs)
+        self._totals_file = TotalsFile(path, self.totals)
 
     # -- what is in it -----------------------------------------------------------------
 
@@ -176,7 +164,7 @@ class Journal(Deliveries):
             raise LidarpoolError(
                 f"The journal {self.path} cannot be read: {error.strerror or error}."
             ) from error
-        except _UNREADABLE as error:
+        except UNREADABLE as error:
             raise self._refusal(f"is damaged ({error})") from error
         if self.kept:
             self._file = file
@@ -198,48 +186,24 @@ class Journal(Deliveries):
         for record in file.records():
             if not self.backend:
                 self.backend = self._read_header(record)
-            elif record.kind == _POINTS:
-                self._read_points(record)
-            elif record.kind == _TRIAL:
+            elif record.kind == POINTS:
+                scans, counts, begin, points = unpack_points(record.payload)
+                self.cloud.restore(scans, counts, record.offset + begin, points)
+            elif record.kind == TRIAL:
                 self.trials.append(trial_from_json(record.payload))
         if self.kept:
-            self._read_totals()
-            file.truncate()
+            self._totals_file.load()
 
     def _read_header(self, record: Record) -> str:
         """Check that the journal is of this run; returns the backend of its scans."""
-        header = json.loads(record.payload) if record.kind == _HEADER else {}
-        if header.get("format") != FORMAT:
-            raise self._refusal(
-                f"is of format {header.get('format')}, and this version reads {FORMAT}"
-            )
-        theirs, backend = Identity.from_data(header["identity"]), str(header["backend"])
+        if record.kind != HEADER:
+            raise ValueError("it does not begin with a header")
+        number, backend, theirs = unpack_header(record.payload)
+        if theirs is None:
+            raise self._refusal(f"is of format {number}, and this version reads {FORMAT}")
         if difference := self.identity.difference(theirs):
             raise self._refusal(f"cannot be continued, {difference}")
         return backend
-
-    def _read_points(self, record: Record) -> None:
-        data = record.payload
-        (scans,) = _COUNT.unpack_from(data)
-        begin = _COUNT.size + 8 * scans
-        numbers = np.frombuffer(data, "<u4", 2 * scans, _COUNT.size).reshape(2, scans)
-        points = np.frombuffer(data, POINT, offset=begin)
-        if numbers[1].sum(dtype=np.int64) != len(points):
-            raise DamagedFileError(f"{len(points):,} points where there should be others")
-        self.cloud.restore(numbers[0], numbers[1], record.offset + begin, points)
-
-    def _read_totals(self) -> None:
-        if not (self.path / FRAMES).is_file():
-            return  # the run ended before they were first written
-        file = RecordFile(self.path / FRAMES)
-        try:
-            for record in file.records():
-                self.totals.unpack(record.payload)
-        finally:
-            file.close()
-        if not self.totals.frames:  # it was replaced as a whole: no crash can have cut it
-            raise DamagedFileError(f"{FRAMES} holds no whole record")
-        self._totals_kept = self.totals.frames
 
     def _refusal(self, why: str) -> LidarpoolError:
         return LidarpoolError(
@@ -247,16 +211,12 @@ class Journal(Deliveries):
             "another folder."
         )
 
-    # -- writing -----------------------------------------------------------------------
-
-    # A PointStore for its own `cloud`.
+    # -- writing; `append` and `read_into` make it the PointStore of its `cloud` ----------
 
     def append(self, scans: Sequence[int], counts: Sequence[int], points: NDArray[Any]) -> int:
         """Keep the points of some whole scans; returns where they lie."""
-        table = np.array([scans, counts], "<u4")
-        head = _COUNT.pack(len(scans)) + table.tobytes()
-        rows = np.ascontiguousarray(points).view(np.uint8).data
-        return self._append(_POINTS, head, rows) + len(head)
+        head, rows = pack_points(scans, counts, points)
+        return self._append(POINTS, head, rows) + len(head)
 
     def read_into(self, offset: int, buffer: memoryview) -> None:
         """Fill `buffer` with what lies at `offset`."""
@@ -265,7 +225,7 @@ class Journal(Deliveries):
 
     def add_trial(self, trial: Trial) -> None:
         """Keep a planning trial."""
-        self._append(_TRIAL, trial_to_json(trial))
+        self._append(TRIAL, trial_to_json(trial))
         super().add_trial(trial)
 
     def look(self) -> None:
@@ -274,8 +234,7 @@ class Journal(Deliveries):
             return
         with self._explained():
             self._file.sync_if_due()
-            if time.monotonic() >= self._totals_due:
-                self._write_totals()
+            self._totals_file.write_if_due()
 
     def _append(self, kind: int, *pieces: Any) -> int:
         with self._explained():
@@ -290,12 +249,7 @@ class Journal(Deliveries):
             # What there may be is of an earlier run that came to nothing.
             remove_files(self.path)
             file = RecordFile(self.path / RECORDS)
-            header = {
-                "format": FORMAT,
-                "backend": self.backend,
-                "identity": self.identity.to_data(),
-            }
-            file.append(_HEADER, json.dumps(header).encode())
+            file.append(HEADER, pack_header(self.backend, self.identity))
             file.sync()
             flush_folder(self.path)
             flush_folder(self.path.parent)
@@ -304,23 +258,6 @@ class Journal(Deliveries):
             remove_folder(self.path)
             raise
         return file
-
-    def _write_totals(self) -> None:
-        """Replace the totals on disk by those of now; they take their time, so not too often."""
-        begun = time.monotonic()
-        if self.totals.frames > self._totals_kept:
-            fresh = self.path / FRESH
-            fresh.unlink(missing_ok=True)
-            file = RecordFile(fresh)
-            try:
-                file.append(_TOTALS, *self.totals.pack())
-                file.sync()
-            finally:
-                file.close()
-            fresh.replace(self.path / FRAMES)
-            self._totals_kept = self.totals.frames
-        now = time.monotonic()
-        self._totals_due = now + max(TOTALS_EVERY_S, TOTALS_SHARE * (now - begun))
 
     @contextmanager
     def _explained(self) -> Iterator[None]:
@@ -345,7 +282,7 @@ class Journal(Deliveries):
         """
         if self._file is not None:
             with self._explained():
-                self._write_totals()
+                self._totals_file.write()
                 self._file.mark()
                 self._file.unlock()
 

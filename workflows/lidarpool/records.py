@@ -82,6 +82,7 @@ class RecordFile:
             raise
         self.end = os.fstat(self._file.fileno()).st_size
         self._durable = 0
+        self._ragged = False  # whether there are bytes after `end`
         self._synced_at = time.monotonic()
         self._sync_wait = SYNC_EVERY_S
 
@@ -104,14 +105,12 @@ class RecordFile:
                 f"the record at byte {at:,} is damaged, and there are whole ones after it, "
                 f"at byte {later:,}"
             )
-        self.end = at
-
-    def truncate(self) -> None:
-        """Cut off what a crash left behind the last whole record."""
-        self._file.truncate(self.end)
+        self.end, self._ragged = at, at < size
 
     def append(self, kind: int, *pieces: Buffer) -> int:
         """Write a record, its payload given in pieces; returns where the payload begins.
+
+        What a crash has left behind the last whole record is cut off.
 
         Raises
         ------
@@ -125,6 +124,9 @@ class RecordFile:
             crc = zlib.crc32(view, crc)
         at = self.end
         try:
+            if self._ragged:
+                self._file.truncate(at)
+                self._ragged = False
             self._file.seek(at)
             for piece in (memoryview(head + _CRC.pack(crc)), *views):
                 _write_all(self._file, piece)
