@@ -3,6 +3,7 @@
 from .asking import ask_workers
 from .awaiting import await_news
 from .backoff import Backoff
+from .departure import WorkerLeft, telling_departure
 from .errors import PipeClosed, PipeFailed, PoolError
 from .fence import lower_fence, raise_fence
 from .fetch import fetch_available
@@ -47,6 +48,7 @@ __all__ = [
     "TaskRecord",
     "Whereabouts",
     "WorkerInfo",
+    "WorkerLeft",
     "ask_workers",
     "assign_devices",
     "await_news",
@@ -68,6 +70,7 @@ __all__ = [
     "remove_partitions_page",
     "rest",
     "tell_page",
+    "telling_departure",
     "trace",
     "trace_to",
     "worker_identities",

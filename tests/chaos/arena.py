@@ -17,8 +17,8 @@ from poolpart import local_cluster, trace_to
 
 from .events import Board, ChaosPlugin
 
-# The scheduler goes by ten heartbeats, 5 s here, where this is less.
-TIME_TO_LIVE = "5s"
+# Long enough for a worker that imports a lot at once to be heard of again.
+TIME_TO_LIVE = "10s"
 CLOSING_S = 10.0
 _CONFIG = {
     "distributed.scheduler.worker-ttl": TIME_TO_LIVE,

@@ -61,23 +61,26 @@ class Order:
         Where to carry it out.
     scan
         At the first pass there that is about this scan or a later one.
+    worker
+        Whose pass; "" for anybody's.
     """
 
     number: int
     kind: str
     point: str
     scan: int = 0
+    worker: str = ""
 
     @property
     def file_name(self) -> str:
         """The order as the name of its file: nothing has to be read."""
-        return f"{self.number:05d}~{self.kind}~{self.point}~{self.scan}"
+        return f"{self.number:05d}~{self.kind}~{self.point}~{self.scan}~{self.worker}"
 
     @classmethod
     def parse(cls, name: str) -> Order:
         """Inverse of `file_name`; anything may follow."""
-        number, kind, point, scan = name.split("~")[:4]
-        return cls(int(number), kind, point, int(scan))
+        number, kind, point, scan, worker = name.split("~")[:5]
+        return cls(int(number), kind, point, int(scan), worker)
 
 
 @dataclass(frozen=True)
@@ -118,7 +121,8 @@ class Board:
         """Take an order for this point, if there is one that nobody else takes."""
         for name in sorted(path.name for path in (self.folder / _ARMED).iterdir()):
             order = Order.parse(name)
-            if order.point == point and scan >= order.scan:
+            mine = order.worker in ("", worker)
+            if mine and order.point == point and scan >= order.scan:
                 path = self.folder / _FIRED / f"{name}~{os.getpid()}~{worker}"
                 try:
                     (self.folder / _ARMED / name).rename(path)

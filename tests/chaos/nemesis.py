@@ -21,7 +21,7 @@ from .events import KINDS, RESTART, RETIRE, SIGNALS, STOP, Fired, Order, Sink
 RANDOM = "random time"  # in place of a point
 PARTITIONS = ("GPU", "LIDAR", "OTHER")
 ALL_AT_ONCE = 0.15  # part of the faults at random times that come together with the one before
-SHORT_STOPS_S, LONG_STOP_S = (0.1, 2.0), 7.0  # longer than `arena.TIME_TO_LIVE`
+SHORT_STOPS_S, LONG_STOP_S = (0.1, 2.0), 12.0  # longer than `arena.TIME_TO_LIVE`
 LONG_STOPS = 0.1  # part of them
 LOOK_EVERY_S = 0.005
 
@@ -48,6 +48,8 @@ class Fault:
         Which of the workers, from 0 to 1.
     stop_s
         Until SIGCONT.
+    worker
+        At a named point: the worker that is to come to it; "" for any.
     """
 
     number: int
@@ -58,11 +60,12 @@ class Fault:
     partition: str = ""
     pick: float = 0.0
     stop_s: float = 0.5
+    worker: str = ""
 
     @property
     def order(self) -> Order:
         """What the board is told."""
-        return Order(self.number, self.kind, self.point, self.scan)
+        return Order(self.number, self.kind, self.point, self.scan, self.worker)
 
 
 def make_plan(

@@ -64,6 +64,10 @@ DEATHS = {
         at("sort.put", number=2),
         at("generate.sent", number=3),
     ],
+    "LIDAR workers whose clients are closed under the stages": [
+        Fault(number, "restart", RANDOM, after_s=0.3, partition="LIDAR", pick=number % 2 / 2)
+        for number in range(3)
+    ],
 }
 
 

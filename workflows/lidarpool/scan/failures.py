@@ -7,6 +7,8 @@ from contextlib import contextmanager
 
 from distributed import Client, Future, KilledWorker
 
+from poolpart import WorkerLeft
+
 from ..errors import LidarpoolError
 
 ASK_S = 10.0  # for an error's text, which the scheduler has
@@ -29,8 +31,8 @@ def naming_scans(first: int, last: int | None = None) -> Iterator[None]:
 
 
 def was_killed(future: Future) -> bool:
-    """Whether a failed task was given up by Dask because its workers kept dying."""
-    return isinstance(future.exception(timeout=ASK_S), KilledWorker)
+    """Whether it was not a failed task that failed: its workers kept dying, or its worker left."""
+    return isinstance(future.exception(timeout=ASK_S), (KilledWorker, WorkerLeft))
 
 
 def raise_if_failed(future: Future, what: str) -> None:

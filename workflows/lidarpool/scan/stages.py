@@ -23,6 +23,7 @@ from poolpart import (
     Recorder,
     TaskRecord,
     fetch_available,
+    telling_departure,
     trace,
 )
 
@@ -38,6 +39,7 @@ DELIVERY_BYTES = 4 << 20  # of points or frames in one message through the sched
 GIVE_UP_S = 120.0  # asking for a result; the driver sends what does not arrive again
 
 
+@telling_departure()
 def generate(
     attempt: Attempt, survey: Survey, outlet: Pipe, first: int = 0, pace: float | None = None
 ) -> TaskRecord:
@@ -70,6 +72,7 @@ def generate(
     return recorder.done(sent - first)
 
 
+@telling_departure()
 def sort_frames(attempt: Attempt, inlet: Pipe, outlet: Pipe) -> TaskRecord:
     """Stage 3: put frames back into scan order.
 
@@ -109,6 +112,7 @@ def sort_frames(attempt: Attempt, inlet: Pipe, outlet: Pipe) -> TaskRecord:
     return recorder.done(following)
 
 
+@telling_departure()
 def collect(
     attempt: Attempt,
     sensor: Sensor,
