@@ -19,7 +19,7 @@ from tornado.ioloop import PeriodicCallback
 
 from .book import Book, Resources, Seat, seat_key
 from .calls import call
-from .placing import hand_off, held_by, recount, show
+from .placing import hand_off, held_by, recount, show, wake
 from .probe import probe_worker
 from .rebalancing import Rebalancing
 from .restarts import declare_on_worker, keep_on_nanny, restore_on_nanny
@@ -175,6 +175,9 @@ class Steward(SchedulerPlugin):
             except OSError as error:  # it or its nanny is going, or the connection was bad
                 logger.info("The worker at %s does not answer: %s", address, error)
                 await asyncio.sleep(10 * LOOK_EVERY_S)
+        # Somebody may have set the resource by hand before, which wakes nobody.
+        if worker := self.scheduler.workers.get(address):
+            wake(self.scheduler, worker)
 
     async def _step(self, worker: Any, seat: Seat, asked: set[Any]) -> None:
         """Bring a worker nearer to what the book says."""

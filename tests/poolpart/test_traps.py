@@ -62,6 +62,8 @@ def test_a_resource_that_is_set_wakes_no_task_and_a_partition_does(start, wait_u
     Pool.from_client(client).partition("P", workers=["b"])
     assert waiting.result(LONG_S) == 1
     assert scheduler.tasks[by_hand.key].state == "no-worker"
+    Pool.from_client(client).partition("HAND", workers=["a"])
+    assert by_hand.result(LONG_S) == 1
 
 
 def test_a_task_for_a_worker_by_name_waits_for_its_old_address_and_one_for_a_partition_runs(

@@ -1,0 +1,88 @@
+"""A local cluster starts whole and stops whole, whenever its user interrupts."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import psutil
+import pytest
+
+from lidarpool import interrupts
+from lidarpool.interrupts import deferred_interrupts, interrupt_on_signals
+
+SCRIPT = """
+from lidarpool import Scene, Survey, simulate
+
+def tell(progress):
+    if progress.generated and not told:
+        told.append(print("surveying", flush=True))
+
+told = []
+if __name__ == "__main__":
+    survey = Survey(poses=[(0, 0, 1)], steps=1_000_000)
+    print("starting", flush=True)
+    try:
+        simulate(Scene.seed(), survey, gpu_workers=1, other_workers=1, on_progress=tell)
+    except KeyboardInterrupt:
+        print("interrupted", flush=True)
+"""
+
+
+@pytest.mark.parametrize(("word", "pauses"), [("starting", [0.5, 0.5]), ("surveying", [0, 0.2])])
+def test_simulate_leaves_nothing_when_it_is_interrupted_twice(word, pauses, tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT)
+    with subprocess.Popen(
+        [sys.executable, script],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    ) as run:
+        assert run.stdout
+        while word not in run.stdout.readline():
+            assert run.poll() is None
+        for pause in pauses:
+            time.sleep(pause)
+            started = psutil.Process(run.pid).children(recursive=True)
+            os.killpg(run.pid, signal.SIGINT)
+        out, err = run.communicate(timeout=60)
+    assert "interrupted" in out or err.rstrip().endswith("KeyboardInterrupt")
+    # Python's own helper process ends a moment after its parent.
+    _, alive = psutil.wait_procs(started, timeout=10)
+    assert alive == []
+
+
+@pytest.fixture
+def handlers():
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def test_a_first_signal_is_held_back_until_the_body_is_done(handlers):
+    interrupt_on_signals()
+    done = False
+    with pytest.raises(KeyboardInterrupt), deferred_interrupts():
+        signal.raise_signal(signal.SIGTERM)
+        done = True
+    assert done
+
+
+def test_a_second_one_is_not(handlers, monkeypatch):
+    ended: list[int] = []
+    monkeypatch.setattr(interrupts, "_IMPATIENT_S", -1.0)
+    monkeypatch.setattr(interrupts.os, "write", lambda *_: None)
+    monkeypatch.setattr(interrupts.os, "_exit", ended.append)
+    interrupt_on_signals()
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+    with deferred_interrupts():
+        signal.raise_signal(signal.SIGINT)
+        assert ended == [interrupts.INTERRUPTED]
