@@ -6,7 +6,7 @@ import pytest
 from tests.chaos.__main__ import Campaign
 from tests.chaos.arena import Arena
 from tests.chaos.events import KINDS
-from tests.chaos.nemesis import Fault
+from tests.chaos.nemesis import RANDOM, Fault
 from tests.chaos.survey import PAUSES, disturbed, reference, survey
 
 from lidarpool.scan.points import STAGE_POINTS

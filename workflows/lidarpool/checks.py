@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from distributed import Client
@@ -106,7 +107,7 @@ def common_backend(
     LidarpoolError
         If the backend wanted is not there on all of them.
     """
-    answers: Mapping[str, dict[str, str]] = ask_workers(
+    answers: Mapping[str, Any] = ask_workers(
         client, available_backends, [worker.address for worker in workers]
     )
     for answer in answers.values():
