@@ -14,7 +14,8 @@ from distributed import Client
 import lidarpool.scan.caster
 import lidarpool.scan.crew
 import lidarpool.scan.long_stages
-from lidarpool import LidarpoolError, Scene, Sensor, Survey, simulate
+import lidarpool.trials
+from lidarpool import LidarpoolError, Planning, Scene, Sensor, Survey, simulate
 from lidarpool.scan import CloudBuilder, SurveyPump
 from lidarpool.scan import casting as casting_module
 from lidarpool.scan.failures import words_on_memory
@@ -202,3 +203,22 @@ def test_a_worker_that_was_ended_for_its_memory_is_known(client):
     while not (words := words_on_memory(client, ["tcp://127.0.0.1:1"])):
         assert time.monotonic() < until
     assert "memory" in words
+
+
+@pytest.mark.slow
+def test_a_trial_whose_workers_were_killed_is_tried_again(client, monkeypatch, tmp_path):
+    """Dask gives a task up at the fourth death, whoever is to blame for it."""
+    deaths_left = tmp_path / "deaths"
+    deaths_left.write_bytes(b"x" * 4)
+    die, original = dying_at({2}, deaths_left), lidarpool.trials.run_trial
+
+    def run_trial(planning, number):
+        die(number)
+        return original(planning, number)
+
+    monkeypatch.setattr(lidarpool.trials, "run_trial", run_trial)
+    planning = Planning((25, 25), (-30, -20), trials=5, particles=50, iterations=20)
+    result = simulate(Scene.seed(), Survey(poses=[(0, 0, 1)]), planning, client=client)
+    assert sorted(trial.trial for trial in result.trials) == list(range(5))
+    assert deaths_left.stat().st_size == 0
+    assert tasks_left(client) == []

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import time
 import uuid
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Sequence
 
 from distributed import Client, Future
 
-from poolpart import Partition, recorded
+from poolpart import Partition, fetch_available, look_for_tasks, recorded
 
 from .errors import LidarpoolError
 from .plan import Plan, Planning, Trial, best, run_trial
+from .scan.failures import was_killed
 from .task_book import TaskBook
 
 TRIAL = "trial"
+ROUNDS_MOST = 3  # submissions of a trial whose workers die
+LOOK_EVERY_S = 1.0
 
 
 class TrialPump:
@@ -46,6 +50,8 @@ class TrialPump:
         known = {trial.trial for trial in done}
         self._waiting = deque(n for n in range(planning.trials) if n not in known)  # numbers
         self._running: dict[Future, int] = {}  # {future: number of the trial}
+        self._rounds: Counter[int] = Counter()  # {number: how often it was submitted}
+        self._looked_at = time.monotonic()
         # One waits behind each that runs: no slot idles, and a dying worker takes few along.
         self._most = 2 * max(1, partition.slots)
 
@@ -62,33 +68,59 @@ class TrialPump:
         LidarpoolError
             If a trial has failed.
         """
-        done = [f for f in self._running if f.status in ("finished", "error", "cancelled")]
+        if self._running and time.monotonic() - self._looked_at > LOOK_EVERY_S:
+            self._leave_silent_workers()
+        done = [f for f in self._running if f.status in ("error", "cancelled")]
         for future in done:
-            number = self._running.pop(future)
-            if future.status == "error":
-                error = future.exception(timeout=10)
-                raise LidarpoolError(f"Planning trial {number} failed: {error}")
-            if future.status == "cancelled":
-                raise LidarpoolError(
-                    f"Planning trial {number} was cancelled from outside this run."
-                )
-            trial, record = future.result(timeout=30)
-            self.trials.append(trial)
-            self.book.add(record)
+            self._take_failure(future, self._running.pop(future))
+        finished = [f for f in self._running if f.status == "finished"]
+        found = fetch_available(self.client, [f.key for f in finished]) if finished else {}
+        for future in finished:
+            if future.key in found:
+                del self._running[future]
+                trial, record = found[future.key]
+                self.trials.append(trial)
+                self.book.add(record)
         room = min(self._most - len(self._running), len(self._waiting))
         for _ in range(room):
-            number = self._waiting.popleft()
-            future = self.partition.submit(
-                recorded,
-                TRIAL,
-                self.partition.name,
-                run_trial,
-                self.planning,
-                number,
-                key=f"{TRIAL}-{self._run_id}-{number}",
-            )
-            self._running[future] = number
-        return bool(done or room > 0)
+            self._submit(self._waiting.popleft())
+        return bool(done or found or room > 0)
+
+    def _submit(self, number: int, worker: str | None = None) -> None:
+        future = self.partition.submit(
+            recorded,
+            TRIAL,
+            self.partition.name,
+            run_trial,
+            self.planning,
+            number,
+            key=f"{TRIAL}-{self._run_id}-{number}.{self._rounds[number]}",
+            worker=worker,
+        )
+        self._rounds[number] += 1
+        self._running[future] = number
+
+    def _take_failure(self, future: Future, number: int) -> None:
+        if future.status == "cancelled":
+            raise LidarpoolError(f"Planning trial {number} was cancelled from outside this run.")
+        # Dask gives up what was on several workers that died, whoever ended them.
+        if was_killed(future) and self._rounds[number] < ROUNDS_MOST:
+            self._waiting.append(number)
+            return
+        error = future.exception(timeout=10)
+        raise LidarpoolError(f"Planning trial {number} failed: {error}")
+
+    def _leave_silent_workers(self) -> None:
+        """Run trials elsewhere whose workers give no sign of life, or have gone."""
+        self._looked_at = time.monotonic()
+        keys = [future.key for future in self._running]
+        seen = look_for_tasks(self.client, self.partition.name, keys)
+        heard = sorted(seen.members - seen.silent)
+        # One that was bound to a worker which has gone since waits for it for ever.
+        waiting = {key for key, place in seen.tasks.items() if place.state == "no-worker"}
+        lost = [f for f in self._running if f.key in waiting or seen.out_of_reach(f.key)]
+        for place, future in enumerate(lost if heard else []):
+            self._submit(self._running.pop(future), heard[place % len(heard)])
 
     def stop(self, reason: str) -> None:
         """Start no more trials; those that run end by themselves in a fraction of a second."""
