@@ -91,7 +91,7 @@ class Backend(ABC):
         gathering = Gathering()
         for start in range(0, len(rays), self.chunk):
             found = self.closest(rays.part(start, start + self.chunk), weights=False)
-            ray = found.ray.astype(np.int64) + start
+            ray = found.ray.astype(np.uint32) + np.uint32(start)
             gathering.add(Returns(ray, found.t / self._mesh.scale, found.triangle))
         return gathering.returns()
 

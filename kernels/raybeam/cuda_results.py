@@ -15,7 +15,7 @@ from .hits import Gathering, Returns
 
 _PINNED = 1 << 30  # bytes that are page-locked, at most
 _LEAST = 1 << 16
-_DTYPES = (np.int64, np.float64, np.int32)  # ray, distance, triangle
+_DTYPES = (np.uint32, np.float64, np.int32)  # ray, distance, triangle
 
 
 class PinnedRoom:

@@ -127,8 +127,7 @@ class EmbreeBackend(Backend):
             meter.add(_PAIR_BYTES * len(hits.ray))
         hits = _joined(parts)
         np.divide(hits.t, scale, out=hits.t)
-        ray = hits.ray.astype(np.int64, copy=False)
-        return Returns(ray, hits.t, self._mesh.index.take(hits.place))
+        return Returns(hits.ray.astype(np.uint32), hits.t, self._mesh.index.take(hits.place))
 
     def along(self, rays: Rays) -> NDArray[np.int32]:
         """See `Backend.along`; of triangles at one distance Open3D lists one."""

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from .memory import Meter
 
 RAY_BYTES = 28  # a ray in `Hits`
-HIT_BYTES = 20  # a hit in `Returns`
+HIT_BYTES = 16  # a hit in `Returns`
+MOST_RAYS = 1 << 32  # in one call, for their numbers in `Returns` to fit
 
 
 @dataclass(frozen=True)
@@ -51,14 +52,14 @@ class Returns:
     Attributes
     ----------
     ray
-        int64 (k,): number of the ray, ascending.
+        uint32 (k,): number of the ray, ascending.
     distance
         float64 (k,): as in `Hits`, metres.
     triangle
         int32 (k,): as in `Hits`.
     """
 
-    ray: NDArray[np.int64]
+    ray: NDArray[np.uint32]
     distance: NDArray[np.float64]
     triangle: NDArray[np.int32]
 
@@ -82,7 +83,7 @@ class Gathering:
         """All hits, in the order in which they were added."""
         if len(self._parts) == 1:
             return self._parts[0]
-        parts = [Returns(np.zeros(0, np.int64), np.zeros(0), np.zeros(0, np.int32)), *self._parts]
+        parts = [Returns(np.zeros(0, np.uint32), np.zeros(0), np.zeros(0, np.int32)), *self._parts]
         return Returns(
             np.concatenate([part.ray for part in parts]),
             np.concatenate([part.distance for part in parts]),

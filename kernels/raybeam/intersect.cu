@@ -511,7 +511,7 @@ extern "C" __global__ void BOUNDS weigh_table(
     const double* __restrict__ corners, const double* __restrict__ frame,
     const double* __restrict__ origins, int origin_stride,
     const double* __restrict__ directions,
-    const Count* __restrict__ ray, const int* __restrict__ place, Count count,
+    const unsigned int* __restrict__ ray, const int* __restrict__ place, Count count,
     double* __restrict__ u, double* __restrict__ v)
 {
     const Count k = blockIdx.x * (Count)blockDim.x + threadIdx.x;
@@ -574,13 +574,13 @@ extern "C" __global__ void BOUNDS count_closest(
 extern "C" __global__ void BOUNDS pack(
     const int* __restrict__ faces, const double* __restrict__ distance,
     const int* __restrict__ place, const int* __restrict__ ends, Count count, Count first,
-    double scale, Count* __restrict__ ray, double* __restrict__ metres,
+    double scale, unsigned int* __restrict__ ray, double* __restrict__ metres,
     int* __restrict__ triangle)
 {
     const Count i = blockIdx.x * (Count)blockDim.x + threadIdx.x;
     if (i >= count || place[i] < 0) return;
     const int k = ends[i] - 1;
-    ray[k] = first + i;
+    ray[k] = (unsigned int)(first + i);
     metres[k] = distance[i] / scale;
     triangle[k] = faces[place[i]];
 }

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .hits import MOST_RAYS
 from .memory import require
 
 # A squared length this close to 1 is a unit vector up to rounding and is left as it is, so that
@@ -220,6 +221,11 @@ def _has_length(block: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def _refuse_directions(table: NDArray[Any]) -> None:
+    if len(table) > MOST_RAYS:
+        raise ValueError(
+            f"{len(table):,} directions are more than the {MOST_RAYS:,} that one call can number: "
+            "give them in parts."
+        )
     _refuse("Direction", table, _has_length, "a finite vector that is not zero")
 
 

@@ -73,6 +73,7 @@ def test_returns_are_the_hits_of_cast(caster, shapes, monkeypatch):
         np.testing.assert_array_equal(found.distance, hits.distance[hits.hit])
         np.testing.assert_array_equal(found.triangle, hits.triangle[hits.hit])
         assert len(found) == hits.hit.sum()
+        assert sum(row.itemsize for row in (found.ray, found.distance, found.triangle)) == 16
 
 
 @pytest.mark.parametrize("origin", [[0.3, -0.2, 2.9], [0.1, 0.2, 0.3], [9, -7, 5], [4e4, 3e4, 1e4]])

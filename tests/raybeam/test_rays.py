@@ -126,6 +126,12 @@ def test_scan_refused(change, words):
         caster.scan(Pattern(np.eye(3)), **{"origin": [0, 0, 0], **change})
 
 
+def test_more_rays_than_can_be_numbered_are_refused():
+    many = np.broadcast_to([0.0, 0.0, 1.0], (2**32 + 1, 3))  # takes no memory
+    with pytest.raises(ValueError, match=r"4,294,967,297 directions are more than the 4,294,967,2"):
+        Pattern(many)
+
+
 def test_pattern_refused():
     with pytest.raises(ValueError, match="Direction 2 is"):
         Pattern([[0, 0, 1], [0, 1, 0], [0, 0, 0]])
