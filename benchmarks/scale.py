@@ -136,6 +136,7 @@ def measure(workers: int, tasks: int) -> dict[str, Any]:
         figures: dict[str, Any] = {
             "seconds_to_partition": round(seconds, 3),
             "scheduler_idle_percent": round(100 * idle, 1),
+            "tasks": 0,
             "misplaced": 0,
         }
         by_submit(parts[0], workers)  # the first tasks import things
@@ -150,6 +151,7 @@ def measure(workers: int, tasks: int) -> dict[str, Any]:
                 "driver_ms": round(1e3 * (time.process_time() - driver) / done, 4),
                 "scheduler_ms": round(1e3 * max(0.0, busy) / done, 4),
             }
+            figures["tasks"] += done
             figures["misplaced"] += sum(
                 worker not in members[name] for name, ran in names.items() for worker in ran
             )
@@ -176,7 +178,7 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
         clusters[count] = figures = measure(count, options.tasks)
         print(
             f"{count} workers: {figures['seconds_to_partition']} s to partition, "
-            f"{figures['misplaced']} tasks misplaced, scheduler idle at "
+            f"{figures['misplaced']} of {figures['tasks']} misplaced, scheduler idle at "
             f"{figures['scheduler_idle_percent']}% of a core"
         )
         for way in WAYS:

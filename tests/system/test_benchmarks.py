@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import pytest
 from benchmarks import pipeline, scale
 
 
@@ -29,3 +30,10 @@ def test_scale(tmp_path, capsys):
         assert cluster["misplaced"] == 0
         assert all(cluster[way]["tasks_per_second"] > 0 for way in scale.WAYS)
     assert "growth from 4 to 8 workers" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_no_task_is_misplaced_among_two_hundred_workers():
+    figures = scale.measure(workers=200, tasks=14_000)  # and half as many in the other ways
+    assert figures["misplaced"] == 0
+    assert figures["tasks"] == 21_000 + 70_000  # the items of the small ones
