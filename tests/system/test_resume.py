@@ -30,7 +30,7 @@ poses: [[0, 0, 1], [0, 0, 2], [3, 0, 1], [0, 3, 1]]
 steps: 180
 cloud: {keep_every: 2}
 planning: {trials: 30, iterations: 40}
-pool: {backend: numpy}
+pool: {backend: numpy, gpu: 1, other: 1}
 """
 SCANS = 4 * 180
 SMALL = "sensor: {layers: 4}\nplanning: {trials: 2}\n"
@@ -87,7 +87,7 @@ def kept_in(journal: Path) -> int:
 
 def kill_at_random(run: Any, journal: Path, dice: random.Random) -> None:
     """Kill the driver once it has delivered something more, or at any time from its start on."""
-    enough, deadline = kept_in(journal) + dice.randrange(25_000), time.monotonic() + 60
+    enough, deadline = kept_in(journal) + dice.randrange(16_000), time.monotonic() + 60
     if dice.random() < 0.2:
         time.sleep(dice.uniform(0, 3))
     else:
@@ -131,14 +131,11 @@ def test_a_driver_is_killed_twenty_times(start_command, undisturbed, tmp_path):
     """Each time with a cluster of its own, whose workers end by themselves."""
     kills = 0
     for seed in range(20):
-        out = tmp_path / str(seed)
-        out.mkdir()
-        sizes = kill_and_resume(start_command, tmp_path, min(3, 20 - kills), seed)
-        kills += len(sizes)
+        kills += len(kill_and_resume(start_command, tmp_path, min(7, 20 - kills), seed))
         assert same_result(tmp_path / "out", undisturbed)
         for entry in (tmp_path / "out").iterdir():
             entry.unlink()
-        if kills >= 20:
+        if kills == 20:
             break
     assert kills == 20
 
