@@ -182,9 +182,10 @@ class Nemesis:
         while not self._over.is_set():
             if due == float("inf") and self.arena.board.has_events:  # it has begun
                 due = time.monotonic()
-            if timed and time.monotonic() >= due + timed[0].after_s:
+            # One that finds nobody there waits until somebody is.
+            while timed and time.monotonic() >= due + timed[0].after_s and self.strike(timed[0]):
                 due = time.monotonic()
-                self.strike(timed.pop(0))
+                timed.pop(0)
             for fired in self.arena.board.fired():
                 self._answer(fired)
             self._wake(time.monotonic())
@@ -214,22 +215,26 @@ class Nemesis:
 
     # -- in either thread --------------------------------------------------------------
 
-    def strike(self, fault: Fault) -> None:
-        """Carry out a fault on a worker of its partition."""
-        names = [n for n in self.arena.names(fault.partition) if self.arena.pid(n)]
+    def strike(self, fault: Fault) -> bool:
+        """Carry out a fault on a worker of its partition; False if there is none now."""
+        there = self.arena.pid if fault.kind in SIGNALS else self.arena.address
+        names = [name for name in self.arena.names(fault.partition) if there(name)]
         if not names:
-            return
+            return False
         name = names[int(fault.pick * len(names))]
+        done = self._signal(fault, name) if fault.kind in SIGNALS else self._help(fault.kind, name)
+        if done:
+            self._note(fault)
+        return done
+
+    def _signal(self, fault: Fault, name: str) -> bool:
         pid = self.arena.pid(name)
-        if fault.kind in SIGNALS:
-            if pid is None or not _send(pid, SIGNALS[fault.kind]):
-                return
-            if fault.kind == STOP:
-                with self._lock:
-                    self._stopped[pid] = time.monotonic() + fault.stop_s
-        elif not self._help(fault.kind, name):
-            return
-        self._note(fault)
+        if pid is None or not _send(pid, SIGNALS[fault.kind]):
+            return False
+        if fault.kind == STOP:
+            with self._lock:
+                self._stopped[pid] = time.monotonic() + fault.stop_s
+        return True
 
     def _help(self, kind: str, name: str) -> bool:
         """Have a worker leave or restart, in a thread of its own; False if it is not there."""
