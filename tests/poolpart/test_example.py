@@ -8,6 +8,7 @@ import sys
 import threading
 from pathlib import Path
 
+import dask
 import numpy as np
 import pytest
 from distributed import Client, LocalCluster
@@ -39,6 +40,8 @@ def test_whichever_worker_is_killed_the_file_is_the_same(tmp_path, wait_until):
     path, total = tmp_path / "out.bin", 150
     run = runpy.run_path(str(EXAMPLE))["run"]
     with (
+        # Else it gives up a worker that is not back in 15 seconds, or dies twice within them.
+        dask.config.set({"distributed.deploy.lost-worker-timeout": "300s"}),
         LocalCluster(
             n_workers=4,
             threads_per_worker=1,
