@@ -6,6 +6,7 @@ import random
 import struct
 import subprocess
 import sys
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -300,6 +301,18 @@ def test_a_journal_that_cannot_be_made_says_so(path, monkeypatch):
         with pytest.raises(LidarpoolError, match=r"cannot be written \(No space left on device\)"):
             deliver(journal, DELIVERIES[:1])
     assert not path.exists() and journal.kept == ""
+
+
+def test_the_file_is_open_as_long_as_somebody_reads_from_it(path, expected):
+    journal = Journal(path, make_job())
+    deliver(journal)
+    file = weakref.ref(journal._store.file)
+    result = make_result(journal)
+    del journal
+    assert len(result.cloud) == len(result.points)
+    assert file() is not None
+    del result
+    assert file() is None  # at once: nothing holds it in a circle
 
 
 # -- damage --------------------------------------------------------------------------------------

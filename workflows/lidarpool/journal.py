@@ -8,13 +8,10 @@ while. Everything in them is numbers and JSON; nothing is ever unpickled.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-from numpy.typing import NDArray
 
 from .deliveries import Deliveries
 from .errors import LidarpoolError
@@ -23,9 +20,6 @@ from .job import Job
 from .journal_folder import (
     RECORDS,
     check_ours,
-    flush_folder,
-    remove_files,
-    remove_folder,
     remove_journal,
 )
 from .journal_format import (
@@ -34,11 +28,10 @@ from .journal_format import (
     POINTS,
     TRIAL,
     UNREADABLE,
-    pack_header,
-    pack_points,
     unpack_header,
     unpack_points,
 )
+from .journal_store import JournalStore
 from .plan import Trial
 from .records import Record, RecordFile
 from .totals_file import TotalsFile
@@ -114,13 +107,21 @@ class Journal(Deliveries):
     """
 
     def __init__(self, path: Path, job: Job, terms: Terms = PYTHON_TERMS) -> None:
-        super().__init__(job, self)
         self.path, self.terms = path, terms
-        self.identity = Identity.of(job.scene, job.survey, job.planning)
-        self._file: RecordFile | None = None
+        self._store = JournalStore(path, Identity.of(job.scene, job.survey, job.planning))
+        super().__init__(job, self._store)
         self._totals_file = TotalsFile(path, self.totals)
 
     # -- what is in it -----------------------------------------------------------------
+
+    @property
+    def backend(self) -> str:
+        """Backend that casts the scans; empty until it is known."""
+        return self._store.backend
+
+    @backend.setter
+    def backend(self, name: str) -> None:
+        self._store.backend = name
 
     @property
     def kept(self) -> str:
@@ -167,7 +168,7 @@ class Journal(Deliveries):
         except UNREADABLE as error:
             raise self._refusal(f"is damaged ({error})") from error
         if self.kept:
-            self._file = file
+            self._store.file = file
             self.resumed = self.cloud.ledger.delivered
         else:  # it ended before it began; the first delivery will start it anew
             self.backend = ""
@@ -201,7 +202,7 @@ class Journal(Deliveries):
         number, backend, theirs = unpack_header(record.payload)
         if theirs is None:
             raise self._refusal(f"is of format {number}, and this version reads {FORMAT}")
-        if difference := self.identity.difference(theirs):
+        if difference := self._store.identity.difference(theirs):
             raise self._refusal(f"cannot be continued, {difference}")
         return backend
 
@@ -211,64 +212,19 @@ class Journal(Deliveries):
             "another folder."
         )
 
-    # -- writing; `append` and `read_into` make it the PointStore of its `cloud` ----------
-
-    def append(self, scans: Sequence[int], counts: Sequence[int], points: NDArray[Any]) -> int:
-        """Keep the points of some whole scans; returns where they lie."""
-        head, rows = pack_points(scans, counts, points)
-        return self._append(POINTS, head, rows) + len(head)
-
-    def read_into(self, offset: int, buffer: memoryview) -> None:
-        """Fill `buffer` with what lies at `offset`."""
-        assert self._file is not None  # or nobody could know of an offset
-        self._file.read_into(offset, buffer)
+    # -- writing -----------------------------------------------------------------------
 
     def add_trial(self, trial: Trial) -> None:
         """Keep a planning trial."""
-        self._append(TRIAL, trial_to_json(trial))
+        self._store.append_record(TRIAL, trial_to_json(trial))
         super().add_trial(trial)
 
     def look(self) -> None:
         """Sync, and write down the totals of the frames, if it is time; call it often."""
-        if self._file is None:
-            return
-        with self._explained():
-            self._file.sync_if_due()
-            self._totals_file.write_if_due()
-
-    def _append(self, kind: int, *pieces: Any) -> int:
-        with self._explained():
-            if self._file is None:
-                self._file = self._create()
-            return self._file.append(kind, *pieces)
-
-    def _create(self) -> RecordFile:
-        """Make the journal with its header, and both certain to be there after a crash."""
-        self.path.mkdir(exist_ok=True)
-        try:
-            # What there may be is of an earlier run that came to nothing.
-            remove_files(self.path)
-            file = RecordFile(self.path / RECORDS)
-            file.append(HEADER, pack_header(self.backend, self.identity))
-            file.sync()
-            flush_folder(self.path)
-            flush_folder(self.path.parent)
-        except OSError:
-            remove_files(self.path)
-            remove_folder(self.path)
-            raise
-        return file
-
-    @contextmanager
-    def _explained(self) -> Iterator[None]:
-        """Say of an error of the disk what it means."""
-        try:
-            yield
-        except OSError as error:
-            raise LidarpoolError(
-                f"The journal {self.path} cannot be written ({error.strerror or error}): make room "
-                "on its disk, or give another folder."
-            ) from error
+        if (file := self._store.file) is not None:
+            with self._store.explained():
+                file.sync_if_due()
+                self._totals_file.write_if_due()
 
     # -- the end -----------------------------------------------------------------------
 
@@ -280,11 +236,11 @@ class Journal(Deliveries):
         LidarpoolError
             If the disk is full; what was delivered is there all the same.
         """
-        if self._file is not None:
-            with self._explained():
+        if (file := self._store.file) is not None:
+            with self._store.explained():
                 self._totals_file.write()
-                self._file.mark()
-                self._file.unlock()
+                file.mark()
+                file.unlock()
 
     def remove(self) -> None:
         """Remove the journal and let go of its files."""
@@ -311,5 +267,4 @@ class Journal(Deliveries):
 
     def close(self) -> None:
         """Let go of the files; afterwards the points cannot be read any more."""
-        if self._file is not None:
-            self._file.close()
+        self._store.close()
