@@ -17,11 +17,11 @@ from poolpart import local_cluster, trace_to
 
 from .events import Board, ChaosPlugin
 
-# Long enough for a worker that imports a lot at once to be heard of again.
-TIME_TO_LIVE = "10s"
+# Long enough for a worker that imports a lot at once to be heard of again. The scheduler looks
+# at such intervals, too: a worker is given up after once to twice this.
+TIME_TO_LIVE_S = 10
 CLOSING_S = 10.0
 _CONFIG = {
-    "distributed.scheduler.worker-ttl": TIME_TO_LIVE,
     # Half of what is started here is killed; no need to be told each time.
     "logging.distributed": "critical",
 }
@@ -38,17 +38,24 @@ class Arena:
         Threads and slots of each.
     pauses
         Seconds a scan to hold at some points of the workers.
+    time_to_live_s
+        Without a heartbeat of a worker, before the scheduler gives it up.
     """
 
     def __init__(
-        self, lidar: int = 2, slots: int = 4, pauses: Mapping[str, float] | None = None
+        self,
+        lidar: int = 2,
+        slots: int = 4,
+        pauses: Mapping[str, float] | None = None,
+        time_to_live_s: int = TIME_TO_LIVE_S,
     ) -> None:
         self._stack = ExitStack()
+        self._config = {**_CONFIG, "distributed.scheduler.worker-ttl": f"{time_to_live_s}s"}
         self._lidar, self._slots, self._pauses = lidar, slots, dict(pauses or {})
 
     def __enter__(self) -> Arena:
         with ExitStack() as stack:
-            stack.enter_context(dask.config.set(_CONFIG))
+            stack.enter_context(dask.config.set(self._config))
             folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="chaos-"))
             self.board = Board(Path(folder))
             self.cluster: SpecCluster = stack.enter_context(

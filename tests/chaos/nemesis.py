@@ -15,13 +15,14 @@ from functools import partial
 
 from poolpart import trace_to
 
-from .arena import Arena
+from .arena import TIME_TO_LIVE_S, Arena
 from .events import KINDS, RESTART, RETIRE, SIGNALS, STOP, Fired, Order, Sink
 
 RANDOM = "random time"  # in place of a point
 PARTITIONS = ("GPU", "LIDAR", "OTHER")
 ALL_AT_ONCE = 0.15  # part of the faults at random times that come together with the one before
-SHORT_STOPS_S, LONG_STOP_S = (0.1, 2.0), 12.0  # longer than `arena.TIME_TO_LIVE`
+SHORT_STOPS_S = 0.1, 2.0
+LONG_STOP_S = 2.1 * TIME_TO_LIVE_S
 LONG_STOPS = 0.1  # part of them
 LOOK_EVERY_S = 0.005
 
