@@ -14,7 +14,8 @@ from poolpart.probe import visible_gpus
 from raybeam import available_backends
 
 from ._version import __version__
-from .complaints import did_you_mean
+from .command_group import CommandGroup
+from .completion import PROGRAM, complete_backend, completion
 from .connection import connected
 from .errors import LidarpoolError
 from .interrupts import INTERRUPTED, STOPPED, UNTOUCHED, interrupt_on_signals
@@ -22,6 +23,7 @@ from .quiet import silence_logs
 from .report import versions
 from .run_command import RunOptions, run_scenario
 from .scenario import Scenario
+from .scenario_commands import init, schema
 from .scene_commands import scene
 from .tls import TlsFiles
 
@@ -49,28 +51,14 @@ def _tls_files(command: Callable[..., None]) -> Callable[..., None]:
     return command
 
 
-class _Commands(click.Group):
-    """Names the command that a misspelt one may have been meant to be."""
-
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Find the command that the first argument names."""
-        if args and self.get_command(ctx, args[0]) is None and not args[0].startswith("-"):
-            hint = did_you_mean(args[0], self.list_commands(ctx))
-            raise click.UsageError(
-                f"There is no command {args[0]!r}.{hint} See lidarpool --help.", ctx
-            )
-        return super().resolve_command(ctx, args)
-
-
-@click.group(cls=_Commands)
-@click.version_option(__version__, prog_name="lidarpool")
+@click.group(cls=CommandGroup, context_settings={"max_content_width": 100})
+@click.version_option(__version__, prog_name=PROGRAM)
 def cli() -> None:
     """Simulate lidar surveys on a partitioned Dask cluster."""
 
 
-cli.add_command(scene)
+for _command in (init, schema, scene, completion):
+    cli.add_command(_command)
 
 
 @cli.command()
@@ -98,6 +86,7 @@ def demo(out: Path, tls: bool, page: bool, quiet: bool) -> None:
 @click.option(
     "--backend",
     metavar="[auto|cuda|embree|numpy]",
+    shell_complete=complete_backend,
     help="Ray caster of stage 2; by default the scenario's, else the fastest there is.",
 )
 @click.option("--no-plan", is_flag=True, help="Leave the path planning out.")
@@ -204,7 +193,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     interrupt_on_signals()
     silence_logs()
     try:
-        cli.main(args=arguments, prog_name="lidarpool", standalone_mode=False)
+        cli.main(args=arguments, prog_name=PROGRAM, standalone_mode=False)
     except (LidarpoolError, PoolError) as error:
         _die(" ".join([str(error), *_notes(error)]), 2)
     except click.UsageError as error:

@@ -66,9 +66,19 @@ class Scenario(Section):
     scene: SceneSection = SceneSection()
     sensor: SensorSection = SensorSection()
     poses: Annotated[
-        tuple[PoseSection, ...] | None, Strict(False), Field(min_length=1, max_length=1_000_000)
+        tuple[PoseSection, ...] | None,
+        Strict(False),
+        Field(
+            min_length=1,
+            max_length=1_000_000,
+            description="where the sensor stands, world metres, Z-up; by default 1, 2 and 3 m "
+            "above the origin (default objects) or the middle of the floor (files)",
+            examples=[[[0, 0, 1], [0, 0, 2], {"position": [0, 0, 3], "yaw_deg": 90}]],
+        ),
     ] = None
-    steps: Annotated[int, Field(ge=1, le=1_000_000)] = 36
+    steps: Annotated[
+        int, Field(ge=1, le=1_000_000, description="time steps (scans) from each pose")
+    ] = 36
     cloud: CloudSection = CloudSection()
     planning: PlanningSection = PlanningSection()
     pool: PoolSection = PoolSection()

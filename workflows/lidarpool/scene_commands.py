@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from .command_group import CommandGroup
 from .scene import Scene
 
 _out = click.argument("out", type=click.Path(path_type=Path), metavar="OUT.ply|.glb|.obj")
@@ -24,7 +25,7 @@ _seed = click.option(
 )
 
 
-@click.group(name="scene")
+@click.group(name="scene", cls=CommandGroup)
 def scene() -> None:
     """Make scenes to survey, as mesh files."""
 

@@ -38,13 +38,32 @@ class MeshFile(Section):
     it all. Relative names start from the scenario's folder.
     """
 
-    file: Annotated[str, Field(min_length=1, max_length=4096)]
-    unit: Literal["um", "mm", "cm", "dm", "m", "km", "in", "ft", "yd", "mi"] | None = None
-    up_axis: Literal["x", "y", "z"] | None = None
-    translation: Triple = (0.0, 0.0, 0.0)
-    rotation_deg: Angles = (0.0, 0.0, 0.0)
-    scale: Factors = (1.0, 1.0, 1.0)
-    matrix: Matrix | None = None
+    file: Annotated[
+        str,
+        Field(
+            min_length=1,
+            max_length=4096,
+            description=".glb .gltf .obj .stl .ply .off .dae or .3mf, from the scenario's folder",
+        ),
+    ]
+    unit: Annotated[
+        Literal["um", "mm", "cm", "dm", "m", "km", "in", "ft", "yd", "mi"] | None,
+        Field(description="length unit of the file; by default what it states, else metres"),
+    ] = None
+    up_axis: Annotated[
+        Literal["x", "y", "z"] | None,
+        Field(description="axis of the file that points up; by default what its format states"),
+    ] = None
+    translation: Annotated[Triple, Field(description="moved by so many metres, last")] = (0, 0, 0)
+    rotation_deg: Annotated[
+        Angles, Field(description="turned about the world's x, y and z axes, degrees")
+    ] = (0, 0, 0)
+    scale: Annotated[
+        Factors, Field(description="one factor, or one for each axis; applied first")
+    ] = (1, 1, 1)
+    matrix: Annotated[
+        Matrix | None, Field(description="all of the placement at once, 4 rows of 4, metres")
+    ] = None
 
     @model_validator(mode="before")
     @classmethod
@@ -74,8 +93,10 @@ class MeshFile(Section):
 class Ground(Section):
     """A level rectangle under the scene, `margin_m` wider than it on each side."""
 
-    height_m: Coordinate = 0.0
-    margin_m: Annotated[float, Field(ge=0, le=1e6)] = 5.0
+    height_m: Annotated[Coordinate, Field(description="z of the rectangle, metres")] = 0.0
+    margin_m: Annotated[
+        float, Field(ge=0, le=1e6, description="wider than the scene on each side, metres")
+    ] = 5.0
 
 
 class SceneSection(Section):
@@ -84,9 +105,30 @@ class SceneSection(Section):
     `preset` is 'seed' where no files are given, else 'none'.
     """
 
-    preset: Literal["seed", "none"] | None = None
-    files: Annotated[tuple[MeshFile, ...], Strict(False), Field(max_length=10_000)] = ()
-    ground: Ground | None = None
+    preset: Annotated[
+        Literal["seed", "none"] | None,
+        Field(
+            description="seed (six objects) where no files are given; with files: none",
+            examples=["seed"],
+        ),
+    ] = None
+    files: Annotated[
+        tuple[MeshFile, ...],
+        Strict(False),
+        Field(
+            max_length=10_000,
+            description="mesh files, by name or with unit, up_axis, scale, rotation_deg, "
+            "translation",
+            examples=[["hall.glb", {"file": "part.stl", "unit": "mm", "translation": [1, 0, 0]}]],
+        ),
+    ] = ()
+    ground: Annotated[
+        Ground | None,
+        Field(
+            description="a level rectangle below it all, metres",
+            examples=[{"height_m": 0, "margin_m": 5}],
+        ),
+    ] = None
 
     @model_validator(mode="before")
     @classmethod
@@ -110,14 +152,25 @@ class SceneSection(Section):
 
 
 class SensorSection(Section):
-    """The lidar; see `Sensor`."""
+    """The lidar: a turning head with evenly spaced azimuths and elevations; see `Sensor`."""
 
-    rays_per_revolution: Annotated[int, Field(ge=1, le=10_000_000)] = 1000
-    layers: Annotated[int, Field(ge=1, le=65_535)] = 40
-    vertical_fov_deg: Annotated[float, Field(gt=0, le=180)] = 60.0
-    step_deg: Annotated[float, Field(gt=0, le=360)] = 10.0
-    min_range_m: Annotated[float, Field(ge=0, le=1e8)] = 0.0
-    max_range_m: Annotated[float, Field(gt=0, allow_inf_nan=True)] = float("inf")
+    rays_per_revolution: Annotated[
+        int, Field(ge=1, le=10_000_000, description="azimuths in one turn")
+    ] = 1000
+    layers: Annotated[int, Field(ge=1, le=65_535, description="elevations (rings)")] = 40
+    vertical_fov_deg: Annotated[
+        float, Field(gt=0, le=180, description="degrees, half of it below the horizon")
+    ] = 60.0
+    step_deg: Annotated[
+        float, Field(gt=0, le=360, description="degrees turned in one time step")
+    ] = 10.0
+    min_range_m: Annotated[
+        float, Field(ge=0, le=1e8, description="metres; nearer returns are not seen")
+    ] = 0.0
+    max_range_m: Annotated[
+        float,
+        Field(gt=0, allow_inf_nan=True, description="metres; farther returns are not seen"),
+    ] = float("inf")
 
     @model_validator(mode="after")
     def _bounded(self) -> SensorSection:
@@ -137,10 +190,10 @@ class SensorSection(Section):
 class PoseSection(Section):
     """Where the sensor stands, in world coordinates; in YAML [x, y, z] will do."""
 
-    position: Triple
-    yaw_deg: Angle = 0.0
-    pitch_deg: Angle = 0.0
-    roll_deg: Angle = 0.0
+    position: Annotated[Triple, Field(description="x, y and z, metres")]
+    yaw_deg: Annotated[Angle, Field(description="turned about z, first")] = 0.0
+    pitch_deg: Annotated[Angle, Field(description="turned about the new y, then")] = 0.0
+    roll_deg: Annotated[Angle, Field(description="turned about the new x, last")] = 0.0
 
     @model_validator(mode="before")
     @classmethod
@@ -151,8 +204,12 @@ class PoseSection(Section):
 class CloudSection(Section):
     """What is kept of the hits."""
 
-    keep_every: Annotated[int, Field(ge=1, le=1_000_000)] = 5
-    precision_m: Annotated[float, Field(ge=1e-6, le=1000)] = 0.01
+    keep_every: Annotated[
+        int, Field(ge=1, le=1_000_000, description="of the hits of each scan, every n-th")
+    ] = 5
+    precision_m: Annotated[
+        float, Field(ge=1e-6, le=1000, description="metres that points are rounded to")
+    ] = 0.01
 
 
 class Obstacle(Section):
@@ -161,9 +218,14 @@ class Obstacle(Section):
     `object` may hold * and ?, and is all of the entry in the short form: `- Shelf*`.
     """
 
-    object: Annotated[str, Field(min_length=1)] | None = None
-    centre: Pair | None = None
-    radius_m: Annotated[float, Field(gt=0, le=1e6)] | None = None
+    object: Annotated[
+        Annotated[str, Field(min_length=1)] | None,
+        Field(description="name of objects of the scene, may hold * and ?"),
+    ] = None
+    centre: Annotated[Pair | None, Field(description="x and y of a disc, metres")] = None
+    radius_m: Annotated[
+        Annotated[float, Field(gt=0, le=1e6)] | None, Field(description="of the disc, metres")
+    ] = None
 
     @model_validator(mode="before")
     @classmethod
@@ -188,16 +250,39 @@ class PlanningSection(Section):
     each radius.
     """
 
-    enabled: bool | None = None
-    start: Pair | None = None
-    target: Pair | None = None
-    obstacles: Annotated[tuple[Obstacle, ...], Strict(False)] | None = None
-    clearance_m: Annotated[float, Field(ge=0, le=1000)] = 0.0
-    trials: Annotated[int, Field(ge=1, le=1_000_000)] = 100
-    particles: Annotated[int, Field(ge=1, le=10_000_000)] = 1000
-    iterations: Annotated[int, Field(ge=1, le=1_000_000)] = 300
-    waypoints: Annotated[int, Field(ge=1, le=100)] = 5
-    seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 0
+    enabled: Annotated[
+        bool | None,
+        Field(description="by default whether there are start and target", examples=[True]),
+    ] = None
+    start: Annotated[
+        Pair | None,
+        Field(description="x and y, metres; the default objects have one", examples=[[25, 25]]),
+    ] = None
+    target: Annotated[
+        Pair | None,
+        Field(description="x and y, metres; the default objects have one", examples=[[-30, -20]]),
+    ] = None
+    obstacles: Annotated[
+        Annotated[tuple[Obstacle, ...], Strict(False)] | None,
+        Field(
+            description="circles about all objects that are not flat (auto), or names and discs",
+            examples=["auto", ["Shelf*", {"centre": [-6, -1], "radius_m": 1}]],
+        ),
+    ] = None
+    clearance_m: Annotated[
+        float, Field(ge=0, le=1000, description="metres kept from obstacles")
+    ] = 0.0
+    trials: Annotated[
+        int, Field(ge=1, le=1_000_000, description="particle swarms, each with its own seed")
+    ] = 100
+    particles: Annotated[int, Field(ge=1, le=10_000_000, description="of each swarm")] = 1000
+    iterations: Annotated[int, Field(ge=1, le=1_000_000, description="of each swarm")] = 300
+    waypoints: Annotated[
+        int, Field(ge=1, le=100, description="corners of the path between its ends")
+    ] = 5
+    seed: Annotated[
+        int, Field(ge=0, le=2**63 - 1, description="the same seed gives the same path")
+    ] = 0
 
     @model_validator(mode="before")
     @classmethod
@@ -214,8 +299,19 @@ class PoolSection(Section):
     the workers it has. `collectors` and `queue_capacity` hold for both.
     """
 
-    gpu: Annotated[int, Field(ge=1, le=10_000)] | None = None
-    other: Annotated[int, Field(ge=1, le=10_000)] | None = None
-    collectors: Annotated[int, Field(ge=1, le=64)] = 2
-    queue_capacity: Annotated[int, Field(ge=1, le=100_000)] = 10
-    backend: Literal["auto", "cuda", "embree", "numpy"] = "auto"
+    gpu: Annotated[
+        Annotated[int, Field(ge=1, le=10_000)] | None,
+        Field(description="workers that cast rays; by default one a GPU", examples=[1]),
+    ] = None
+    other: Annotated[
+        Annotated[int, Field(ge=1, le=10_000)] | None,
+        Field(description="workers that plan; by default they follow the cores", examples=[1]),
+    ] = None
+    collectors: Annotated[int, Field(ge=1, le=64, description="tasks that make points of hits")] = 2
+    queue_capacity: Annotated[
+        int, Field(ge=1, le=100_000, description="items that stage 1 may be ahead of stage 2")
+    ] = 10
+    backend: Annotated[
+        Literal["auto", "cuda", "embree", "numpy"],
+        Field(description="cuda, embree or numpy; auto takes the fastest that is there"),
+    ] = "auto"

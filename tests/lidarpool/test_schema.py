@@ -1,0 +1,95 @@
+"""The schema says what `Scenario` takes: what one accepts or refuses, the other does."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from jsonschema import Draft202012Validator
+
+from lidarpool import LidarpoolError
+from lidarpool.scenario import Scenario
+from lidarpool.schema import scenario_schema, schema_text
+from lidarpool.template import scenario_template
+
+EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.yaml"))
+
+GOOD: list[dict[str, Any]] = [
+    {},
+    {"scene": "hall.glb"},
+    {"scene": "seed"},
+    {"scene": ["hall.glb", {"file": "part.stl", "scale": 0.001}]},
+    {"scene": {"files": "hall.glb", "ground": {}}},
+    {"scene": {"files": [{"file": "a.ply", "scale": [1, 2, 3], "up_axis": "y"}]}},
+    {"scene": None, "sensor": None, "cloud": None, "planning": None, "pool": None},
+    {"scene": {"files": [{"file": "a.ply", "matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0],
+                                                       [0, 0, 0, 1]]}]}},
+    {"poses": [[0, 0, 1], {"position": [0, 0, 2], "yaw_deg": 90}]},
+    {"planning": {"obstacles": "auto"}},
+    {"planning": {"obstacles": ["Shelf*", {"centre": [1, 2], "radius_m": 3}], "start": [1, 1]}},
+    {"pool": {"gpu": 2, "backend": "numpy"}},
+    {"sensor": {"max_range_m": float("inf")}},
+]  # fmt: skip
+BAD: list[dict[str, Any]] = [
+    {"sensors": {}},
+    {"sensor": {"layer": 4}},
+    {"sensor": {"layers": 0}},
+    {"sensor": {"layers": "40"}},
+    {"scene": {"files": [{"unit": "mm"}]}},
+    {"scene": {"files": [{"file": "a.stl", "unit": "mile"}]}},
+    {"poses": []},
+    {"poses": [[0, 0]]},
+    {"poses": [{"yaw_deg": 3}]},
+    {"planning": {"obstacles": [{"centre": [1, 2, 3], "radius_m": 1}]}},
+    {"planning": {"start": [1]}},
+    {"pool": {"backend": "embre"}},
+    {"pool": {"gpu": 0}},
+    {"cloud": {"keep_every": 2.5}},
+]
+
+
+@pytest.fixture(scope="module")
+def validator() -> Draft202012Validator:
+    schema = json.loads(schema_text(), parse_constant=pytest.fail)  # NaN and Infinity: no JSON
+    Draft202012Validator.check_schema(schema)
+    return Draft202012Validator(schema)
+
+
+@pytest.mark.parametrize("data", GOOD, ids=str)
+def test_what_a_scenario_takes_is_valid(validator, data):
+    Scenario.from_data(data)
+    assert list(validator.iter_errors(data)) == []
+
+
+@pytest.mark.parametrize("data", BAD, ids=str)
+def test_what_a_scenario_refuses_is_not(validator, data):
+    with pytest.raises(LidarpoolError):
+        Scenario.from_data(data)
+    assert not validator.is_valid(data)
+
+
+def test_the_examples_and_the_template_are_valid(validator):
+    texts = [path.read_text() for path in EXAMPLES] + [scenario_template()]
+    assert len(texts) >= 3
+    for text in texts:
+        assert list(validator.iter_errors(yaml.safe_load(text))) == []
+
+
+def test_every_example_of_a_field_is_valid(validator):
+    for name, section in scenario_schema()["$defs"].items():
+        for field, content in section.get("properties", {}).items():
+            local = {"$defs": scenario_schema()["$defs"], **content}
+            for example in content.get("examples", []):
+                errors = list(Draft202012Validator(local).iter_errors(example))
+                assert errors == [], (name, field)
+
+
+def test_editors_find_words_and_choices():
+    schema = scenario_schema()
+    pool = schema["$defs"]["PoolSection"]["properties"]
+    assert pool["backend"]["enum"] == ["auto", "cuda", "embree", "numpy"]
+    assert "fastest" in pool["backend"]["description"]
+    assert schema["$defs"]["SensorSection"]["properties"]["layers"]["default"] == 40

@@ -1,0 +1,65 @@
+from __future__ import annotations
+
+import re
+
+import pytest
+import yaml
+
+from lidarpool import LidarpoolError
+from lidarpool.scenario import Scenario
+from lidarpool.sections import CloudSection, PlanningSection, PoolSection, SceneSection
+from lidarpool.sections import SensorSection as Sensor
+from lidarpool.template import scenario_template
+
+TEXT = scenario_template(("lidarpool run scenario.yaml",), "scenario.schema.json")
+# A field that is commented out: its name, a colon and a value in YAML.
+OFF = re.compile(r"^( *)# ([a-z_]+: \S.*)$")
+
+
+def test_it_is_valid_and_is_the_default_survey(tmp_path):
+    (tmp_path / "scenario.yaml").write_text(TEXT)
+    assert Scenario.load(tmp_path / "scenario.yaml").model_dump() == Scenario().model_dump()
+
+
+def test_its_head_names_the_schema_and_what_to_do():
+    assert TEXT.startswith("# yaml-language-server: $schema=scenario.schema.json\n")
+    assert "#     lidarpool run scenario.yaml\n" in TEXT
+    assert "yaml-language-server" not in scenario_template()
+
+
+def test_every_field_is_in_it_with_a_comment_of_its_own():
+    for section in (Scenario, SceneSection, Sensor, CloudSection, PlanningSection, PoolSection):
+        for name, field in section.model_fields.items():
+            assert re.search(rf"^ *(# )?{name}:", TEXT, re.M), name
+            if section is not Scenario:
+                assert field.description, name
+    assert max(map(len, TEXT.splitlines())) <= 100
+
+
+def test_every_default_is_written_out():
+    data = yaml.safe_load(TEXT)
+    assert data["sensor"]["layers"] == 40 and data["sensor"]["max_range_m"] == float("inf")
+    assert data["planning"]["trials"] == 100 and data["pool"]["backend"] == "auto"
+    assert data["steps"] == 36
+
+
+@pytest.mark.parametrize(
+    "line", [line for line in TEXT.splitlines() if OFF.match(line) and "$schema" not in line]
+)
+def test_what_is_commented_out_is_valid_too(line):
+    assert TEXT.count(line) == 1
+    data = yaml.safe_load(TEXT.replace(line, OFF.sub(r"\1\2", line)))
+    scenario = Scenario.from_data(data)
+    # What cannot be told from a default that follows from other things says it in words.
+    assert "auto" in line or scenario.model_dump() != Scenario().model_dump()
+
+
+def test_the_lines_that_are_commented_out_are_found():
+    found = [OFF.match(line) for line in TEXT.splitlines()]
+    names = {match[2].partition(":")[0] for match in found if match}
+    assert names >= {"preset", "files", "ground", "poses", "start", "obstacles", "gpu", "enabled"}
+
+
+def test_a_mistake_in_it_is_found():
+    with pytest.raises(LidarpoolError, match="Did you mean 'layers'"):
+        Scenario.from_data(yaml.safe_load(TEXT.replace("layers:", "layer:")))

@@ -1,0 +1,128 @@
+"""What helps before the first run: init, schema, completion, help, words for mistakes."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+from lidarpool.cli import cli
+from lidarpool.scenario import Scenario
+
+
+def test_init_writes_a_scenario_and_says_what_to_do_next(tmp_path, lidarpool):
+    folder = tmp_path / "my surveys" / "hall"
+    outcome = lidarpool("init", folder)
+    assert (outcome.code, outcome.err) == (0, "")
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "scenario.schema.json",
+        "scenario.yaml",
+    ]
+    assert outcome.out.endswith(f"next: lidarpool check '{folder / 'scenario.yaml'}'\n")
+    assert Scenario.load(folder / "scenario.yaml").model_dump() == Scenario().model_dump()
+    first = (folder / "scenario.yaml").read_text().splitlines()[0]
+    assert first == "# yaml-language-server: $schema=scenario.schema.json"
+    json.loads((folder / "scenario.schema.json").read_text())
+
+
+def test_init_begins_in_the_current_folder(tmp_path, lidarpool, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert lidarpool("init").out.endswith("next: lidarpool check scenario.yaml\n")
+    assert (tmp_path / "scenario.yaml").exists()
+
+
+@pytest.mark.parametrize("name", ["scenario.yaml", "scenario.schema.json"])
+def test_init_overwrites_nothing(name, tmp_path, lidarpool):
+    (tmp_path / name).write_text("mine")
+    outcome = lidarpool("init", tmp_path)
+    assert outcome.code == 2
+    assert f"{tmp_path / name} is there already, and is not overwritten" in outcome.err
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, "mine")]
+
+
+def test_init_leaves_an_untouched_scenario_alone_as_well(tmp_path, lidarpool):
+    lidarpool("init", tmp_path)
+    assert lidarpool("init", tmp_path).code == 2
+    (tmp_path / "scenario.yaml").unlink()
+    assert lidarpool("init", tmp_path).code == 0  # the schema was as it should be
+
+
+def test_init_where_there_can_be_no_folder(tmp_path, lidarpool):
+    (tmp_path / "file").write_text("")
+    outcome = lidarpool("init", tmp_path / "file" / "folder")
+    assert outcome.code == 2
+    assert "cannot be written" in outcome.err and "Traceback" not in outcome.err
+
+
+def test_schema_prints_what_init_writes(tmp_path, lidarpool):
+    lidarpool("init", tmp_path)
+    assert lidarpool("schema").out == (tmp_path / "scenario.schema.json").read_text()
+
+
+# -- completion ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion_is_a_script_that_the_shell_takes(shell, lidarpool):
+    outcome = lidarpool("completion", shell)
+    assert (outcome.code, outcome.err) == (0, "")
+    assert f"_LIDARPOOL_COMPLETE={shell}_complete" in outcome.out
+    if shutil.which(shell):
+        checked = subprocess.run([shell, "-n"], input=outcome.out, text=True, check=False)
+        assert checked.returncode == 0
+
+
+def test_bash_completes(tmp_path, lidarpool):
+    if not shutil.which("bash"):
+        pytest.skip("there is no bash here")
+    script = lidarpool("completion", "bash").out
+    command = tmp_path / "lidarpool"
+    command.write_text(
+        f'#!/bin/sh\nexec {sys.executable} -c "from lidarpool.cli import main; main()" "$@"\n'
+    )
+    command.chmod(0o755)
+    asked = "COMP_WORDS=(lidarpool run --no)\nCOMP_CWORD=2\n_lidarpool_completion lidarpool\n"
+    path = os.pathsep.join([str(tmp_path), os.environ["PATH"]])
+    done = subprocess.run(
+        ["bash", "-c", f'{script}\n{asked}echo "${{COMPREPLY[@]}}"'],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PATH": path, "PYTHONPATH": os.pathsep.join(sys.path)},
+        check=False,
+    )
+    assert done.stdout == "--no-plan\n", done.stderr
+
+
+# -- help and mistakes ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", sorted(cli.commands))
+def test_help_of_each_command_shows_two_examples(name, lidarpool):
+    commands = getattr(cli.commands[name], "commands", {"": None})
+    for inner in commands:
+        words = [name, *([inner] if inner else [])]
+        outcome = lidarpool(*words, "--help")
+        assert outcome.code == 0
+        examples = outcome.out.partition("Examples:")[2].partition("\n\n")[0]
+        assert len(re.findall(rf"\blidarpool {' '.join(words)}\b", examples)) == 2, words
+
+
+@pytest.mark.parametrize(
+    ("arguments", "meant"),
+    [
+        (["run", "--bakend", "numpy", "x.yaml"], "'--backend'"),
+        (["demo", "--ou", "x"], "'--out'"),
+        (["scene", "ciyt", "x.ply"], "'city'"),
+        (["scheme"], "'schema'"),
+        (["run", "x.glb", "--backend", "cuad"], "'cuda'"),
+    ],
+)
+def test_what_is_misspelt_is_answered_with_what_was_meant(arguments, meant, lidarpool):
+    outcome = lidarpool(*arguments)
+    assert outcome.code == 2 and outcome.out == ""
+    assert re.search(rf"Did you mean (one of: )?.*{meant}", outcome.err), outcome.err

@@ -1,0 +1,84 @@
+"""A scenario file to begin with: every field with its default, made from the sections."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterator
+from typing import Any
+
+import yaml
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from .scenario import Scenario
+
+_WIDTH = 100
+_COMMENT_AT = 30  # column of the comments that stand beside a field
+
+_HEAD = """\
+# A lidar survey for lidarpool, and a path planned beside it. All of it written out: every line
+# may be left out, and this is what it is then. Lines that begin with "# " and a name show what
+# may be given instead of what lidarpool chooses. Lengths are in metres, angles in degrees, Z is up.
+"""
+
+
+def scenario_template(commands: tuple[str, ...] = (), schema: str | None = None) -> str:
+    """Return a commented scenario in YAML that holds all defaults.
+
+    Parameters
+    ----------
+    commands
+        What to do with it, for its head.
+    schema
+        Name of the JSON Schema beside it, which editors then use; None for none.
+    """
+    # Only a comment's first line is looked at by editors.
+    lines = [f"# yaml-language-server: $schema={schema}\n"] if schema else []
+    lines.append(_HEAD)
+    if commands:
+        lines += ["#\n", *(f"#     {command}\n" for command in commands)]
+    for name, field in Scenario.model_fields.items():
+        lines += ["\n", *(f"{line}\n" for line in _top(name, field))]
+    return "".join(lines)
+
+
+def _top(name: str, field: FieldInfo) -> Iterator[str]:
+    """Give the lines of a section, or of a field that stands beside them."""
+    section = field.annotation
+    if not (isinstance(section, type) and issubclass(section, BaseModel)):
+        yield from _lines(name, field, "")
+        return
+    summary = (section.__doc__ or "").partition("\n")[0].partition(";")[0].rstrip(".")
+    yield from _beside(f"{name}:", summary, "")
+    for inner, content in section.model_fields.items():
+        yield from _lines(inner, content, "  ")
+
+
+def _lines(name: str, field: FieldInfo, indent: str) -> Iterator[str]:
+    """Give a field with its default; what follows from other things is shown by examples."""
+    text = field.description or ""
+    if not field.examples:
+        yield from _beside(f"{name}: {_flow(field.default)}", text, indent)
+        return
+    first, *others = field.examples
+    yield from _beside(f"# {name}: {_flow(first)}", text, indent)
+    for other in others:
+        yield f"{indent}# {name}: {_flow(other)}"
+
+
+def _beside(code: str, comment: str, indent: str) -> Iterator[str]:
+    """Give code with its comment to the right of it, or above it where there is no room."""
+    line = f"{indent}{code}".ljust(_COMMENT_AT - 1) + f" # {comment}"
+    if len(line) <= _WIDTH and len(indent + code) < _COMMENT_AT:
+        yield line
+        return
+    mark = f"{indent}# "
+    sentence = f"{comment[:1].upper()}{comment[1:]}."  # prose, not a field to be uncommented
+    yield from textwrap.wrap(sentence, _WIDTH, initial_indent=mark, subsequent_indent=mark)
+    yield f"{indent}{code}"
+
+
+def _flow(value: Any) -> str:
+    """Value as YAML on one line."""
+    text = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=10_000)
+    return text.removesuffix("\n").removesuffix("...").removesuffix("\n")
