@@ -57,7 +57,7 @@ def _look(
     silent = silent_workers(dask_scheduler, patience_s)
     members = [ws for ws in dask_scheduler.workers.values() if ws.resources.get(resource)]
     free = {
-        ws.address: int(ws.resources[resource] - ws.used_resources.get(resource, 0))
+        ws.address: int(ws.resources[resource] - _in_use(ws, resource))
         for ws in members
         if ws.status.name == "running" and ws.address not in silent
     }
@@ -67,3 +67,9 @@ def _look(
         if task is not None and task.processing_on and task in task.processing_on.long_running:
             running.append(key)
     return free, [ws.address for ws in members], running, list(silent)
+
+
+def _in_use(worker: Any, resource: str) -> float:
+    """Count what the tasks on a worker hold: Dask's own count is off once one was stolen."""
+    held = ((task.resource_restrictions or {}).get(resource, 0) for task in worker.processing)
+    return float(sum(held))
