@@ -1,5 +1,6 @@
 """Files of records come back as they were written, or say what is wrong with them."""
 
+import errno
 import os
 import subprocess
 import sys
@@ -147,6 +148,20 @@ def test_two_cannot_have_it_open(path):
     file.unlock()
     RecordFile(path).close()
     file.close()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="which has no such locks")
+@pytest.mark.parametrize("code", [errno.ENOLCK, errno.EOPNOTSUPP])
+def test_a_disk_without_locks_will_do(path, monkeypatch, code):
+    def no_locks(handle, operation):
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(records.fcntl, "flock", no_locks)
+    file = RecordFile(path)
+    file.append(1, b"one")
+    file.unlock()
+    file.close()
+    assert read(path)[0] == [b"one"]
 
 
 def test_syncs_come_once_a_second_or_less_often_where_they_take_long(path, monkeypatch):

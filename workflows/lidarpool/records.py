@@ -9,6 +9,7 @@ are a write that was cut off, which a disk may also leave out of order or as zer
 
 from __future__ import annotations
 
+import errno
 import os
 import struct
 import sys
@@ -16,6 +17,7 @@ import time
 import weakref
 import zlib
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -172,7 +174,8 @@ class RecordFile:
     def unlock(self) -> None:
         """Let others open it: nothing more will be written."""
         if sys.platform != "win32":
-            fcntl.flock(self._file.fileno(), fcntl.LOCK_UN)
+            with suppress(OSError):  # a disk without locks, see `_lock`
+                fcntl.flock(self._file.fileno(), fcntl.LOCK_UN)
 
     def _record_at(self, at: int, size: int) -> Record | None:
         """Record that begins at a byte; None if there is no whole one."""
@@ -231,5 +234,10 @@ def _write_all(file: Any, view: memoryview) -> None:
 
 
 def _lock(handle: int) -> None:
-    if sys.platform != "win32":  # which does not let two open a file for writing and delete it
+    if sys.platform == "win32":  # does not let two open a file for writing and delete it
+        return
+    try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP):  # a network disk without locks
+            raise
