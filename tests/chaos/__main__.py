@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import math
 import random
 import sys
 import time
@@ -21,10 +22,11 @@ from .nemesis import Fault, make_plan
 from .survey import PAUSES, Outcome, Reference, disturbed, reference, survey
 
 FAULTS_PER_RUN = 8
+SPARE_FAULTS = 0.05  # part that may find nobody to strike
 VAIN_RUNS_MOST = 2  # one after the other in which nothing that was left to do could be done
 
 # Points that many a run does not come to: what is to happen there waits for one that does.
-RARE_POINTS = ("driver.stale", "driver.recast")
+RARE_POINTS = ("driver.duplicate", "driver.stale", "driver.recast")
 WORKER_POINTS = tuple(point for points in STAGE_POINTS.values() for point in points)
 
 
@@ -116,7 +118,7 @@ def main(arguments: list[str] | None = None) -> int:
     logging.disable(logging.CRITICAL)  # that workers die here is no news
     seed = random.SystemRandom().randrange(10**6) if options.seed is None else options.seed
     print(f"seed {seed}", flush=True)
-    campaign = Campaign(options.faults, seed, survey())
+    campaign = Campaign(math.ceil((1 + SPARE_FAULTS) * options.faults), seed, survey())
     started = time.monotonic()
     with Arena(pauses=PAUSES) as arena:
         known = reference(arena, campaign.what)
