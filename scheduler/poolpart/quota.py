@@ -45,5 +45,9 @@ class Quota:
         """Give the task's place back when it is done, failed or cancelled."""
         future.add_done_callback(self._done)
 
+    def give_back(self, places: int) -> None:
+        """Give places back for which no task was submitted after all."""
+        self._free.release(places)
+
     def _done(self, _: Any) -> None:
         self._free.release()

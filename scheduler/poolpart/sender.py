@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import inspect
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from distributed import Client, Future
@@ -55,16 +56,17 @@ class Sender:
             )
         if self.quota is not None:
             self.quota.take(1, wait=True)
-        future = self.client.submit(
-            function,
-            *args,
-            key=key,
-            pure=False,
-            priority=priority,
-            resources={self.resource: 1},
-            workers=None if worker is None else [worker],
-            **kwargs,
-        )
+        with self._giving_back(1):
+            future = self.client.submit(
+                function,
+                *args,
+                key=key,
+                pure=False,
+                priority=priority,
+                resources={self.resource: 1},
+                workers=None if worker is None else [worker],
+                **kwargs,
+            )
         if self.quota is not None:
             self.quota.watch(future)
         return future
@@ -102,15 +104,30 @@ class Sender:
             count = self.quota.take(count, wait)
             if not count:
                 return []
-        futures: list[Future] = self.client.map(
-            function,
-            *(column[:count] for column in columns),
-            key=key,
-            pure=False,
-            priority=priority,
-            resources={self.resource: 1},
-        )
+        with self._giving_back(count):
+            futures: list[Future] = self.client.map(
+                function,
+                *(column[:count] for column in columns),
+                key=key,
+                pure=False,
+                priority=priority,
+                resources={self.resource: 1},
+            )
         if self.quota is not None:
             for future in futures:
                 self.quota.watch(future)
         return futures
+
+    @contextmanager
+    def _giving_back(self, places: int) -> Iterator[None]:
+        """Give places of the quota back where nothing comes to be submitted.
+
+        Dask refuses what cannot be called or pickled. Nobody would give those places back, and
+        a later `send` would wait for them for ever.
+        """
+        try:
+            yield
+        except BaseException:
+            if self.quota is not None:
+                self.quota.give_back(places)
+            raise

@@ -4,6 +4,7 @@ import itertools
 import logging
 import os
 import signal
+import threading
 import time
 import uuid
 import weakref
@@ -318,6 +319,18 @@ def test_a_task_that_failed_or_was_cancelled_gives_its_place_back(a, gate):
     last = handle.submit(twice, 1)
     gate.set()  # what was cancelled goes on on its worker, which may be the one for the last
     assert last.result(LONG_S) == 2
+
+
+def test_what_cannot_be_submitted_gives_its_places_back(a):
+    handle, lock = a.limited(2), threading.Lock()
+    for _ in range(3):
+        with pytest.raises(TypeError, match="must be a callable"):
+            handle.submit(3)
+        with pytest.raises(TypeError, match="Could not serialize"):
+            handle.submit(twice, lock)
+        with pytest.raises(TypeError, match="Could not serialize"):
+            handle.map(twice, [lock] * 9)
+    assert handle.submit(twice, 1).result(LONG_S) == 2
 
 
 @pytest.mark.parametrize("slots", [0, -1, 1.5])
