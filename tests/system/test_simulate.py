@@ -151,6 +151,17 @@ def test_a_precision_too_fine_for_the_scene_is_refused(client):
         )
 
 
+def test_a_client_that_has_given_its_scheduler_up_is_told_of_in_one_sentence(client):
+    """It closes itself some seconds after the scheduler was lost."""
+    address = client.scheduler.address
+    survey = Survey(SENSOR, [(0, 0, 0)])
+    with (
+        Client(address, set_as_default=False) as lost,
+        pytest.raises(LidarpoolError, match=f"The cluster at {address} cannot be reached"),
+    ):
+        simulate(room(), survey, client=lost, on_frame=lambda _: lost.close())
+
+
 def test_too_few_slots_are_told_before_anything_runs(client):
     with pytest.raises(LidarpoolError, match="Partition 'LIDAR' has 4 of the 7 slots"):
         simulate(room(), Survey(SENSOR, [(0, 0, 0)], 5), client=client, collectors=5)

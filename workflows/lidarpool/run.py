@@ -59,6 +59,7 @@ class Run:
         job = kept.job
         pool = survey_pool(client, job.collectors, job.planning is not None)
         self.client, self.job, self.kept = client, job, kept
+        self.address: str = client.scheduler.address  # for when it is lost
         self.partitions: dict[str, Partition] = pool.partitions()
         casting = [worker for worker in pool if worker.resources.get(GPU)]
         kept.backend = common_backend(client, kept.backend or job.backend, casting, kept.advice)
@@ -96,16 +97,17 @@ class Run:
                 pump.finish()
         except BaseException as error:
             # A client that loses its scheduler cancels all futures: tasks seem to be cancelled.
-            lost = self.client.status == "connecting"
+            # After some seconds it gives up and closes, and any call of it makes any error.
+            lost = self.client.status != "running"
             reason = str(error) or type(error).__name__
-            _stop(pumps, f"the run was stopped: {reason}")
+            _stop(self.client, pumps, f"the run was stopped: {reason}")
             if error is self.callers_error:
                 raise
             if isinstance(error, PoolError) and not lost:
                 raise LidarpoolError(str(error)) from error
             if isinstance(error, _CLUSTER_LOST) or (lost and isinstance(error, Exception)):
                 raise LidarpoolError(
-                    f"The cluster at {self.client.scheduler.address} cannot be reached any more, "
+                    f"The cluster at {self.address} cannot be reached any more, "
                     "or somebody cancelled the tasks of this run; it has ended without a result."
                 ) from error
             raise
@@ -231,10 +233,14 @@ def make_result(
     )
 
 
-def _stop(pumps: list[SurveyPump | TrialPump], reason: str) -> None:
+def _stop(client: Client, pumps: list[SurveyPump | TrialPump], reason: str) -> None:
     """Stop what can be stopped; the cluster may be gone, and then nothing can."""
     for pump in pumps:
         for step in (lambda pump=pump: pump.stop(reason), pump.finish):
-            # The first error is the one to tell of.
-            with suppress(OSError, CommClosedError, FutureCancelledError, RuntimeError):
-                step()
+            try:
+                # The first error is the one to tell of.
+                with suppress(OSError, CommClosedError, FutureCancelledError, RuntimeError):
+                    step()
+            except Exception:
+                if client.status == "running":
+                    raise
