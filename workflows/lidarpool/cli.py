@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import NoReturn
 
@@ -14,6 +13,7 @@ from poolpart.probe import visible_gpus
 from raybeam import available_backends
 
 from ._version import __version__
+from .check_command import check
 from .command_group import CommandGroup
 from .completion import PROGRAM, complete_backend, completion
 from .connection import connected
@@ -25,7 +25,7 @@ from .run_command import RunOptions, run_scenario
 from .scenario import Scenario
 from .scenario_commands import init, schema
 from .scene_commands import scene
-from .tls import TlsFiles
+from .tls_options import tls_file_options, tls_files_for
 
 _out = click.option(
     "--out",
@@ -40,24 +40,13 @@ _page = click.option("--page", is_flag=True, help="Serve a live page, and say wh
 _tls = click.option("--tls", is_flag=True, help="Encrypt the traffic of the local cluster.")
 
 
-def _tls_files(command: Callable[..., None]) -> Callable[..., None]:
-    """Options for the certificates of an encrypted cluster."""
-    for name, what in (
-        ("key", "Private key of that certificate, if its file does not hold it."),
-        ("cert", "Certificate to show to an encrypted cluster, a PEM file."),
-        ("ca", "Certificates of the authority of an encrypted cluster, a PEM file."),
-    ):
-        command = click.option(f"--tls-{name}", type=click.Path(path_type=Path), help=what)(command)
-    return command
-
-
 @click.group(cls=CommandGroup, context_settings={"max_content_width": 100})
 @click.version_option(__version__, prog_name=PROGRAM)
 def cli() -> None:
     """Simulate lidar surveys on a partitioned Dask cluster."""
 
 
-for _command in (init, schema, scene, completion):
+for _command in (init, check, schema, scene, completion):
     cli.add_command(_command)
 
 
@@ -81,7 +70,7 @@ def demo(out: Path, tls: bool, page: bool, quiet: bool) -> None:
 @click.argument("scenario", type=click.Path(path_type=Path))
 @_out
 @click.option("--scheduler", metavar="ADDRESS", help="Use this Dask cluster, tcp://host:8786.")
-@_tls_files
+@tls_file_options
 @_tls
 @click.option(
     "--backend",
@@ -116,7 +105,7 @@ def run(
       lidarpool run examples/seed.yaml --out seed
       lidarpool run hall.glb --no-plan --resume --scheduler tcp://127.0.0.1:8786
     """  # noqa: D301 - click wants the character, not its name
-    files = _files_for(scheduler, tls_ca, tls_cert, tls_key)
+    files = tls_files_for(scheduler, tls_ca, tls_cert, tls_key)
     if tls and scheduler is not None:
         raise click.UsageError(
             "--tls is for a cluster of this machine; that of --scheduler is encrypted if its "
@@ -139,19 +128,9 @@ def run(
     run_scenario(Scenario.load(scenario), options)
 
 
-def _files_for(scheduler: str | None, *files: Path | None) -> TlsFiles:
-    """Certificates as one; an error if there is no scheduler to use them with."""
-    if any(files) and scheduler is None:
-        raise click.UsageError(
-            "--tls-ca, --tls-cert and --tls-key are for the cluster of --scheduler: give its "
-            "address, tls://host:8786, or --tls for an encrypted cluster of this machine."
-        )
-    return TlsFiles(*files)
-
-
 @cli.command()
 @click.option("--scheduler", metavar="ADDRESS", help="Also show the workers of this cluster.")
-@_tls_files
+@tls_file_options
 def info(
     scheduler: str | None, tls_ca: Path | None, tls_cert: Path | None, tls_key: Path | None
 ) -> None:
@@ -163,7 +142,7 @@ def info(
       lidarpool info --scheduler tcp://127.0.0.1:8786
     """  # noqa: D301 - click wants the character, not its name
     pool = None
-    files = _files_for(scheduler, tls_ca, tls_cert, tls_key)
+    files = tls_files_for(scheduler, tls_ca, tls_cert, tls_key)
     if scheduler is not None:
         with connected(scheduler, files) as client:
             pool = Pool.from_client(client)

@@ -84,7 +84,7 @@ def save_cloud(path: str | Path, cloud: CloudLike, *, precision_m: float = 0.01)
         If it cannot be written whole; no temporary file is left.
     """
     path = Path(path)
-    real = _real_type(cloud.bounds, precision_m)
+    real = real_type(cloud.bounds, precision_m)
     # The ending stays, since Open3D picks the format by it.
     temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.tmp.ply")
     try:
@@ -122,7 +122,7 @@ def read_cloud(path: str | Path) -> Cloud:
     return Cloud(positions, rows["scan"], rows["ring"], rows["object"])
 
 
-def _real_type(bounds: NDArray[np.floating], precision_m: float) -> np.dtype[np.floating]:
+def real_type(bounds: NDArray[np.floating], precision_m: float) -> np.dtype[np.floating]:
     """Least precise type that is precise enough for positions between these bounds."""
     if bounds.dtype == np.float32:
         return bounds.dtype

@@ -58,26 +58,37 @@ def run_scenario(scenario: Scenario, options: RunOptions) -> None:
     """
     # Matplotlib is a third of the time that --help would take.
     from .output import result_folder, write_result
+    from .report_page import make_recipe
 
+    recipe = make_recipe(scenario, click.get_current_context(silent=True))
     _check_backend(options.backend or scenario.pool.backend, options)
-    job = _job(scenario, options)
+    job = make_job(scenario, options.backend, options.no_plan)
     with result_folder(options.out):
         kept = _deliveries(job, options)
         with kept.kept_on_error():
             result = _conduct(scenario, kept, options)
             with shown_status("writing the cloud, the pictures and the report", options.quiet):
-                report = write_result(options.out, result, job.scene, job.survey, job.planning)
+                report = write_result(
+                    options.out, result, job.scene, job.survey, job.planning, recipe
+                )
         kept.remove()
         _tell(options.out, result, job, report["files"])
 
 
-def _job(scenario: Scenario, options: RunOptions) -> Job:
+def make_job(scenario: Scenario, backend: str | None = None, no_plan: bool = False) -> Job:
+    """Read the scene and put together what a scenario asks for; options go first.
+
+    Raises
+    ------
+    LidarpoolError
+        If a mesh file cannot be read, or fields do not fit together or the scene.
+    """
     scene = scenario.build_scene()
     return Job(
         scene,
         scenario.survey(scene),
-        None if options.no_plan else scenario.plan(scene),
-        options.backend or scenario.pool.backend,
+        None if no_plan else scenario.plan(scene),
+        backend or scenario.pool.backend,
         scenario.pool.queue_capacity,
         scenario.pool.collectors,
     )

@@ -1,0 +1,230 @@
+"""What a run would do and take, found out without starting anything."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from distributed import Client
+from distributed.system import MEMORY_LIMIT
+
+from poolpart import Pool, PoolError
+from poolpart.local import default_workers, usable_cores
+from poolpart.probe import visible_gpus
+from raybeam import available_backends
+
+from .checks import check_backend_here, common_backend, survey_pool
+from .errors import LidarpoolError
+from .job import Job
+from .journal_folder import RECORDS
+from .needs import Needs, needs_of
+from .run_command import JOURNAL
+from .sampling import Sample, sample_survey
+from .scan import GPU, LIDAR, OTHER
+from .sections import PoolSection
+
+
+@dataclass
+class Forecast:
+    """What a run would do and take; filled in by `forecast`.
+
+    Parameters
+    ----------
+    job, out
+        What is to be run, and the folder of the result.
+    backend
+        Ray-casting backend that stage 2 would use; empty where it is not to be had.
+    slots
+        Slots of each partition: those needed, and those there.
+    sample
+        Estimate of hits and points; None where no ray could be cast.
+    needs
+        Memory and disk.
+    memory, memory_needed
+        Bytes that there are and that are needed: of this machine and by all processes, or, on
+        another cluster, those of a GPU worker. 0 where there is no limit.
+    disk_free
+        Bytes that the disk of `out` has free.
+    reasons
+        Why it cannot run, each with what to do.
+    notes
+        What should be known besides.
+    """
+
+    job: Job
+    out: Path
+    backend: str = ""
+    slots: dict[str, tuple[int, int]] = field(default_factory=dict)
+    sample: Sample | None = None
+    needs: Needs | None = None
+    memory: int = 0
+    memory_needed: int = 0
+    disk_free: int = 0
+    reasons: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    def as_data(self) -> dict[str, Any]:
+        """Return it as plain data for JSON; sizes in bytes."""
+        scene, survey, planning = self.job.scene, self.job.survey, self.job.planning
+        return {
+            "can_run": not self.reasons,
+            "reasons": self.reasons,
+            "notes": self.notes,
+            "objects": len(scene.names),
+            "triangles": len(scene.faces),
+            "poses": len(survey.poses),
+            "scans": survey.scan_count,
+            "rays": survey.ray_count,
+            "estimate": asdict(self.sample) if self.sample else None,
+            "trials": planning.trials if planning else 0,
+            "backend": self.backend or None,
+            "slots": {
+                name: {"needed": needed, "there": there}
+                for name, (needed, there) in self.slots.items()
+            },
+            "memory": {
+                "gpu_worker": self.needs.gpu_worker if self.needs else None,
+                "driver": self.needs.driver if self.needs else None,
+                "needed": self.memory_needed,
+                "there": self.memory or None,
+            },
+            "disk": {
+                "journal": self.needs.journal if self.needs else None,
+                "result": self.needs.cloud + self.needs.pictures if self.needs else None,
+                "free": self.disk_free,
+                "folder": str(self.out),
+            },
+        }
+
+
+def forecast(job: Job, pool: PoolSection, out: Path, client: Client | None = None) -> Forecast:
+    """Find out what a run would do and take, and whether it can.
+
+    Parameters
+    ----------
+    job, out
+        What is to be run, and the folder of the result; the folder is only looked at.
+    pool
+        Sizes of a cluster on this machine, which is not started.
+    client
+        Client of the cluster to run on instead.
+    """
+    made = Forecast(job, out)
+    with _taken_for_reason(made):
+        if client is None:
+            _look_here(made, pool)
+        else:
+            _look_there(made, client)
+    _look_at_folder(made)
+    # Casting here takes what it takes on a worker: it would be refused, or killed.
+    if needs_of(job, 0).gpu_worker <= MEMORY_LIMIT:
+        made.sample = sample_survey(job.scene, job.survey)
+    # Without a sample every ray may hit.
+    points = made.sample.points if made.sample else job.survey.ray_count // job.survey.keep_every
+    made.needs = needs_of(job, points)
+    made.memory_needed = (
+        made.needs.on_one_machine(made.slots[GPU][1], made.slots.get(OTHER, (0, 0))[1])
+        if client is None
+        else made.needs.gpu_worker
+    )
+    _compare(made, made.needs)
+    return made
+
+
+@contextmanager
+def _taken_for_reason(made: Forecast) -> Iterator[None]:
+    """Take an error for a reason why it cannot run."""
+    try:
+        yield
+    except (LidarpoolError, PoolError) as error:
+        made.reasons.append(str(error))
+
+
+def _slots_needed(job: Job) -> dict[str, int]:
+    needed = {GPU: 1, LIDAR: 2 + job.collectors}
+    return needed | ({OTHER: 1} if job.planning else {})
+
+
+def _look_here(made: Forecast, pool: PoolSection) -> None:
+    """Find out what a cluster of this machine would have."""
+    needed = _slots_needed(made.job)
+    workers = default_workers(usable_cores(), len(visible_gpus()))
+    there = {
+        GPU: pool.gpu or workers[GPU],
+        LIDAR: needed[LIDAR],  # one worker with as many threads
+        OTHER: pool.other or workers[OTHER],
+    }
+    made.slots = {name: (needed[name], there[name]) for name in needed}
+    made.memory = MEMORY_LIMIT
+    check_backend_here(made.job.backend)
+    made.backend = _settled(made.job.backend)
+
+
+def _settled(wanted: str) -> str:
+    """Backend that is taken here."""
+    usable = (name for name, reason in available_backends().items() if not reason)
+    return next(usable) if wanted == "auto" else wanted
+
+
+def _look_there(made: Forecast, client: Client) -> None:
+    """Find out what a cluster has that is running already."""
+    needed = _slots_needed(made.job)
+    everybody = Pool.from_client(client)
+    there = {name: sum(w.resources.get(name, 0) for w in everybody) for name in needed}
+    made.slots = {name: (needed[name], int(there[name])) for name in needed}
+    pool = survey_pool(client, made.job.collectors, made.job.planning is not None)
+    casting = [worker for worker in pool if worker.resources.get(GPU)]
+    made.memory = min((worker.memory for worker in casting if worker.memory), default=0)
+    made.backend = common_backend(client, made.job.backend, casting)
+    if not any(worker.gpus for worker in casting):
+        made.notes.append(f"no GPU in partition GPU: CPU workers cast the rays with {made.backend}")
+
+
+def _look_at_folder(made: Forecast) -> None:
+    """See whether the result can go there; nothing is made or changed."""
+    there = next(path for path in (made.out, *made.out.absolute().parents) if path.exists())
+    made.disk_free = shutil.disk_usage(there).free
+    if not there.is_dir():
+        made.reasons.append(f"{there} is a file: give a folder for the results with --out.")
+    elif not os.access(there, os.W_OK | os.X_OK):
+        made.reasons.append(f"Cannot write to the folder {there}: give another with --out.")
+    if (made.out / JOURNAL / RECORDS).exists():
+        made.notes.append(
+            f"{made.out} holds an unfinished run: --resume goes on with it, --fresh drops it"
+        )
+
+
+def _compare(made: Forecast, needs: Needs) -> None:
+    """Compare what it takes with what there is."""
+    if made.disk_free < needs.disk:
+        made.reasons.append(
+            f"The disk of {made.out} has {in_bytes(made.disk_free)} free and the run needs about "
+            f"{in_bytes(needs.disk)}: make room, name another folder with --out, or take a "
+            "larger keep_every."
+        )
+    if made.memory and made.memory < made.memory_needed:
+        made.reasons.append(
+            f"There are {in_bytes(made.memory)} of memory and the run needs about "
+            f"{in_bytes(made.memory_needed)}: take a smaller scene, fewer workers (pool.gpu) or "
+            "rays_per_revolution, or a machine with more."
+        )
+
+
+def in_bytes(count: int) -> str:
+    """Size with three digits: 950 bytes, 2.35 MB, 104 GB.
+
+    Examples
+    --------
+    >>> in_bytes(950), in_bytes(2_345_678), in_bytes(103_900_000_000)
+    ('950 bytes', '2.35 MB', '104 GB')
+    """
+    for factor, unit in ((1e12, "TB"), (1e9, "GB"), (1e6, "MB"), (1e3, "kB")):
+        if count >= factor * 0.9995:
+            digits = 2 if count < 9.995 * factor else 1 if count < 99.95 * factor else 0
+            return f"{count / factor:,.{digits}f} {unit}"
+    return f"{count} bytes"

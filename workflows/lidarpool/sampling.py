@@ -1,0 +1,98 @@
+"""How many points a survey will give, from casting a few of its rays in this process."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from raybeam import RayCaster
+
+from .scan.setup import ray_directions
+from .scene import Scene
+from .survey import Survey
+
+# Rays that are cast at most; what that takes is much less than starting a cluster.
+RAYS_MOST = {"numpy": 20_000}
+RAYS_MOST_ELSE = 200_000
+SCANS_MOST = 500
+
+_SEED = 0  # the same survey gets the same estimate
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What some rays of a survey say of all.
+
+    Parameters
+    ----------
+    backend
+        Ray-casting backend that was used.
+    rays
+        Rays that were cast.
+    hits, points
+        Of the whole survey, estimated; counted if all of its rays were cast.
+    """
+
+    backend: str
+    rays: int
+    hits: int
+    points: int
+
+
+def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> Sample:
+    """Estimate hits and points of a survey.
+
+    Scans, and rays of each, are chosen at random, one from each of as many equal parts: chosen
+    at even distances, they could all be of one ring, or look one way.
+
+    Parameters
+    ----------
+    scene, survey
+        What to scan, and how.
+    backend
+        Ray-casting backend; "auto" for the fastest that there is here.
+
+    Raises
+    ------
+    BackendUnavailable
+        If the backend cannot be used here.
+    """
+    rng = np.random.default_rng(_SEED)
+    caster = RayCaster(scene.vertices, scene.faces, backend=backend)
+    most = RAYS_MOST.get(caster.backend, RAYS_MOST_ELSE)
+    scans = _spread(survey.scan_count, SCANS_MOST, rng)
+    each = most if survey.ray_count <= most else max(1, most // len(scans))
+    cast = 0
+    hits, points = [], []  # of each of these scans
+    for index in scans.tolist():
+        spec = survey.scan(index)
+        count = spec.ray_count(survey.sensor)
+        rays = _spread(count, each, rng)
+        found = caster.returns(
+            np.asarray(spec.pose.position),
+            ray_directions(survey.sensor, spec, rays),
+            survey.sensor.min_range_m,
+            survey.sensor.max_range_m,
+        )
+        cast += len(rays)
+        hits.append(len(found.ray) * count / len(rays))
+        points.append(_kept(hits[-1], survey.keep_every, len(rays) == count))
+    share = survey.scan_count / len(scans)
+    return Sample(caster.backend, cast, round(sum(hits) * share), round(sum(points) * share))
+
+
+def _kept(hits: float, keep_every: int, counted: bool) -> float:
+    """Points that are kept of the hits of a scan: the first, and every n-th from there."""
+    if counted:
+        return -(-hits // keep_every)
+    # Rounding up adds half a point, less what whole numbers leave out, where there are any.
+    return hits / keep_every + (keep_every - 1) / (2 * keep_every) if hits else 0.0
+
+
+def _spread(count: int, most: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """At most so many of the numbers below `count`, in order, one from each equal part."""
+    parts = min(count, most)
+    edges = np.arange(parts + 1, dtype=np.int64) * count // parts
+    return rng.integers(edges[:-1], edges[1:])
