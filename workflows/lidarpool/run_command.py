@@ -58,9 +58,7 @@ def run_scenario(scenario: Scenario, options: RunOptions) -> None:
     """
     # Matplotlib is a third of the time that --help would take.
     from .output import result_folder, write_result
-    from .report_page import make_recipe
 
-    recipe = make_recipe(scenario, click.get_current_context(silent=True))
     _check_backend(options.backend or scenario.pool.backend, options)
     job = make_job(scenario, options.backend, options.no_plan)
     with result_folder(options.out):
@@ -68,9 +66,7 @@ def run_scenario(scenario: Scenario, options: RunOptions) -> None:
         with kept.kept_on_error():
             result = _conduct(scenario, kept, options)
             with shown_status("writing the cloud, the pictures and the report", options.quiet):
-                report = write_result(
-                    options.out, result, job.scene, job.survey, job.planning, recipe
-                )
+                report = write_result(options.out, result, job.scene, job.survey, job.planning)
         kept.remove()
         _tell(options.out, result, job, report["files"])
 
