@@ -184,6 +184,42 @@ def test_an_error_is_told_how_to_go_on(path):
     assert reopen(path).totals.frames == 4
 
 
+class InterruptedFrame:
+    """A frame at whose n-th look somebody presses Ctrl-C."""
+
+    def __init__(self, whole, looks):
+        self.whole, self.looks = whole, looks
+
+    def __getattr__(self, name):
+        self.looks -= 1
+        if self.looks < 0:
+            raise KeyboardInterrupt
+        return getattr(self.whole, name)
+
+
+@pytest.mark.parametrize("looks", range(8))
+def test_a_frame_is_not_counted_twice_after_an_interrupt(looks, path, expected):
+    journal = reopen(path)
+    with pytest.raises(KeyboardInterrupt), journal.kept_on_error():
+        deliver(journal, DELIVERIES[:6])
+        journal.totals.take(InterruptedFrame(frame(3), looks))
+    again = reopen(path)
+    deliver(again)
+    assert content(again) == expected
+
+
+def test_an_interrupt_while_the_journal_is_made_leaves_nothing(path, monkeypatch):
+    def interrupt(folder):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("lidarpool.journal_store.flush_folder", interrupt)
+    journal = reopen(path)
+    with pytest.raises(KeyboardInterrupt) as caught, journal.kept_on_error():
+        deliver(journal)
+    assert not path.exists()
+    assert not getattr(caught.value, "__notes__", [])
+
+
 def test_an_unfinished_run_is_not_written_over(path):
     interrupted(path, 9)
     before = files(path)

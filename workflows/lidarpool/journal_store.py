@@ -89,7 +89,7 @@ class JournalStore:
             except BaseException:
                 file.close()
                 raise
-        except OSError:
+        except BaseException:  # an interrupt, too: nothing was delivered, nothing is left
             remove_files(self.folder)
             remove_folder(self.folder)
             raise

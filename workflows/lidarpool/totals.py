@@ -32,6 +32,7 @@ class FrameTotals:
         self.hits = 0
         self.hit_counts = np.zeros(triangles, np.int64)
         self._samples: list[NDArray[np.float32]] = []
+        self.whole = True  # whether no frame was entered by half, as an interrupt leaves it
 
     def take(self, frame: Frame) -> None:
         """Enter the next frame.
@@ -43,6 +44,7 @@ class FrameTotals:
         """
         if frame.scan != self.frames:
             raise ValueError(f"Frame {frame.scan} came when {self.frames} was due.")
+        self.whole = False
         np.add.at(self.hit_counts, frame.triangles, frame.counts)
         self.hits += frame.hits
         self.frames += 1
@@ -52,6 +54,7 @@ class FrameTotals:
                 np.asarray(frame.pose.position, np.float32), frame.samples.shape
             )
             self._samples.append(np.stack([starts, frame.samples], axis=1))
+        self.whole = True
 
     @property
     def sample_rays(self) -> NDArray[np.float32]:

@@ -61,9 +61,15 @@ class TotalsFile:
             self.write()
 
     def write(self) -> None:
-        """Replace the totals on disk by those of now; OSError if they cannot be written."""
+        """Replace the totals on disk by those of now, unless they hold a part of a frame.
+
+        Raises
+        ------
+        OSError
+            If they cannot be written.
+        """
         begun = time.monotonic()
-        if self.totals.frames > self._kept:
+        if self.totals.whole and self.totals.frames > self._kept:
             fresh = self.folder / FRESH
             fresh.unlink(missing_ok=True)
             file = RecordFile(fresh)
