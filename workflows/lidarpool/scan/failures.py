@@ -38,7 +38,10 @@ def was_killed(future: Future) -> bool:
 def raise_if_failed(future: Future, what: str) -> None:
     """Raise LidarpoolError if a task has failed or was cancelled by somebody else."""
     if future.status == "error":
-        raise LidarpoolError(f"{what} failed: {future.exception(timeout=ASK_S)}")
+        error = future.exception(timeout=ASK_S)
+        error.__traceback__ = future.traceback(timeout=ASK_S)
+        # Some of Dask's errors have no words.
+        raise LidarpoolError(f"{what} failed: {str(error) or type(error).__name__}") from error
     if future.status == "cancelled":  # "lost" passes: a worker died and the task runs again
         raise LidarpoolError(f"{what} was cancelled from outside this run.")
 
