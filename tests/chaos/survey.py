@@ -8,6 +8,7 @@ import traceback
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from poolpart import placement_violations
 
 from .arena import Arena
 from .checker import Verdict, judge
+from .events import Event
 from .nemesis import Fault, Nemesis
 
 STEPS, POSES = 360, 2
@@ -75,6 +77,7 @@ class Outcome:
     done: Counter[tuple[str, str]]  # {(kind of fault, point): times}
     left: tuple[Fault, ...]  # not carried out
     seconds: float
+    silence: str  # the longest time in which nothing happened, and what ended it
     replayed: int
     dropped: int
     misplaced: int
@@ -113,9 +116,10 @@ def disturbed(
             )
         except Exception as failure:
             error = "".join(traceback.format_exception(failure))
+    events = arena.board.events(nemesis.run)
     return Outcome(
         verdict=judge(
-            arena.board.events(nemesis.run),
+            events,
             what.scan_count,
             [] if result is None else result.cloud.scan.tolist(),
             known.rows,
@@ -124,8 +128,18 @@ def disturbed(
         done=nemesis.done,
         left=tuple(nemesis.left),
         seconds=time.monotonic() - started,
+        silence=_longest_silence(events),
         replayed=0 if result is None else result.replayed,
         dropped=0 if result is None else result.duplicates_dropped,
         misplaced=0 if result is None else len(placement_violations(result.records)),
         error=error,
     )
+
+
+def _longest_silence(events: Sequence[Event]) -> str:
+    log = sorted(events, key=lambda event: event["t"])
+    gaps = [(b["t"] - a["t"], a, b) for a, b in pairwise(log)]
+    if not gaps:
+        return "nothing happened"
+    seconds, before, after = max(gaps, key=lambda gap: gap[0])
+    return f"{seconds:.1f} s from {before['point']} to {after['point']}"

@@ -13,6 +13,7 @@ from lidarpool.scan.points import STAGE_POINTS
 
 SEED = 7
 FAULTS = 20
+PLANNED = 24  # some may find nobody to strike
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +33,7 @@ def known(arena, what):
 
 
 def test_twenty_faults_are_survived(arena, what, known):
-    campaign = Campaign(FAULTS, SEED, what, crossed=False)
+    campaign = Campaign(PLANNED, SEED, what, crossed=False)
     while not campaign.over:
         outcome = campaign.play(arena, known)
         assert outcome.sound, f"seed {SEED}: {outcome.error or outcome.verdict}"
