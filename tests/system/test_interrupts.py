@@ -157,7 +157,8 @@ def test_the_run_after_one_that_was_killed_while_writing(start, untouched, tmp_p
     assert "starting the workers" not in run.said
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert names == {
-        "cloud.ply", "scene.png", "intensity.png", "cloud.png", "path.png", "report.json",
+        "cloud.ply", "scene.png", "intensity.png", "cloud.png", "path.png", "report.html",
+        "report.json",
     }  # fmt: skip
 
 

@@ -22,6 +22,7 @@ from .interrupts import deferred_interrupts
 from .plan import Planning
 from .ply import save_cloud
 from .report import make_report
+from .report_page import Recipe, write_page
 from .result import Result
 from .scene import Scene
 from .survey import Survey
@@ -32,8 +33,8 @@ if sys.platform != "win32":
 
 ROOM_BYTES = 32 << 20  # what pictures and report may take; the cloud is checked when it is known
 
-REPORT = "report.json"
-FILES = ("cloud.ply", "scene.png", "intensity.png", "cloud.png", "path.png", REPORT)
+PAGE, REPORT = "report.html", "report.json"
+FILES = ("cloud.ply", "scene.png", "intensity.png", "cloud.png", "path.png", PAGE, REPORT)
 
 # Folders within the output folder: a result being made, and one that is whole and on its way
 # into place. A run that was killed leaves one behind; the next run removes or finishes it.
@@ -70,7 +71,12 @@ def result_folder(folder: Path) -> Iterator[None]:
 
 
 def write_result(
-    folder: Path, result: Result, scene: Scene, survey: Survey, planning: Planning | None
+    folder: Path,
+    result: Result,
+    scene: Scene,
+    survey: Survey,
+    planning: Planning | None,
+    recipe: Recipe | None = None,
 ) -> dict[str, Any]:
     """Write cloud, pictures and report, and return the report.
 
@@ -84,8 +90,9 @@ def write_result(
         If a file cannot be written.
     """
     makers = _makers(result, scene, survey, planning)
-    report = make_report(result, scene, survey, planning, [*makers, REPORT])
+    report = make_report(result, scene, survey, planning, [*makers, PAGE, REPORT])
     text = json.dumps(report, indent=1, allow_nan=False) + "\n"
+    makers[PAGE] = lambda path: write_page(path, report, result, scene, survey, planning, recipe)
     makers[REPORT] = lambda path: path.write_text(text, encoding="utf-8")
     staged = folder / f"{_WRITING}{secrets.token_hex(4)}"
     try:

@@ -1,0 +1,163 @@
+"""Writes the page: puts what is to be told into the template."""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from ..plan import Planning
+from ..result import Result
+from ..scan import COLLECT, GENERATE, INTERSECT, SORT
+from ..scan.messages import HIT, POINT
+from ..scene import Scene
+from ..survey import Survey
+from ..trials import TRIAL
+from . import words
+from .charts import convergence, object_bars, range_histogram, ring_histogram
+from .cloud_numbers import count_cloud
+from .recipe import Recipe
+from .sentences import facts, pictures, summary
+from .timeline import make_timeline
+
+# {stage: what it is called on the page}, in the order of the pipeline
+STAGES = {
+    GENERATE: "generate",
+    INTERSECT: "intersect",
+    SORT: "sort frames",
+    COLLECT: "collect points",
+    TRIAL: "plan path",
+}
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture within the page."""
+
+    name: str
+    alt: str
+    caption: str
+    uri: str
+
+
+def write_page(
+    path: Path,
+    report: Mapping[str, Any],
+    result: Result,
+    scene: Scene,
+    survey: Survey,
+    planning: Planning | None,
+    recipe: Recipe | None = None,
+) -> None:
+    """Write a report as one HTML file that needs nothing else, and asks nobody for anything.
+
+    Parameters
+    ----------
+    path
+        Where to; pictures and cloud of the result are in the same folder.
+    report
+        What `make_report` says: all numbers of the page that it has are taken from it.
+    result, scene, survey, planning
+        What it is about.
+    recipe
+        How to have it once more, if that is known.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written.
+    """
+    ordered = sorted(result.stages, key=lambda stage: list(STAGES).index(stage.stage))
+    numbers = count_cloud(result.points, survey, scene.origin)
+    page = (
+        _environment()
+        .get_template("page.html")
+        .stream(
+            report=report,
+            title="Lidar survey" + (f": {recipe.name}" if recipe else ""),
+            begun=_day(min((stage.start for stage in ordered), default=math.inf)),
+            summary=summary(report),
+            facts=facts(report),
+            pictures=[
+                _picture(path.parent / name, *said) for name, said in pictures(report).items()
+            ],
+            stages=ordered,
+            names=STAGES,
+            delivered=_delivered(report),
+            timeline=make_timeline(ordered, result.records, STAGES),
+            objects=object_bars(report["points_by_object"]),
+            cloud=numbers,
+            ranges=range_histogram(numbers.by_range, numbers.edges) if len(numbers.edges) else None,
+            rings=ring_histogram(numbers.by_ring) if len(result.points) else None,
+            curves=convergence(result.trials, result.plan) if planning and result.plan else None,
+            files=[(name, _size(path.parent / name, path)) for name in report["files"]],
+            recipe=recipe,
+            recipe_uri=_data_uri("text/yaml", recipe.scenario.encode(errors="backslashreplace"))
+            if recipe
+            else "",
+        )
+    )
+    page.dump(str(path), encoding="utf-8")
+
+
+def _environment() -> Environment:
+    """Jinja as it is used here: all values are escaped, and one that is missing is an error."""
+    environment = Environment(
+        loader=PackageLoader(__package__ or ""),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        finalize=_presentable,
+    )
+    for filter_ in (
+        words.duration, words.rate, words.large, words.share, words.excess, words.metres,
+        words.numbers, words.shortened, words.counted,
+    ):  # fmt: skip
+        environment.filters[filter_.__name__] = filter_
+    return environment
+
+
+def _presentable(value: object) -> object:
+    """Replace what HTML cannot hold, in every value that goes into the page."""
+    if isinstance(value, str) and not isinstance(value, Markup):
+        return words.printable(value)
+    return value
+
+
+def _day(seconds: float) -> str:
+    if not math.isfinite(seconds):
+        return ""
+    return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d %H:%M UTC")
+
+
+def _delivered(report: Mapping[str, Any]) -> dict[str, str]:
+    """{stage: bytes that it made for others}, where that is known; empty where it is not."""
+    counts = {
+        INTERSECT: (report["hits"], HIT.itemsize),
+        COLLECT: (report["points"], POINT.itemsize),
+    }
+    known = {} if report["resumed_scans"] else counts  # counts are of all runs, stages of this one
+    return {
+        stage: words.size(math.prod(known[stage])) if stage in known else "" for stage in STAGES
+    }
+
+
+def _picture(path: Path, alt: str, caption: str) -> Picture:
+    return Picture(path.name, alt, caption, _data_uri("image/png", path.read_bytes()))
+
+
+def _data_uri(kind: str, data: bytes) -> str:
+    return f"data:{kind};base64,{base64.b64encode(data).decode()}"
+
+
+def _size(file: Path, page: Path) -> str:
+    """Size of a file that is there already; the page is being written, the report comes last."""
+    return words.size(file.stat().st_size) if file != page and file.exists() else ""

@@ -1,0 +1,95 @@
+"""Numbers and names as a reader wants them; a leaf module."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+MINUS, NARROW = "\N{MINUS SIGN}", "\N{NARROW NO-BREAK SPACE}"
+LETTERS_MOST = 60
+_SPACES = f"\n\t\N{NO-BREAK SPACE}{NARROW}"  # not printable to Python, and harmless
+
+
+def printable(text: str) -> str:
+    """Replace what cannot be shown; names come from files, and may reverse the rest of a line."""
+    return "".join(
+        c if c.isprintable() or c in _SPACES else "\N{REPLACEMENT CHARACTER}" for c in text
+    )
+
+
+def shortened(name: str) -> str:
+    """Cut a long name in its middle."""
+    if len(name) <= LETTERS_MOST:
+        return name
+    tail = LETTERS_MOST // 3
+    return f"{name[: LETTERS_MOST - tail - 1]}…{name[-tail:]}"
+
+
+def counted(number: float, what: str, several: str = "") -> str:
+    """Return number and noun: «1 scan», «1,200 scans»."""
+    return f"{number:,} {what if number == 1 else several or what + 's'}"
+
+
+def duration(seconds: float) -> str:
+    """Return a time in the unit that suits it."""
+    if seconds < 0.001:
+        return f"{1e6 * seconds:.0f} µs"
+    if seconds < 0.9995:
+        return f"{1e3 * seconds:.3g} ms"
+    if seconds < 99.95:
+        return f"{seconds:.3g} s"
+    whole = round(seconds)
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    return f"{whole // 3600:,} h {whole % 3600 // 60:02d} min"
+
+
+def rate(number: float, seconds: float) -> str:
+    """Return how many there were in a second; a dash where that cannot be said."""
+    if seconds <= 0:
+        return "–"
+    return f"{large(number / seconds)}/s"
+
+
+def large(number: float) -> str:
+    """Three figures of a number, with k, M or G where it is large."""
+    for size, letter in ((1e9, "G"), (1e6, "M"), (1e4, "k")):
+        if number >= size:
+            scaled = number / (1e3 if letter == "k" else size)
+            return f"{scaled:.{max(0, 2 - int(math.log10(scaled)))}f}{NARROW}{letter}"
+    return f"{number:,.0f}" if number >= 100 else f"{number:.3g}"
+
+
+def size(count: int) -> str:
+    """Bytes in the unit that suits them."""
+    for unit, letters in ((1e9, "GB"), (1e6, "MB"), (1e3, "kB")):
+        if count >= unit:
+            return f"{count / unit:.3g} {letters}"
+    return f"{count} bytes"
+
+
+def share(part: float, whole: float) -> str:
+    """Return a part in per cent."""
+    if not whole:
+        return "–"
+    percent = 100 * part / whole
+    return "< 0.1%" if 0 < percent < 0.1 else f"{percent:.1f}%"
+
+
+def excess(fraction: float) -> str:
+    """Return by how much something is longer, in per cent: «+0.12%»."""
+    percent = 100 * fraction
+    text = f"{percent:+.2f}%" if abs(percent) >= 0.01 or percent == 0 else f"{percent:+.1g}%"
+    if "e" in text:
+        text = "< 0.01%"
+    return text.replace("-", MINUS)
+
+
+def metres(value: float | None) -> str:
+    """Length in metres, and words for none."""
+    return "–" if value is None else f"{value:,.2f} m".replace("-", MINUS)
+
+
+def numbers(values: Sequence[float]) -> str:
+    """Coordinates, short."""
+    return ", ".join(f"{value:,.10g}" for value in values).replace("-", MINUS)
