@@ -9,6 +9,7 @@ from distributed import Client
 
 from .book import Seat, names_of
 from .errors import PoolError
+from .fence_plugin import lower
 from .remote import on_scheduler
 from .rules import Rule
 from .steward import Steward, steward_of
@@ -86,6 +87,9 @@ async def _declare(
             seat.info = seat.info.with_gpus(devices)
     seats = {name: [_seat(steward, name, a) for a in chosen[name]] for name in rules}
     for name, rule in rules.items():
+        before = steward.book.rules.get(name)
+        if before and before.exclusive and not rule.exclusive:
+            lower(steward.scheduler, name)
         steward.book.enter(name, rule)
         for seat in seats[name]:
             steward.book.put(seat, name, rule.slots_of(seat.info))

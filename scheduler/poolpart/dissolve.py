@@ -12,8 +12,8 @@ from distributed import Client
 from .book import names_of
 from .declare import ask
 from .errors import PoolError
-from .fence import lower_fence
-from .inherit import disinherit
+from .fence_plugin import lower
+from .inherit import end_inheritance
 from .page import remove_partitions_page
 from .placing import asks_for
 from .stats import unwatch
@@ -45,20 +45,14 @@ def dissolve(client: Client, names: Collection[str] | None, timeout_s: float) ->
         If tasks of theirs have not ended; then they stay.
     """
     asked = None if names is None else list(names)
-    done, fenced = ask(client, _dissolve, names=asked, timeout_s=timeout_s)
-    for name in fenced:
-        lower_fence(client, name)
-    for name in done:
-        disinherit(client, name)
+    done: list[str] = ask(client, _dissolve, names=asked, timeout_s=timeout_s)
     if names is None:
         remove_partitions_page(client)
         unwatch(client)
-    return list(done)
+    return done
 
 
-async def _dissolve(
-    steward: Steward, names: list[str] | None, timeout_s: float
-) -> tuple[list[str], list[str]]:
+async def _dissolve(steward: Steward, names: list[str] | None, timeout_s: float) -> list[str]:
     book, scheduler = steward.book, steward.scheduler
     gone = [name for name in book.rules if names is None or name in names]
     deadline = time.monotonic() + timeout_s
@@ -72,22 +66,26 @@ async def _dissolve(
             )
         await asyncio.sleep(LOOK_EVERY_S)
     # From here to the next await nothing else happens on the scheduler.
-    fenced = [name for name in gone if book.rules[name].exclusive]
     for name in gone:  # whoever was lent is a member of its own partition again
         steward.rebalancing.drop_all(name)
     seats = [seat for seat in book.seats.values() if seat.partition in gone]
     for name in gone:
         del book.rules[name]
+        # Here and now, whatever becomes of the client and of workers that do not answer. A
+        # fence may be there also if the rule does not say so: somebody has raised it.
+        lower(scheduler, name)
+        end_inheritance(scheduler, name)
     for seat in seats:
         book.put(seat, None)
     _lift_restrictions(scheduler, gone)
-    if late := await steward.arrive(seats, max(timeout_s, 10.0)):
+    late = await steward.arrive(seats, max(timeout_s, 10.0))
+    await steward.restore_nannies(seat for seat in seats if not seat.holds)
+    if late:
         raise PoolError(
             f"{names_of(late)} did not answer while {' and '.join(gone)} were dissolved; they "
             "become what they were when they do."
         )
-    await steward.restore_nannies(s for s in seats if book.wanted(s) == s.found)
-    return gone, fenced
+    return gone
 
 
 def _unfinished(scheduler: Any, names: Collection[str]) -> list[Any]:

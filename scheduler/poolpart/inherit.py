@@ -55,7 +55,12 @@ async def _inherit(name: str, dask_scheduler: Any = None) -> None:
 
 
 async def _disinherit(name: str, dask_scheduler: Any = None) -> None:
-    rule: Inheritance | None = dask_scheduler.plugins.get(NAME)
+    end_inheritance(dask_scheduler, name)
+
+
+def end_inheritance(scheduler: Any, name: str) -> None:
+    """Do what `disinherit` does, on the scheduler."""
+    rule: Inheritance | None = scheduler.plugins.get(NAME)
     if rule is not None:
         rule.names.discard(name)
         if not rule.names:

@@ -8,6 +8,7 @@ from typing import Any
 from .book import Resources
 
 _PATIENCE_S = 1.0
+_FOUND = "poolpart_found"  # on a nanny: what it started its worker with before
 
 
 async def declare_on_worker(resources: Resources, dask_worker: Any = None) -> bool:
@@ -37,7 +38,7 @@ async def declare_on_worker(resources: Resources, dask_worker: Any = None) -> bo
     return True
 
 
-def keep_on_nanny(resources: Resources, dask_worker: Any = None) -> list[Resources | None]:
+def keep_on_nanny(resources: Resources, dask_worker: Any = None) -> None:
     """Start the worker with these resources from now on; runs on a nanny.
 
     Resources set on a running worker are lost when its nanny restarts it. Setting them once
@@ -45,27 +46,32 @@ def keep_on_nanny(resources: Resources, dask_worker: Any = None) -> list[Resourc
     nothing wakes those. A resource in what the nanny starts the worker with is there when the
     worker registers, and that does wake them.
 
-    Returns
-    -------
-    before
-        What it was before, for `restore_on_nanny`.
+    The nanny itself keeps what it had before: the answer to this may be lost, when its worker
+    dies at the same moment, and then nobody else would know.
     """
     nanny = dask_worker  # the server that this runs on
-    return _exchange(nanny, dict(resources), dict(resources))
+    if not hasattr(nanny, _FOUND):
+        setattr(nanny, _FOUND, (nanny.resources, _started_with(nanny)))
+    _start_with(nanny, dict(resources), dict(resources))
 
 
-def restore_on_nanny(before: list[Resources | None], dask_worker: Any = None) -> None:
-    """Have the nanny as `keep_on_nanny` found it; runs on a nanny."""
-    _exchange(dask_worker, *before)
+def restore_on_nanny(dask_worker: Any = None) -> None:
+    """Have the nanny as `keep_on_nanny` found it; runs on a nanny, any number of times."""
+    nanny = dask_worker
+    if hasattr(nanny, _FOUND):
+        _start_with(nanny, *getattr(nanny, _FOUND))
+        delattr(nanny, _FOUND)
 
 
-def _exchange(
-    nanny: Any, resources: Resources | None, started_with: Resources | None
-) -> list[Resources | None]:
-    before = [nanny.resources, None]
-    nanny.resources = resources
-    # A nanny that has started a worker keeps what it started it with, and uses that.
+def _started_with(nanny: Any) -> Resources | None:
+    """Look up what a nanny has started its worker with, and would again."""
+    started: Resources | None = nanny.resources
     if nanny.process is not None:
-        before[1] = nanny.process.worker_kwargs["resources"]
-        nanny.process.worker_kwargs["resources"] = started_with
-    return before
+        started = nanny.process.worker_kwargs["resources"]
+    return started
+
+
+def _start_with(nanny: Any, resources: Resources | None, again: Resources | None) -> None:
+    nanny.resources = resources
+    if nanny.process is not None:
+        nanny.process.worker_kwargs["resources"] = again

@@ -50,9 +50,11 @@ class Steward(SchedulerPlugin):
         self.book = Book()
         self.asked = 0  # questions of clients that are being answered
         self.rebalancing = Rebalancing(scheduler, self.book, self.settle)
+        self._looked_at: Any = None  # rules and members when nobody wanted those without a place
         self._resources_before = set(scheduler.resources)
         self._declared: dict[str, Resources] = {}  # {address: what the worker itself declares}
-        self._nannies: dict[str, tuple[Resources, Any]] = {}  # {address: (told, as found)}
+        # {address of a nanny: what it was told; None where its answer has not come, or never will}
+        self._nannies: dict[str, Resources | None] = {}
         self._tasks: dict[str, asyncio.Task[None]] = {}  # {address: settling of that worker}
         for worker in scheduler.workers.values():
             self._seat(worker)
@@ -124,11 +126,24 @@ class Steward(SchedulerPlugin):
         self.rebalancing.look(time.monotonic())
         if any(seat.absent_since is not None for seat in self.book.seats.values()):
             self.book.forget(time.monotonic())
-        for seat in list(self.book.seats.values()):
-            # One that nobody wanted may be wanted since another has gone for good.
-            waits = seat.unplaced and seat.absent_since is None
-            if waits and seat.info.address not in self._tasks and self._place(seat):
-                self.settle([seat])
+        waiting = [s for s in self.book.seats.values() if s.unplaced and s.absent_since is None]
+        if waiting:
+            self._look_for_places(waiting)
+
+    def _look_for_places(self, waiting: list[Seat]) -> None:
+        """Place workers that nobody wanted: another may have gone for good since.
+
+        Only when something has changed. To ask all rules for a thousand workers takes as long
+        as from one tick to the next.
+        """
+        book = self.book
+        now = dict(book.rules), {n: [s.key for s in book.members(n)] for n in book.rules}
+        if now == self._looked_at:
+            return
+        seats = [seat for seat in waiting if seat.info.address not in self._tasks]
+        self.settle([seat for seat in seats if self._place(seat)])
+        # Those that are on their way look for themselves, perhaps before what has changed.
+        self._looked_at = now if len(seats) == len(waiting) else None
 
     # -- making it so ------------------------------------------------------------------
 
@@ -144,10 +159,9 @@ class Steward(SchedulerPlugin):
         if worker is None:
             return False
         wanted = self.book.wanted(seat)
-        told = self._nannies[seat.nanny][0] if seat.nanny in self._nannies else None
         return bool(
             worker.resources == wanted == self._declared[worker.address]
-            and (told is None or told == wanted)
+            and self._nannies.get(seat.nanny or "", wanted) == wanted
         )
 
     def _spawn(self, address: str) -> None:
@@ -212,16 +226,17 @@ class Steward(SchedulerPlugin):
                 recount(self.scheduler.workers[address])
 
     async def _tell_nanny(self, seat: Seat, wanted: Resources) -> None:
-        if seat.nanny is None:
+        nanny = seat.nanny
+        if nanny is None:
             return
-        if seat.nanny not in self._nannies:
-            if wanted == seat.found:
-                return  # it starts its worker like that already
-            before = await call(self.scheduler, seat.nanny, keep_on_nanny, resources=wanted)
-            self._nannies[seat.nanny] = (wanted, before)
-        elif self._nannies[seat.nanny][0] != wanted:
-            await call(self.scheduler, seat.nanny, keep_on_nanny, resources=wanted)
-            self._nannies[seat.nanny] = (wanted, self._nannies[seat.nanny][1])
+        if wanted == seat.found:
+            if nanny in self._nannies:
+                await call(self.scheduler, nanny, restore_on_nanny)
+                self._nannies.pop(nanny, None)
+        elif self._nannies.get(nanny) != wanted:
+            self._nannies[nanny] = None  # its worker may die before it answers, which ends this
+            await call(self.scheduler, nanny, keep_on_nanny, resources=wanted)
+            self._nannies[nanny] = wanted
 
     async def arrive(self, seats: Collection[Seat], timeout_s: float) -> list[Seat]:
         """Wait until workers declare what the book says; returns those that do not in time.
@@ -258,13 +273,13 @@ class Steward(SchedulerPlugin):
     # -- the end -----------------------------------------------------------------------
 
     async def restore_nannies(self, seats: Iterable[Seat]) -> None:
-        """Have nannies start these workers as they were found to."""
+        """Have nannies start these workers, which are not there, as they were found to."""
         for seat in seats:
             if seat.nanny is None or seat.nanny not in self._nannies:
                 continue
-            _, before = self._nannies.pop(seat.nanny)
+            del self._nannies[seat.nanny]
             try:
-                await call(self.scheduler, seat.nanny, restore_on_nanny, before=before)
+                await call(self.scheduler, seat.nanny, restore_on_nanny)
             except OSError as error:
                 logger.info("The nanny at %s is gone: %s", seat.nanny, error)
 

@@ -1,5 +1,6 @@
 """Undoing partitions: what the scheduler, workers and nannies know is what they knew before."""
 
+import asyncio
 import os
 import signal
 import threading
@@ -7,7 +8,17 @@ import threading
 import pytest
 from distributed import Client, Event, get_worker
 
-from poolpart import Partition, Pool, PoolError, n_workers, named, per_host, rest
+from poolpart import (
+    Partition,
+    Pool,
+    PoolError,
+    n_workers,
+    named,
+    per_host,
+    raise_fence,
+    rest,
+    steward,
+)
 
 LONG_S = 60.0
 
@@ -110,6 +121,69 @@ def test_nannies_are_as_before(nannies, wait_until):
     nannies.restart()
     assert declared(nannies) == {"0": {}, "1": {}}
     assert known(nannies)["nannies"] == before["nannies"]
+
+
+def test_a_nanny_whose_worker_dies_before_it_has_answered(nannies, wait_until, monkeypatch):
+    before, answered = known(nannies), steward.call
+    pids, killed = nannies.run(os.getpid), []
+
+    async def call(scheduler, address, function, **arguments):
+        answer = await answered(scheduler, address, function, **arguments)
+        if function is steward.keep_on_nanny and not killed:
+            killed.extend(w for w, state in scheduler.workers.items() if state.nanny == address)
+            os.kill(pids[killed[0]], signal.SIGKILL)
+            while killed[0] in scheduler.workers:
+                await asyncio.sleep(0.01)
+            await asyncio.sleep(0)  # the steward does not get to read the answer
+        return answer
+
+    monkeypatch.setattr(steward, "call", call)
+    [part] = Pool.from_client(nannies).divide({"A": rest()}).values()
+    wait_until(lambda: declared(nannies) == {"0": {"A": 1}, "1": {"A": 1}}, LONG_S)
+    part.dissolve()
+    assert len(killed) == 1
+    assert known(nannies)["nannies"] == before["nannies"]
+
+
+def test_a_nanny_whose_worker_has_left_its_partition(nannies):
+    before = known(nannies)
+    part, _ = Pool.from_client(nannies).partition("A", n_workers=2)
+    part.shrink(1)
+    part.dissolve()
+    assert known(nannies)["nannies"] == before["nannies"]
+
+
+@pytest.mark.parametrize("how", ["not exclusive any more", "raised by hand"])
+def test_no_fence_stays(start, how):
+    client = start({"a": {}, "b": {}})
+    before = known(client)
+    pool = Pool.from_client(client)
+    part, _ = pool.partition("A", n_workers=1, exclusive=how == "not exclusive any more")
+    if how == "raised by hand":
+        raise_fence(client, "A")
+    else:
+        pool.partition("A", n_workers=1)
+        assert not part.stats().exclusive
+    pool.dissolve()
+    assert known(client) == before
+
+
+def test_nothing_stays_but_of_workers_that_do_not_answer(start, wait_until, monkeypatch):
+    client = start({"a": {}, "b": {}})
+    before = known(client)
+    pool = Pool.from_client(client)
+    pool.divide({"A": n_workers(1, exclusive=True), "B": rest()})
+    arrive = steward.Steward.arrive
+
+    async def impatient(self, seats, timeout_s):
+        return await arrive(self, seats, 0.0)
+
+    monkeypatch.setattr(steward.Steward, "arrive", impatient)
+    with pytest.raises(PoolError, match="a, b did not answer while A and B were dissolved"):
+        pool.dissolve()
+    wait_until(lambda: steward.NAME not in client.cluster.scheduler.plugins)
+    assert pool.dissolve() == []
+    assert known(client) == before
 
 
 def test_one_partition(start):

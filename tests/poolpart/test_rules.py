@@ -16,6 +16,7 @@ from poolpart import (
     per_host,
     probe,
     rest,
+    steward,
 )
 from poolpart.rules import check_rules, divide, partition_for
 from poolpart.selection import NO_GPU
@@ -222,6 +223,32 @@ def test_a_worker_that_left_is_replaced_by_one_that_joins_and_waiting_tasks_run(
     join(client, "late")
     assert client.gather(waiting) == ["late"] * 3
     assert declared(client) == {"a": {"B": 1}, "late": {"A": 1}}
+
+
+def test_rules_are_asked_again_only_when_something_has_changed(start, wait_until, monkeypatch):
+    asked = []
+
+    def ask(worker, *args):
+        asked.append(worker.name)
+        return partition_for(worker, *args)
+
+    monkeypatch.setattr(steward, "partition_for", ask)
+    client = start({"a": {}})
+    Pool.from_client(client).divide({"A": n_workers(1)})
+    join(client, "unwanted")
+    ticker = client.cluster.scheduler.plugins[steward.NAME]
+    wait_until(lambda: ticker._looked_at is not None)
+    asked.clear()
+    for _ in range(3):
+        client.sync(_tick, ticker)
+    assert not asked
+    leave(client, "a")
+    wait_until(lambda: declared(client) == {"unwanted": {"A": 1}})
+    assert asked == ["unwanted"]
+
+
+async def _tick(ticker):
+    ticker._tick()
 
 
 def test_a_late_worker_is_asked_for_its_gpus(start, wait_until, monkeypatch):
