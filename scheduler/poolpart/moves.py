@@ -137,6 +137,8 @@ async def _move(
     late = await steward.arrive(seats, timeout_s)
     for seat in late:
         origin, slots, home = before[seat]
+        if seat.partition != target or (origin and origin not in steward.book.rules):
+            continue  # meanwhile somebody else has moved it, or dissolved where it was
         _resize(steward, target, -1)
         _resize(steward, origin, 1)
         steward.book.put(seat, origin, slots)
@@ -152,7 +154,7 @@ async def _move(
 
 
 def _resize(steward: Steward, name: str | None, change: int) -> None:
-    if name is not None:
+    if name in steward.book.rules:
         steward.book.resize(name, change)
 
 

@@ -58,7 +58,8 @@ class Rebalancing:
     def drop(self, lender: str, borrower: str) -> list[Seat]:
         """Follow a rule no more; returns the workers that go back."""
         self.helps.pop((lender, borrower), None)
-        lent = self._lent(lender, borrower)
+        # Also those whose nanny is starting them again: they would stay for good.
+        lent = [seat for seat in self.book.members(borrower) if seat.home == lender]
         self._give_back(lent)
         return lent
 

@@ -137,6 +137,34 @@ def test_a_task_that_does_not_end_keeps_its_worker(divided, wait_until):
     assert len(parts["A"].shrink(1)) == 1
 
 
+def test_partitions_that_are_dissolved_while_a_worker_moves(start, wait_until):
+    client = start({"a": {}, "b": {}})
+    parts = Pool.from_client(client).divide({"A": n_workers(1, minimum=0), "B": rest()})
+    event = Event("late", client)
+    address = parts["A"].workers[0].address
+    task = parts["A"].submit(wait_for, "late")
+    state = client.cluster.scheduler.workers[address]
+    wait_until(lambda: state.processing)
+    time.sleep(0.1)  # until it runs: nobody tells
+    task.cancel()  # so that dissolving does not wait for it
+    wait_until(lambda: not state.processing)
+    moved = []
+
+    def move():
+        with pytest.raises(PoolError, match="1 of 1 workers could not be moved") as error:
+            parts["A"].shrink(1, timeout_s=1)
+        moved.append(error)
+
+    thread = threading.Thread(target=move)
+    thread.start()
+    wait_until(lambda: not state.resources["A"])
+    threading.Timer(3, event.set).start()
+    Pool.from_client(client).dissolve()
+    thread.join()
+    assert moved
+    assert set(map(str, declared_by_themselves(client).values())) == {"{}"}
+
+
 def test_a_task_that_was_cancelled_but_runs_on_keeps_its_slot(divided, wait_until):
     client, parts = divided
     event = Event("cancelled", client)
@@ -274,6 +302,22 @@ def test_rebalancing_that_makes_no_sense(divided):
     with pytest.raises(PoolError, match="There is no partition 'X'"):
         pool.rebalance("A", helps="X")
     assert pool.stop_rebalancing("A", helps="B") == []
+
+
+def test_whoever_helps_and_is_killed_goes_back(nannies, wait_until):
+    pool = Pool.from_client(nannies)
+    parts = pool.divide({"A": n_workers(1), "B": n_workers(1, minimum=0)})
+    helper = parts["B"].workers[0]
+    pool.rebalance("B", helps="A", idle_s=0)
+    event = Event("helper", nannies)
+    tasks = [parts["A"].submit(wait_for, "helper") for _ in range(4)]
+    wait_until(lambda: len(parts["A"]) == 2)
+    os.kill(nannies.run(os.getpid, workers=[helper.address])[helper.address], signal.SIGKILL)
+    wait_until(lambda: len(nannies.scheduler_info(n_workers=-1)["workers"]) == 1)
+    assert pool.stop_rebalancing("B", helps="A") == [helper.name]
+    assert members(parts["B"]) == [helper.name]
+    event.set()
+    nannies.gather(tasks)
 
 
 # -- whoever dies in between -----------------------------------------------------------
