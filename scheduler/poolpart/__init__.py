@@ -3,6 +3,7 @@
 from .asking import ask_workers
 from .awaiting import await_news
 from .backoff import Backoff
+from .current_client import own_client
 from .departure import WorkerLeft, telling_departure
 from .errors import PipeClosed, PipeFailed, PoolError
 from .fence import lower_fence, raise_fence
@@ -61,6 +62,7 @@ __all__ = [
     "lower_fence",
     "n_workers",
     "named",
+    "own_client",
     "partitions_page",
     "per_gpu",
     "per_host",

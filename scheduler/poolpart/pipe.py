@@ -17,10 +17,11 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
-from distributed import Client, Queue, Variable, get_client
+from distributed import Client, Queue, Variable
 
 from .awaiting import await_news
 from .backoff import Backoff
+from .current_client import own_client
 from .errors import PipeClosed, PipeFailed
 from .pipe_parts import AttachedQueue, PipeState, change_pipe, forget_pipes, open_pipe
 
@@ -98,7 +99,7 @@ class Pipe:
         """The client that is used."""
         # Kept: a worker's thread that has seceded would find another one each time.
         if self._client is None:
-            self._client = get_client()
+            self._client = own_client()
         return self._client
 
     @property

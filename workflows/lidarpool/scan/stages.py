@@ -13,7 +13,7 @@ from itertools import chain
 from typing import Any
 
 import numpy as np
-from distributed import Client, get_client, secede
+from distributed import Client, secede
 
 from poolpart import (
     Backoff,
@@ -23,6 +23,7 @@ from poolpart import (
     Recorder,
     TaskRecord,
     fetch_available,
+    own_client,
     telling_departure,
     trace,
 )
@@ -164,7 +165,7 @@ def _arrivals(inlet: Pipe) -> Iterator[tuple[int, list[Any]]]:
     arrived. `base` is the first scan that had not reached the driver when the item was put.
     Results whose worker has died are asked for until Dask has made them again.
     """
-    client: Client = get_client()
+    client: Client = own_client()
     pause = Backoff(most_s=0.1)
     missing: dict[str, float] = {}  # {key: when to stop asking}
     while True:

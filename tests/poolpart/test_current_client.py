@@ -1,0 +1,49 @@
+"""Several tasks of one worker that ask for its client at the same moment."""
+
+from __future__ import annotations
+
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+from distributed import Client
+
+from poolpart.current_client import own_client
+
+
+def test_one_asks_at_a_time(monkeypatch):
+    inside, together = threading.Semaphore(1), []
+
+    def slow() -> str:
+        together.append(not inside.acquire(blocking=False))
+        time.sleep(0.01)
+        inside.release()
+        return "client"
+
+    monkeypatch.setattr("poolpart.current_client.get_client", slow)
+    with ThreadPoolExecutor(4) as threads:
+        assert [*threads.map(lambda _: own_client(), range(8))] == ["client"] * 8
+    assert together == [False] * 8
+
+
+def test_one_that_fails_does_not_keep_others_out(monkeypatch):
+    def fail() -> Client:
+        raise OSError("no scheduler")
+
+    monkeypatch.setattr("poolpart.current_client.get_client", fail)
+    for _ in range(2):
+        with pytest.raises(OSError, match="no scheduler"):
+            own_client()
+
+
+def identity(_: str) -> tuple[str, str]:
+    client = own_client()
+    return client.id, client.status
+
+
+def test_tasks_of_a_worker_share_its_client(start):
+    client = start({"a": {"nthreads": 4}})
+    told = client.gather(client.map(identity, [str(number) for number in range(8)]))
+    assert len({name for name, _ in told}) == 1
+    assert {status for _, status in told} == {"running"}
