@@ -26,6 +26,7 @@ from .scenario import Scenario
 from .scenario_commands import init, schema
 from .scene_commands import scene
 from .tls_options import tls_file_options, tls_files_for
+from .view_command import view
 
 _out = click.option(
     "--out",
@@ -46,7 +47,7 @@ def cli() -> None:
     """Simulate lidar surveys on a partitioned Dask cluster."""
 
 
-for _command in (init, check, schema, scene, completion):
+for _command in (init, check, schema, scene, completion, view):
     cli.add_command(_command)
 
 

@@ -1,0 +1,182 @@
+"""A browser without a window, driven through its debugging protocol."""
+
+import base64
+import itertools
+import json
+import shutil
+import signal
+import subprocess
+import time
+import urllib.request
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from websockets.sync.client import connect
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+# Pictures are drawn by the processor, and nothing is asked of the network on its own account.
+OPTIONS = (
+    "--headless=new",
+    "--no-sandbox",
+    "--no-first-run",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-dev-shm-usage",
+    "--window-size=1280,800",
+    "--remote-debugging-port=0",
+)
+
+_ATTACH = {"autoAttach": True, "waitForDebuggerOnStart": True, "flatten": True}
+
+
+class Tab:
+    """One page of a browser: what it asked for, what it complained of, what it shows."""
+
+    def __init__(self, url: str):
+        self._socket = connect(url, max_size=None, compression=None)
+        self._numbers = itertools.count(1)
+        self.requests: list[str] = []  # addresses
+        self.errors: list[str] = []  # of the console, and exceptions
+        for domain in ("Page", "Network", "Runtime", "Log"):
+            self.call(f"{domain}.enable")
+        # Workers have requests of their own; they wait until these are listened to as well.
+        self.call("Target.setAutoAttach", **_ATTACH)
+
+    def call(self, method: str, **params):
+        """Ask the browser something; its events that come meanwhile are noted."""
+        number = next(self._numbers)
+        self._socket.send(json.dumps({"id": number, "method": method, "params": params}))
+        while True:
+            message = json.loads(self._socket.recv(timeout=60))
+            if message.get("id") == number:
+                assert "error" not in message, message
+                return message["result"]
+            if "method" in message:
+                self._note(message["method"], message["params"])
+
+    def _listen(self, session: str) -> None:
+        """Hear what a worker does, and let it begin."""
+        for method, params in (
+            ("Network.enable", {}),
+            ("Runtime.enable", {}),
+            ("Target.setAutoAttach", _ATTACH),
+            ("Runtime.runIfWaitingForDebugger", {}),
+        ):
+            message = {"id": next(self._numbers), "method": method, "params": params}
+            self._socket.send(json.dumps(message | {"sessionId": session}))
+
+    def _note(self, method: str, params: dict) -> None:
+        if method == "Target.attachedToTarget":
+            self._listen(params["sessionId"])
+        elif method == "Network.requestWillBeSent":
+            self.requests.append(params["request"]["url"])
+        elif method == "Network.webSocketCreated":
+            self.requests.append(params["url"])
+        elif method == "Runtime.exceptionThrown":
+            self.errors.append(json.dumps(params["exceptionDetails"]))
+        elif method == "Runtime.consoleAPICalled" and params["type"] == "error":
+            self.errors.append(json.dumps(params["args"]))
+        elif method == "Log.entryAdded" and params["entry"]["level"] == "error":
+            self.errors.append(params["entry"]["text"] + " " + params["entry"].get("url", ""))
+
+    def open(self, url: str) -> None:
+        """Open an address."""
+        self.call("Page.navigate", url=url)
+
+    def value(self, script: str):
+        """Value of an expression of JavaScript."""
+        return self.call("Runtime.evaluate", expression=script, returnByValue=True)["result"].get(
+            "value"
+        )
+
+    @property
+    def text(self) -> str:
+        """Whatever can be read on the page."""
+        return self.value("document.body ? document.body.innerText : ''") or ""
+
+    def wait_for(self, condition: Callable[[str], object], seconds: float = 60.0):
+        """Wait until something is true of the page's text; returns what it was."""
+        deadline = time.monotonic() + seconds
+        while not (found := condition(self.text)):
+            assert time.monotonic() < deadline, (
+                f"it did not come to pass; the page says {self.text!r}"
+            )
+            time.sleep(0.1)
+        return found
+
+    def click(self, label: str) -> None:
+        """Press the button with this label."""
+        found = self.value(
+            "(() => { const b = [...document.querySelectorAll('button')]"
+            f".find(b => b.innerText.trim() === {json.dumps(label)});"
+            " if (b) b.click(); return !!b; })()"
+        )
+        assert found, f"there is no button {label!r}"
+
+    def picture(self, path: Path) -> np.ndarray:
+        """Take a picture of the page, (height, width, 3), and keep it."""
+        data = self.call("Page.captureScreenshot", format="png")["data"]
+        path.write_bytes(base64.b64decode(data))
+        return np.asarray(Image.open(path).convert("RGB"))
+
+    def close(self) -> None:
+        """Let go of the page."""
+        self._socket.close()
+
+
+@pytest.fixture(scope="session")
+def chromium(tmp_path_factory):
+    """Return the port at which a browser listens."""
+    program = next(filter(None, map(shutil.which, NAMES)), None)
+    if program is None:
+        pytest.skip(f"needs a browser: none of {', '.join(NAMES)} is installed")
+    profile = tmp_path_factory.mktemp("profile")
+    process = subprocess.Popen(
+        [program, *OPTIONS, f"--user-data-dir={profile}", "about:blank"],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    try:
+        told = profile / "DevToolsActivePort"
+        deadline = time.monotonic() + 60
+        while not (told.exists() and told.read_text().strip()):
+            assert process.poll() is None, f"{program} ended with {process.returncode}"
+            assert time.monotonic() < deadline, f"{program} does not answer"
+            time.sleep(0.05)
+        yield int(told.read_text().split()[0])
+    finally:
+        process.send_signal(signal.SIGTERM)
+        try:
+            process.wait(20)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+@pytest.fixture
+def new_tab(chromium):
+    """Return a function that opens a page in a tab of its own."""
+    tabs = []
+
+    def open_tab(url: str) -> Tab:
+        request = urllib.request.Request(
+            f"http://127.0.0.1:{chromium}/json/new?about:blank", method="PUT"
+        )
+        with urllib.request.urlopen(request, timeout=30) as answer:
+            told = json.load(answer)
+        tab = Tab(told["webSocketDebuggerUrl"])
+        tabs.append((tab, told["id"]))
+        tab.open(url)
+        return tab
+
+    yield open_tab
+    for tab, name in tabs:
+        tab.close()
+        urllib.request.urlopen(f"http://127.0.0.1:{chromium}/json/close/{name}", timeout=30).close()

@@ -1,0 +1,70 @@
+"""A finished result, looked at in a browser."""
+
+import re
+
+import numpy as np
+import pytest
+
+from lidarpool.live.page import live_page
+from lidarpool.live.result_file import ResultFile
+from lidarpool.live.viewing import ResultView
+from lidarpool.ply_format import header, row_type
+
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
+
+
+@pytest.fixture
+def cloud(tmp_path):
+    """Return a file with a spiral of 30,000 points in 300 scans."""
+    turn = np.linspace(0, 20 * np.pi, 30_000)
+    rows = np.zeros(30_000, row_type(np.dtype(np.float32)))
+    rows["x"], rows["y"], rows["z"] = 9 * np.cos(turn), 9 * np.sin(turn), turn / 8
+    rows["scan"] = np.arange(30_000) // 100
+    path = tmp_path / "cloud.ply"
+    path.write_bytes(header(np.dtype(np.float32), 30_000) + rows.tobytes())
+    return path
+
+
+@pytest.fixture
+def served(cloud):
+    """Return a page that shows it, at most 20,000 points at a time, and the view."""
+    with live_page("a cloud", port=0) as page:
+        view = ResultView(page, ResultFile(cloud), most=20_000)
+        thread = view.painter.start()
+        yield page, view
+        view.painter.end()
+        thread.join(30)
+        assert view.painter.error is None
+
+
+def outside(requests, url):
+    """Give the requests that leave the page's own server."""
+    own = (url, url.replace("http", "ws", 1), "data:", "blob:")
+    return [request for request in requests if not request.startswith(own)]
+
+
+def test_view_shows_the_cloud_and_asks_nobody_else(served, new_tab, tmp_path):
+    page, _ = served
+    tab = new_tab(page.url)
+    tab.wait_for(lambda text: "30,000 of 30,000 points, 20,000 shown" in text)
+    tab.wait_for(lambda _: colourful(tab.picture(tmp_path / "a.png")) > 3000)
+    picture = tab.picture(tmp_path / "a.png")
+    assert len(np.unique(picture[:, :900].reshape(-1, 3), axis=0)) > 200
+    assert any(request.startswith("ws://127.0.0.1") for request in tab.requests)
+    assert outside(tab.requests, page.url) == []
+    assert tab.errors == []
+
+
+def test_the_slider_shows_some_scans_with_all_their_points(served, new_tab):
+    page, view = served
+    tab = new_tab(page.url)
+    tab.wait_for(lambda text: "20,000 shown" in text)
+    view._scans.value = (100, 149)
+    view.painter.ask()
+    tab.wait_for(lambda text: re.search(r"5,000 of 30,000 points, all\s+shown", text))
+
+
+def colourful(picture):
+    """Count the pixels left of the panel that are of a colour."""
+    part = picture[200:, :900].astype(int)
+    return int((part.max(axis=2) - part.min(axis=2) > 60).sum())

@@ -1,0 +1,118 @@
+"""The page: a viser server on the loopback interface, its camera, ground and theme."""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+import webbrowser
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import rich
+import viser
+from numpy.typing import ArrayLike, NDArray
+
+HOST = "127.0.0.1"
+PORT = 8080  # or the next that is free
+
+_FOV = math.radians(45)
+_FROM = np.array([0.55, -1.0, 0.62])  # direction from the scene's middle to the camera
+_GRID = (128, 134, 142)  # lines that are seen on a light page and on a dark one
+
+
+class LivePage(viser.ViserServer):
+    """A page for anybody on this machine, and for nobody else."""
+
+    def request_share_url(self, verbose: bool = True) -> None:
+        """Do nothing: viser would open a way to this page from the whole internet."""
+
+    @property
+    def url(self) -> str:
+        """Where it is."""
+        return f"http://{HOST}:{self.get_port()}"
+
+    def show_theme(self, dark: bool) -> None:
+        """Show the page light or dark."""
+        self.gui.configure_theme(dark_mode=dark, show_logo=False, show_share_button=False)
+
+    def frame_scene(self, bounds: ArrayLike) -> None:
+        """Put the camera where it sees all of a box, (2, 3) in metres, with Z up, and a grid below.
+
+        The lines of the grid are whole metres apart, or tenths or tens of them.
+        """
+        low, high = np.asarray(bounds, np.float64)
+        size = float(np.linalg.norm(high - low)) or 1.0
+        middle = (low + high) / 2
+        camera = self.initial_camera
+        camera.fov = _FOV
+        camera.look_at = middle
+        camera.position = middle + _FROM / np.linalg.norm(_FROM) * 0.5 * size / math.tan(_FOV / 2)
+        camera.up = np.array([0.0, 0.0, 1.0])
+        camera.near, camera.far = size / 500, size * 50
+        self._add_grid(low, high, size)
+
+    def _add_grid(self, low: NDArray[np.float64], high: NDArray[np.float64], size: float) -> None:
+        step = grid_step(size)
+        centre = step * np.round((low + high) / (2 * step))
+        self.scene.add_grid(
+            "/ground",
+            width=step * math.ceil(1.4 * (high[0] - low[0]) / step + 4),
+            height=step * math.ceil(1.4 * (high[1] - low[1]) / step + 4),
+            cell_size=step,
+            cell_color=_GRID,
+            section_size=5 * step,
+            section_color=_GRID,
+            section_thickness=1.5,
+            fade_distance=20 * size,
+            shadow_opacity=0.0,
+            position=(float(centre[0]), float(centre[1]), float(low[2]) - 0.002 * size),
+        )
+
+    def add_page_controls(self, step_m: float) -> None:
+        """Add what every page has at the end of its panel."""
+        with self.gui.add_folder("page", expand_by_default=False):
+            dark = self.gui.add_checkbox("dark", initial_value=False)
+            self.gui.add_markdown(f"Metres, Z up; the grid's lines are {step_m:g} m apart.")
+        dark.on_update(lambda _: self.show_theme(dark.value))
+
+
+def grid_step(size: float) -> float:
+    """Metres between lines of a grid under a scene of this diagonal."""
+    return float(10.0 ** math.floor(math.log10(size / 4)))
+
+
+@contextmanager
+def live_page(title: str, port: int = PORT) -> Iterator[LivePage]:
+    """Serve a page while the body runs.
+
+    Parameters
+    ----------
+    title
+        Title of its panel.
+    port
+        Port to listen on, or the next that is free; 0 for any.
+    """
+    console = rich.get_console()  # viser tells there what is going on, as it runs and as it ends
+    before, console.quiet = console.quiet, True
+    try:
+        page = LivePage(host=HOST, port=port, label=title, verbose=False)
+        try:
+            page.show_theme(dark=False)
+            yield page
+        finally:
+            page.stop()
+    finally:
+        console.quiet = before
+
+
+def open_browser(url: str) -> bool:
+    """Open a page if there is a desktop to open it on; returns whether there is."""
+    if sys.platform.startswith("linux") and not (
+        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    ):
+        return False  # else a browser in the terminal would take it over
+    if "SSH_CONNECTION" in os.environ:
+        return False
+    return webbrowser.open(url)

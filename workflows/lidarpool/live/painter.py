@@ -1,0 +1,73 @@
+"""Drawing when there is something new, and never so often that it takes over the machine."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+BUSY_SHARE = 0.1  # of the time may go into drawing
+
+
+class Painter:
+    """Calls a function after it was asked to, in one thread, with a rest after each call.
+
+    However often it is asked, what it draws is the latest state, once.
+
+    Parameters
+    ----------
+    draw
+        What to call.
+    every_s
+        Seconds from one call to the next, at least.
+    """
+
+    def __init__(self, draw: Callable[[], None], every_s: float) -> None:
+        self._draw, self._every_s = draw, every_s
+        self._asked = threading.Event()
+        self._ended = threading.Event()
+        self.error: BaseException | None = None  # that ended it
+
+    def ask(self, _: object = None) -> None:
+        """Have it draw soon; from any thread, and as a callback of whatever."""
+        self._asked.set()
+
+    def end(self) -> None:
+        """Have `run` return, after a last drawing if one was asked for."""
+        self._ended.set()
+        self._asked.set()
+
+    def run(self) -> None:
+        """Draw until `end` is called.
+
+        Raises
+        ------
+        Exception
+            Whatever `draw` raises.
+        """
+        while True:
+            # A wait without limit would not be left on Ctrl-C everywhere.
+            while not self._asked.wait(0.2):
+                pass
+            last = self._ended.is_set()
+            self._asked.clear()
+            started = time.monotonic()
+            self._draw()
+            if last:
+                return
+            took = time.monotonic() - started
+            self._ended.wait(max(self._every_s - took, took * (1 / BUSY_SHARE - 1)))
+            if self._ended.is_set():
+                self._asked.set()
+
+    def start(self) -> threading.Thread:
+        """Run in a thread of its own; what it raises is kept in `error`."""
+        thread = threading.Thread(target=self._run_kept, name="lidarpool-live", daemon=True)
+        thread.start()
+        return thread
+
+    def _run_kept(self) -> None:
+        try:
+            self.run()
+        except Exception as error:
+            self.error = error

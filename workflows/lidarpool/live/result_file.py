@@ -1,0 +1,168 @@
+"""A finished cloud on disk, of which any scans are read, thinned to a number of points."""
+
+from __future__ import annotations
+
+import json
+from bisect import bisect_left, bisect_right
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import LidarpoolError
+from ..ply_format import layout
+from .display import DISPLAY
+
+CLOUD, REPORT = "cloud.ply", "report.json"
+
+
+class ResultFile:
+    """A cloud that `lidarpool run` wrote, and what its report tells of it.
+
+    The points stay on disk; only those that are chosen are read.
+
+    Parameters
+    ----------
+    path
+        The folder of a result, or a cloud. The report is looked for beside the cloud.
+
+    Raises
+    ------
+    LidarpoolError
+        If there is no such cloud, or it is damaged.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = _cloud_in(path)
+        self._rows = _mapped(self.path)
+        report = _report_beside(self.path)
+        try:
+            self.names = tuple(map(str, report.get("points_by_object", ())))
+            self.route = _route(report)  # (n, 2), metres, world coordinates
+            self._sensors, self._steps = _sensors(report)
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise LidarpoolError(
+                f"{self.path.with_name(REPORT)} is not the report of a run ({error!r}): remove "
+                "it, and the cloud is shown without it."
+            ) from error
+        whole = self.choose(0, 2**31 - 1, 100_000)[0]
+        scans = whole["scan"]
+        self.in_order = bool((np.diff(scans) >= 0).all())
+        # Exact where the scans are in order.
+        ends = self._rows["scan"][[0, -1]] if self.in_order and len(self) else scans
+        self.scans = (int(ends.min(initial=2**31 - 1)), int(ends.max(initial=0)))
+        if not len(self):
+            self.scans = (0, 0)
+        self.has_ranges = bool(np.isfinite(whole["range"]).any())
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    @property
+    def origin(self) -> NDArray[np.float64]:
+        """Whole metres near the points, (3,), that displayed positions are relative to."""
+        if not len(self):
+            return np.zeros(3)
+        first = np.array([self._rows[axis][0] for axis in "xyz"], np.float64)
+        return np.where(np.abs(first) > 10_000, np.round(first), 0.0)
+
+    def choose(self, first: int, last: int, most: int) -> tuple[NDArray[np.void], int]:
+        """Choose at most so many points of scans `first` to `last`, evenly.
+
+        Returns
+        -------
+        rows
+            The points (DISPLAY), in order. Those without finite coordinates are left out.
+        count
+            How many there are.
+        """
+        scans = self._rows["scan"]
+        low = bisect_left(scans, first) if first > 0 else 0
+        high = bisect_right(scans, last) if last < 2**31 - 1 else len(scans)
+        count = max(0, high - low)
+        rows = self._rows[low + _even(count, most)]
+        positions = np.stack([rows[axis] for axis in "xyz"], axis=1, dtype=np.float64)
+        out = np.empty(len(rows), DISPLAY)
+        out["position"] = positions - self.origin
+        out["range"] = self._ranges(positions, rows["scan"])
+        for name in ("scan", "ring", "object"):
+            out[name] = rows[name]
+        return out[np.isfinite(positions).all(axis=1)], count
+
+    def _ranges(
+        self, positions: NDArray[np.float64], scans: NDArray[np.int32]
+    ) -> NDArray[np.float64]:
+        if not len(self._sensors):
+            return np.full(len(positions), np.nan)
+        sensor = self._sensors[(scans // self._steps).clip(0, len(self._sensors) - 1)]
+        return np.asarray(np.linalg.norm(positions - sensor, axis=1))
+
+
+def _even(count: int, most: int) -> NDArray[np.int64]:
+    """At most so many of the numbers up to `count`, one out of each of equal parts.
+
+    Which of each part is left to chance, the same each time: every n-th point could always be
+    of the same ring.
+    """
+    if count <= most:
+        return np.arange(count)
+    edges = np.linspace(0, count, most + 1)
+    chance = np.random.default_rng(0).random(most)
+    return (edges[:-1] + chance * np.diff(edges)).astype(np.int64)
+
+
+def _cloud_in(path: Path) -> Path:
+    if not path.is_dir():
+        return path
+    if not (path / CLOUD).exists():
+        raise LidarpoolError(
+            f"{path} holds no {CLOUD}: give the folder of a finished run (its --out), or a cloud."
+        )
+    return path / CLOUD
+
+
+def _mapped(path: Path) -> NDArray[np.void]:
+    """Rows of a cloud, read from disk as they are used."""
+    try:
+        start, count, dtype = layout(path)
+        if not count:  # nothing cannot be mapped
+            return np.empty(0, dtype)
+        return np.memmap(path, dtype, "r", start, (count,))
+    except OSError as error:
+        raise LidarpoolError(f"{path} cannot be read: {error.strerror or error}.") from error
+    except ValueError as error:
+        raise LidarpoolError(f"{path} is not a point cloud of lidarpool: {error}.") from error
+
+
+def _report_beside(cloud: Path) -> Mapping[str, Any]:
+    """Report of a cloud; empty where there is none."""
+    path = cloud.with_name(REPORT)
+    if cloud.name != CLOUD or not path.exists():
+        return {}
+    try:
+        report = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise LidarpoolError(
+            f"{path} cannot be read ({error}): remove it, and the cloud is shown without it."
+        ) from error
+    return report if isinstance(report, dict) else {}
+
+
+def _sensors(report: Mapping[str, Any]) -> tuple[NDArray[np.float64], int]:
+    """World position of each pose, (p, 3), and scans from each; none where not all are told."""
+    told = report.get("parameters", {})
+    poses = told.get("first_poses", ())
+    if not poses or len(poses) != told.get("poses"):
+        return np.empty((0, 3)), 1
+    local = np.array([pose["position"] for pose in poses], np.float64)
+    return local + np.asarray(told["origin"], np.float64), int(told["steps"])
+
+
+def _route(report: Mapping[str, Any]) -> NDArray[np.float64]:
+    """Planned path, (n, 2), world coordinates; empty where there is none."""
+    planning = report.get("planning") or {}
+    local = np.asarray(planning.get("path", ()), np.float64).reshape(-1, 2)
+    origin = report.get("parameters", {}).get("origin", (0.0, 0.0))
+    return local + np.asarray(origin, np.float64)[:2]
