@@ -19,6 +19,7 @@ from typing import Any, NoReturn
 from dask.utils import funcname
 from distributed import CancelledError, Future
 
+from .callbacks import when_done
 from .chunks import NOTE, Answer, Call, Chunk, ChunkSize, run_chunk
 from .sender import Sender
 
@@ -169,7 +170,7 @@ class Results(Iterator[Any]):
         )
         for future, chunk in zip(futures, chunks, strict=False):
             self._running[future] = chunk
-            future.add_done_callback(self._done.put)
+            when_done(future, self._done.put)
         for chunk in chunks[len(futures) :]:  # beyond the quota of the sender
             heapq.heappush(self._again, (chunk.first, chunk.calls))
 
@@ -222,8 +223,8 @@ class Results(Iterator[Any]):
         for future in done:
             if future.status == "finished":
                 finished.append(future)
-            elif future.status == "pending":  # its worker was lost since: it runs once more
-                future.add_done_callback(self._done.put)
+            elif future.status in ("pending", "lost"):  # so was its worker: it runs once more
+                when_done(future, self._done.put)
             else:
                 chunk = self._running.pop(future)
                 self._back[chunk.first] = chunk, future

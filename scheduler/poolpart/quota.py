@@ -7,6 +7,8 @@ from typing import Any
 
 from distributed import Future
 
+from .callbacks import when_done
+
 
 class Quota:
     """At most so many tasks under way at a time, counted where they are submitted.
@@ -43,7 +45,7 @@ class Quota:
 
     def watch(self, future: Future) -> None:
         """Give the task's place back when it is done, failed or cancelled."""
-        future.add_done_callback(self._done)
+        when_done(future, self._done)
 
     def give_back(self, places: int) -> None:
         """Give places back for which no task was submitted after all."""

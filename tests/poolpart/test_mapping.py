@@ -3,6 +3,7 @@
 import itertools
 import logging
 import os
+import queue
 import signal
 import threading
 import time
@@ -333,6 +334,18 @@ def test_what_cannot_be_submitted_gives_its_places_back(a):
     assert handle.submit(twice, 1).result(LONG_S) == 2
 
 
+def test_a_callback_may_submit_more_than_the_quota(a):
+    handle, submitted = a.limited(1), queue.SimpleQueue()
+
+    def go_on(_):
+        for number in range(3):
+            submitted.put(handle.submit(twice, number))
+
+    handle.submit(twice, 1).add_done_callback(go_on)
+    futures = [submitted.get(timeout=LONG_S) for _ in range(3)]
+    assert [future.result(LONG_S) for future in futures] == [0, 2, 4]
+
+
 @pytest.mark.parametrize("slots", [0, -1, 1.5])
 def test_quotas_are_checked(a, slots):
     with pytest.raises(ValueError, match=f"A quota of {slots} slots; give a whole number"):
@@ -351,6 +364,22 @@ def test_a_lost_worker_is_survived(nannies, ordered):
     pids += results
     assert len(pids) == 60
     assert len(set(pids)) >= 2
+
+
+@pytest.mark.parametrize("ordered", [True, False])
+def test_results_that_are_lost_before_they_are_fetched(start, wait_until, ordered):
+    client = start({"x": {"resources": {"A": 1}}, "y": {"resources": {"A": 1}}})
+    again = Event("again", client)
+    again.set()
+    results = Partition("A", client).map(
+        wait_for, ["again"] * 4, chunk=1, window=4, ordered=ordered
+    )
+    wait_until(lambda: all(future.done() for future in results._running))
+    again.clear()
+    client.sync(client.cluster.workers["x"].close)
+    wait_until(lambda: any(future.status == "lost" for future in results._running))
+    threading.Timer(0.5, again.set).start()
+    assert list(results) == [True] * 4
 
 
 def test_items_that_kill_their_workers_are_named(nannies):
