@@ -105,9 +105,17 @@ class Arena:
         self.cluster.workers.pop(name, None)
         self.cluster.sync(self.cluster._correct_state)
 
+    @property
+    def deserted(self) -> list[str]:
+        """Names of workers whose nanny has left without them."""
+        nannies = list(self.cluster.workers.items())
+        return [name for name, nanny in nannies if nanny.status.name in ("closed", "failed")]
+
     def wait_until_whole(self, timeout_s: float = 60.0) -> None:
         """Wait until every worker is there."""
         deadline = time.monotonic() + timeout_s
+        for name in self.deserted:
+            self.revive(name)
         while absent := [name for name in self.cluster.worker_spec if not self.address(name)]:
             if time.monotonic() > deadline:
                 raise TimeoutError(f"{', '.join(absent)} did not come back in {timeout_s} s.")

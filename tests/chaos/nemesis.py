@@ -217,9 +217,11 @@ class Nemesis:
     # -- in either thread --------------------------------------------------------------
 
     def strike(self, fault: Fault) -> bool:
-        """Carry out a fault on a worker of its partition; False if there is none now."""
-        there = self.arena.pid if fault.kind in SIGNALS else self.arena.address
-        names = [name for name in self.arena.names(fault.partition) if there(name)]
+        """Carry out a fault on a worker of its partition; False if there is none now.
+
+        Only on one that has joined: a nanny whose worker dies before gives up, and leaves.
+        """
+        names = [name for name in self.arena.names(fault.partition) if self.arena.address(name)]
         if not names:
             return False
         name = names[int(fault.pick * len(names))]
