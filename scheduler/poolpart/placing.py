@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Collection
 from typing import Any
 
@@ -86,10 +87,12 @@ def hand_off(scheduler: Any, worker: Any, names: Collection[str], asked: set[Any
     stealing = scheduler.extensions.get("stealing")
     if stealing is None:
         return
+    given: Counter[Any] = Counter()  # to whom; the scheduler counts a task when the worker agrees
     for task in list(worker.processing - worker.long_running):
         if task in asked or task.actor or not asks_for(task, names):
             continue
         asked.add(task)
         if others := (scheduler.valid_workers(task) or set()) - {worker}:
-            thief = min(others, key=lambda other: len(other.processing) / other.nthreads)
+            thief = min(others, key=lambda o: (len(o.processing) + given[o]) / o.nthreads)
+            given[thief] += 1
             stealing.move_task_request(task, worker, thief)

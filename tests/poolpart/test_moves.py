@@ -83,6 +83,24 @@ def test_workers_that_come_take_tasks(divided):
     assert sorted(map(str, declared(client).values())) == [*["{'A': 1}"] * 3, *["{'B': 1}"] * 3]
 
 
+def test_what_has_not_started_is_shared_out_evenly(divided, wait_until):
+    client, parts = divided
+    event = Event("evenly", client)
+    tasks = [parts["A"].submit(wait_for, "evenly") for _ in range(60)]
+    scheduler = client.cluster.scheduler
+    wait_until(lambda: sum(len(w.processing) for w in scheduler.workers.values()) == 60)
+    members_of_a = [scheduler.workers[worker.address] for worker in parts["A"].workers]
+    moving = threading.Thread(target=parts["A"].shrink)
+    moving.start()
+    # What the worker that leaves has begun ends there.
+    wait_until(lambda: sorted(len(worker.processing) for worker in members_of_a)[0] == 1)
+    given = sorted(len(worker.processing) for worker in members_of_a)
+    event.set()
+    moving.join()
+    client.gather(tasks)
+    assert given in ([1, 29, 30], [1, 28, 31], [1, 27, 32])
+
+
 def test_back_and_forth_is_as_before(divided):
     client, parts = divided
     before = declared(client)
