@@ -7,7 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import TextIO
+from typing import Any, TextIO, cast
 
 from rich.console import Console
 from rich.progress import (
@@ -48,7 +48,7 @@ def shown_progress(quiet: bool = False) -> Iterator[Show]:
     """
     if quiet or sys.stderr is None:
         yield lambda progress: None
-    elif (console := _terminal()) is not None:
+    elif (console := _terminal(sys.stderr)) is not None:
         with _bars(console) as show:
             yield show
     else:
@@ -60,7 +60,7 @@ def shown_status(text: str, quiet: bool = False) -> Iterator[None]:
     """Say on stderr what is going on while the body runs."""
     if quiet or sys.stderr is None:
         yield
-    elif (console := _terminal()) is not None:
+    elif (console := _terminal(sys.stderr)) is not None:
         with console.status(text):
             yield
     else:
@@ -68,10 +68,29 @@ def shown_status(text: str, quiet: bool = False) -> Iterator[None]:
         yield
 
 
-def _terminal() -> Console | None:
+def _terminal(stream: TextIO) -> Console | None:
     """Console of a terminal that can move its cursor; None where lines are all there is."""
-    console = Console(stderr=True)
+    console = Console(file=cast(TextIO, _Unheard(stream)))
     return console if console.is_terminal and not console.is_dumb_terminal else None
+
+
+class _Unheard:
+    """A stream on which writing does not fail: a terminal may be closed while a run goes on."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        with suppress(OSError):
+            return self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with suppress(OSError):
+            self._stream.flush()
 
 
 class PlainLines:
@@ -165,7 +184,7 @@ def time_in_words(seconds: float) -> str:
 
 
 def _tell(stream: TextIO, line: str) -> None:
-    with suppress(BrokenPipeError):  # that nobody reads along any more is no reason to end a run
+    with suppress(OSError):  # that nobody reads along any more is no reason to end a run
         stream.write(f"{time.strftime('%H:%M:%S')}  {line}\n")
         stream.flush()
 
