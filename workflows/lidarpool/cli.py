@@ -19,6 +19,7 @@ from .completion import PROGRAM, complete_backend, completion
 from .connection import connected
 from .errors import LidarpoolError
 from .interrupts import INTERRUPTED, STOPPED, UNTOUCHED, interrupt_on_signals
+from .log_file import LOG
 from .quiet import silence_logs
 from .report import versions
 from .run_command import RunOptions, run_scenario
@@ -36,6 +37,12 @@ _out = click.option(
     help="Folder for the results; made if it is not there.",
 )
 _quiet = click.option("--quiet", "-q", is_flag=True, help="No progress, only the result.")
+_verbose = click.option(
+    "--verbose", "-v", is_flag=True, help=f"Keep more messages in {LOG}, in the folder of --out."
+)
+_json = click.option(
+    "--json", "as_json", is_flag=True, help="Print the main figures as one JSON document."
+)
 
 _page = click.option("--page", is_flag=True, help="Serve a live page, and say where.")
 _tls = click.option("--tls", is_flag=True, help="Encrypt the traffic of the local cluster.")
@@ -56,7 +63,9 @@ for _command in (init, check, schema, scene, completion, view):
 @_tls
 @_page
 @_quiet
-def demo(out: Path, tls: bool, page: bool, quiet: bool) -> None:
+@_verbose
+@_json
+def demo(out: Path, tls: bool, page: bool, quiet: bool, verbose: bool, as_json: bool) -> None:
     """Run the default survey and path planning on a cluster on this machine.
 
     \b
@@ -64,7 +73,16 @@ def demo(out: Path, tls: bool, page: bool, quiet: bool) -> None:
       lidarpool demo
       lidarpool demo --out /tmp/demo
     """  # noqa: D301 - click wants the character, not its name
-    run_scenario(Scenario(), RunOptions(out, tls=tls, journal=False, quiet=quiet, page=page))
+    options = RunOptions(
+        out,
+        tls=tls,
+        journal=False,
+        quiet=quiet,
+        verbose=verbose,
+        as_json=as_json,
+        page=page,
+    )
+    run_scenario(Scenario(), options)
 
 
 @cli.command()
@@ -84,6 +102,8 @@ def demo(out: Path, tls: bool, page: bool, quiet: bool) -> None:
 @click.option("--fresh", is_flag=True, help="Drop an unfinished run.")
 @_page
 @_quiet
+@_verbose
+@_json
 def run(
     scenario: Path,
     out: Path,
@@ -94,6 +114,8 @@ def run(
     fresh: bool,
     page: bool,
     quiet: bool,
+    verbose: bool,
+    as_json: bool,
     tls: bool,
     tls_ca: Path | None,
     tls_cert: Path | None,
@@ -124,6 +146,8 @@ def run(
         resume=resume,
         fresh=fresh,
         quiet=quiet,
+        verbose=verbose,
+        as_json=as_json,
         page=page,
     )
     run_scenario(Scenario.load(scenario), options)

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import logging
 import warnings
+from pathlib import Path
 from typing import Any
 
 from distributed.diagnostics.plugin import WorkerPlugin
+
+from .log_file import log_to
 
 
 def silence_logs() -> None:
@@ -21,10 +24,21 @@ class QuietWorkers(WorkerPlugin):
 
     A task that fails is told of once, by the driver; Dask's worker would log it as well, with
     a traceback.
+
+    Parameters
+    ----------
+    log
+        A file for what they log; None for none.
     """
 
     name = "lidarpool-quiet"
 
+    def __init__(self, log: Path | None = None) -> None:
+        self.log = log
+
     def setup(self, worker: Any) -> None:
         """Silence a worker, also one that is started again."""
-        silence_logs()
+        if self.log is None:
+            silence_logs()
+        else:
+            log_to(self.log)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -18,10 +19,12 @@ from .job import Job
 from .journal import COMMAND_TERMS, open_journal
 from .journal_folder import remove_journal
 from .live_page import shown_on_page
+from .log_file import LOG, logged_to
 from .quiet import QuietWorkers
 from .result import Result
 from .run import Run, make_result
 from .scenario import Scenario
+from .summary import summary
 from .terminal import shown_progress, shown_status
 from .tls import NO_FILES, TlsFiles
 
@@ -45,6 +48,8 @@ class RunOptions:
     resume: bool = False
     fresh: bool = False
     quiet: bool = False
+    verbose: bool = False
+    as_json: bool = False
     page: bool = False
 
 
@@ -58,17 +63,28 @@ def run_scenario(scenario: Scenario, options: RunOptions) -> None:
     """
     # Matplotlib is a third of the time that --help would take.
     from .output import result_folder, write_result
+    from .report_page import make_recipe
 
+    recipe = make_recipe(scenario, click.get_current_context(silent=True))
     _check_backend(options.backend or scenario.pool.backend, options)
     job = make_job(scenario, options.backend, options.no_plan)
-    with result_folder(options.out):
+    with result_folder(options.out), logged_to(_log(options), options.verbose) as log:
         kept = _deliveries(job, options)
         with kept.kept_on_error():
             result = _conduct(scenario, kept, options)
             with shown_status("writing the cloud, the pictures and the report", options.quiet):
-                report = write_result(options.out, result, job.scene, job.survey, job.planning)
+                report = write_result(
+                    options.out, result, job.scene, job.survey, job.planning, recipe
+                )
         kept.remove()
+    if options.as_json:
+        figures = summary(options.out, report, log.path if log.written else None)
+        click.echo(json.dumps(figures, indent=1, allow_nan=False))
+    else:
         _tell(options.out, result, job, report["files"])
+        if log.written and not options.quiet:
+            name = click.format_filename(options.out / LOG)
+            click.echo(f"messages of Dask and other libraries are in {name}", err=True)
 
 
 def make_job(scenario: Scenario, backend: str | None = None, no_plan: bool = False) -> Job:
@@ -88,6 +104,11 @@ def make_job(scenario: Scenario, backend: str | None = None, no_plan: bool = Fal
         scenario.pool.queue_capacity,
         scenario.pool.collectors,
     )
+
+
+def _log(options: RunOptions) -> Path:
+    """File for messages of libraries; its name is good in workers, too."""
+    return options.out.absolute() / LOG
 
 
 def _check_backend(backend: str, options: RunOptions, *advice: str) -> None:
@@ -118,7 +139,7 @@ def _conduct(scenario: Scenario, kept: Deliveries, options: RunOptions) -> Resul
     if kept.backend:
         _check_backend(kept.backend, options, kept.advice)
     if options.scheduler is None:
-        cluster = _local_client(scenario, options.quiet, options.tls)
+        cluster = _local_client(scenario, options)
     else:
         cluster = connected(options.scheduler, options.files)
     with (
@@ -130,19 +151,19 @@ def _conduct(scenario: Scenario, kept: Deliveries, options: RunOptions) -> Resul
 
 
 @contextmanager
-def _local_client(scenario: Scenario, quiet: bool, tls: bool) -> Iterator[Client]:
-    """Client of a cluster on this machine whose workers say nothing of their own."""
+def _local_client(scenario: Scenario, options: RunOptions) -> Iterator[Client]:
+    """Client of a cluster on this machine whose workers say nothing at the terminal."""
     with ExitStack() as stack:
-        with shown_status("starting the workers", quiet):
+        with shown_status("starting the workers", options.quiet):
             client = stack.enter_context(
                 local_client(
                     gpu_workers=scenario.pool.gpu,
                     collectors=scenario.pool.collectors,
                     other_workers=scenario.pool.other,
-                    tls=tls,
+                    tls=options.tls,
                 )
             )
-            client.register_plugin(QuietWorkers())
+            client.register_plugin(QuietWorkers(_log(options) if options.verbose else None))
         yield client
 
 

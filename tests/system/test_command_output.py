@@ -1,0 +1,99 @@
+"""What a run prints for machines, and where messages of libraries go."""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from distributed import Scheduler, SpecCluster, Worker
+
+import lidarpool.run_command
+from lidarpool import read_cloud
+
+SHORT = "sensor: {layers: 8}\nplanning: {trials: 4, iterations: 20}\n"
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[str]:
+    """A cluster whose workers are threads of this process, for speed; its address."""
+    quiet = {"host": "127.0.0.1", "dashboard": False}
+    workers = {
+        name: {"cls": Worker, "options": {"resources": {name: n}, "nthreads": n, **quiet}}
+        for name, n in {"GPU": 1, "LIDAR": 4, "OTHER": 1}.items()
+    }
+    scheduler = {"cls": Scheduler, "options": {"port": 0, **quiet}}
+    with SpecCluster(workers=workers, scheduler=scheduler, silence_logs=50) as cluster:
+        yield cluster.scheduler_address
+
+
+@pytest.fixture
+def run(tmp_path, lidarpool, cluster, no_pictures) -> Callable[..., Any]:
+    """Run a short scenario on the threads' cluster, into the folder `out`."""
+
+    def run(*options: str) -> Any:
+        (tmp_path / "s.yaml").write_text(SHORT)
+        arguments = ["--out", tmp_path / "out", "--scheduler", cluster, *options]
+        return lidarpool("run", tmp_path / "s.yaml", *arguments)
+
+    return run
+
+
+def test_json_is_one_document_and_all_of_stdout(run, tmp_path):
+    outcome = run("--json", "-q")
+    assert (outcome.code, outcome.err) == (0, "")
+    said = json.loads(outcome.out, parse_constant=pytest.fail)
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert said["folder"] == str(tmp_path / "out")
+    assert list(said["files"]) == report["files"]
+    assert all(Path(path).is_file() for path in said["files"].values())
+    assert said["points"] == len(read_cloud(said["files"]["cloud.ply"])) > 0
+    for name in ("scans", "rays", "hits", "backend", "notes", "seconds", "placement_violations"):
+        assert said[name] == report[name]
+    assert said["planning"]["best_length"] == report["planning"]["best_length"]
+
+
+def test_json_with_progress_for_people_beside_it(run):
+    outcome = run("--json", "--no-plan")
+    assert json.loads(outcome.out)["planning"] is None
+    assert "survey  done: 108 scans" in outcome.err
+
+
+def test_json_of_a_run_that_fails_is_nothing(run):
+    outcome = run("--json", "--backend", "cuda")
+    assert (outcome.code, outcome.out) == (2, "")
+    assert outcome.err.splitlines()[-1].startswith("lidarpool: Backend 'cuda' cannot be used")
+
+
+def test_warnings_of_libraries_are_in_the_log_and_not_on_the_terminal(run, tmp_path, monkeypatch):
+    make_result = lidarpool.run_command.shown_progress
+
+    def warn(quiet: bool) -> Any:
+        logging.getLogger("distributed.worker").warning("memory is nearly full")
+        return make_result(quiet)
+
+    monkeypatch.setattr(lidarpool.run_command, "shown_progress", warn)
+    outcome = run("--no-plan")
+    assert outcome.code == 0
+    assert "memory is nearly full" not in outcome.err + outcome.out
+    assert outcome.err.endswith(f"are in {tmp_path / 'out' / 'lidarpool.log'}\n")
+    log = (tmp_path / "out" / "lidarpool.log").read_text()
+    assert re.search(r"WARNING \d+ distributed.worker: memory is nearly full$", log, re.M)
+    assert json.loads(run("--no-plan", "-q", "--json").out)["log"] == str(
+        tmp_path / "out" / "lidarpool.log"
+    )
+
+
+@pytest.mark.slow
+def test_verbose_logs_what_driver_and_workers_do(tmp_path, lidarpool, no_pictures):
+    (tmp_path / "s.yaml").write_text(SHORT)
+    outcome = lidarpool("run", tmp_path / "s.yaml", "--out", tmp_path / "out", "-v", "-q")
+    assert (outcome.code, outcome.err) == (0, "")
+    log = (tmp_path / "out" / "lidarpool.log").read_text()
+    lines = re.findall(r"^\S+ \S+ INFO +(\d+) distributed\.(\w+)", log, re.M)
+    assert len({process for process, _ in lines}) >= 4  # the driver and three workers
+    assert {"scheduler", "nanny", "worker"} <= {part for _, part in lines}
