@@ -126,6 +126,9 @@ class Steward(SchedulerPlugin):
         self.rebalancing.look(time.monotonic())
         if any(seat.absent_since is not None for seat in self.book.seats.values()):
             self.book.forget(time.monotonic())
+            known = {seat.nanny for seat in self.book.seats.values()}
+            for nanny in self._nannies.keys() - known:
+                del self._nannies[nanny]
         waiting = [s for s in self.book.seats.values() if s.unplaced and s.absent_since is None]
         if waiting:
             self._look_for_places(waiting)
