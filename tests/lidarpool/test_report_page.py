@@ -364,7 +364,10 @@ def test_hundreds_of_workers_and_tens_of_thousands_of_tasks(write):
     for name in ("GPU", "OTHER"):
         folded = re.fullmatch(r"and (\d+) more lanes: the share that was busy", said[name][-1])
         assert int(folded[1]) + len(said[name]) - 1 >= 200
-    assert "GPU 200 workers, 10,000 tasks" in page.texts("div", "group")
+    headings = page.texts("div", "group")
+    assert headings[0] == "Stages while at least one task ran"
+    assert headings[1].startswith("GPU 200 workers, 10,000 tasks, of which 2,5")
+    assert headings[2] == "LIDAR 1 worker, 4 tasks"
     assert f"{20_004:,} tasks in" in text and "are drawn by worker" in text
 
 

@@ -159,5 +159,7 @@ def _data_uri(kind: str, data: bytes) -> str:
 
 
 def _size(file: Path, page: Path) -> str:
-    """Size of a file that is there already; the page is being written, the report comes last."""
-    return words.size(file.stat().st_size) if file != page and file.exists() else ""
+    """Size of a file, if it is there already: the report comes last."""
+    if file == page:
+        return "this page"
+    return words.size(file.stat().st_size) if file.exists() else ""

@@ -19,7 +19,7 @@ from .words import counted, duration
 
 WIDTH = 1000  # units of the drawing, whatever its width on the page
 ROW = 18  # height of a row
-LANES_MOST = 64  # of all partitions; what is beyond is drawn together
+LANES_MOST = 48  # of all partitions; what is beyond is drawn together
 SLICES = 250  # of the time, in what is drawn together
 _THIN = 1.2  # units that a bar is wide at least
 _GAP = 0.6  # units between bars that are drawn as one
@@ -130,11 +130,15 @@ def make_timeline(
     ran = sum((stage.resources for stage in stages), Counter())  # {partition: tasks}
     room = _shared(LANES_MOST, [len(found) for found in lanes.values()])
     for (partition, found), most in zip(lanes.items(), room, strict=True):
-        rows = _workers(axis, found, most, names)
+        drawn = sum(len(tasks) for _, _, tasks in found)
+        tasks = max(ran[partition], drawn)
+        rows = _workers(axis, found, most, names, tasks / drawn)
         workers = {worker for worker, _, _ in found}  # of the tasks that have a record
         workers = workers.union(*(s.workers for s in stages if s.partition == partition))
-        tasks = counted(ran[partition] or sum(len(tasks) for _, _, tasks in found), "task")
-        groups.append(Group(partition, f"{counted(len(workers), 'worker')}, {tasks}", rows))
+        detail = f"{counted(len(workers), 'worker')}, {counted(tasks, 'task')}"
+        if tasks > drawn:  # else the gaps would pass for idleness
+            detail += f", of which {drawn:,} are drawn: the gaps are not all idle time"
+        groups.append(Group(partition, detail, rows))
     return Timeline(
         seconds=axis.seconds,
         ticks=tuple(ticks),
@@ -194,8 +198,13 @@ def _lanes(records: Iterable[TaskRecord]) -> list[Lane]:
     return [(*place, lane) for place, lanes in by_place.items() for lane in lanes]
 
 
-def _workers(axis: _Axis, lanes: list[Lane], most: int, names: dict[str, str]) -> tuple[Row, ...]:
-    """Rows of a partition: the busiest lanes by themselves, the others together."""
+def _workers(
+    axis: _Axis, lanes: list[Lane], most: int, names: dict[str, str], each: float
+) -> tuple[Row, ...]:
+    """Rows of a partition: the busiest lanes by themselves, the others together.
+
+    `each` is the number of tasks that one with a record stands for.
+    """
     lanes = sorted(lanes, key=lambda lane: -sum(task.seconds for task in lane[2]))
     shown, rest = lanes[:most], lanes[most:]
     rows = []
@@ -205,11 +214,11 @@ def _workers(axis: _Axis, lanes: list[Lane], most: int, names: dict[str, str]) -
         spans = axis.spans((task.start, task.stop) for task in tasks)
         rows.append(Row(worker, detail, stage, _lines(spans)))
     if rest:
-        rows.append(_folded(axis, rest))
+        rows.append(_folded(axis, rest, each))
     return tuple(rows)
 
 
-def _folded(axis: _Axis, lanes: list[Lane]) -> Row:
+def _folded(axis: _Axis, lanes: list[Lane], each: float) -> Row:
     """Draw many lanes as one area: how large a share of them was busy when."""
     busy = np.zeros(SLICES)  # lanes that were busy in each slice
     for _, _, tasks in lanes:
@@ -217,7 +226,7 @@ def _folded(axis: _Axis, lanes: list[Lane]) -> Row:
         for start, stop in axis.spans((task.start, task.stop) for task in tasks):
             at_work[int(start * SLICES / WIDTH) : int(np.ceil(stop * SLICES / WIDTH))] = True
         busy += at_work
-    high = (ROW - 4) * busy / len(lanes)
+    high = (ROW - 4) * np.minimum(each * busy / len(lanes), 1.0)
     width = WIDTH / SLICES
     steps = "".join(f"V{ROW - 2 - level:.1f}H{(k + 1) * width:.0f}" for k, level in enumerate(high))
     label = f"and {counted(len(lanes), 'more lane')}"
