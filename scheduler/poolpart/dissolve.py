@@ -65,7 +65,9 @@ async def _dissolve(steward: Steward, names: list[str] | None, timeout_s: float)
                 f"such as {tasks[0].key}: wait for them, or cancel them, and dissolve then."
             )
         await asyncio.sleep(LOOK_EVERY_S)
-    # From here to the next await nothing else happens on the scheduler.
+    # From here to the next await nothing else happens on the scheduler; up to here somebody else
+    # may have dissolved the same partitions.
+    gone = [name for name in gone if name in book.rules]
     for name in gone:  # whoever was lent is a member of its own partition again
         steward.rebalancing.drop_all(name)
     seats = [seat for seat in book.seats.values() if seat.partition in gone]

@@ -4,6 +4,7 @@ import asyncio
 import os
 import signal
 import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from distributed import Client, Event, get_worker
@@ -183,6 +184,24 @@ def test_nothing_stays_but_of_workers_that_do_not_answer(start, wait_until, monk
         pool.dissolve()
     wait_until(lambda: steward.NAME not in client.cluster.scheduler.plugins)
     assert pool.dissolve() == []
+    assert known(client) == before
+
+
+def test_two_who_dissolve_the_same_partition(start, wait_until):
+    client = start({"a": {}, "b": {}})
+    before = known(client)
+    part, _ = Pool.from_client(client).partition("A", n_workers=1, exclusive=True)
+    event = Event("both", client)
+    task = part.submit(wait_for, "both")
+    wait_until(lambda: any(w.processing for w in client.cluster.scheduler.workers.values()))
+    with ThreadPoolExecutor(2) as both:
+        dissolved = [both.submit(Pool(client, []).dissolve) for _ in range(2)]
+        ticker = client.cluster.scheduler.plugins[steward.NAME]
+        wait_until(lambda: ticker.asked == 2)
+        event.set()
+    assert sorted(one.result() for one in dissolved) == [[], ["A"]]
+    task.release()
+    wait_until(lambda: not client.cluster.scheduler.tasks)
     assert known(client) == before
 
 
