@@ -86,7 +86,7 @@ def test_bash_completes(tmp_path, lidarpool):
         f'#!/bin/sh\nexec {sys.executable} -c "from lidarpool.cli import main; main()" "$@"\n'
     )
     command.chmod(0o755)
-    asked = "COMP_WORDS=(lidarpool run --no)\nCOMP_CWORD=2\n_lidarpool_completion lidarpool\n"
+    asked = "COMP_WORDS=(lidarpool run --no-pl)\nCOMP_CWORD=2\n_lidarpool_completion lidarpool\n"
     path = os.pathsep.join([str(tmp_path), os.environ["PATH"]])
     done = subprocess.run(
         ["bash", "-c", f'{script}\n{asked}echo "${{COMPREPLY[@]}}"'],
@@ -126,3 +126,17 @@ def test_what_is_misspelt_is_answered_with_what_was_meant(arguments, meant, lida
     outcome = lidarpool(*arguments)
     assert outcome.code == 2 and outcome.out == ""
     assert re.search(rf"Did you mean (one of: )?.*{meant}", outcome.err), outcome.err
+
+
+@pytest.mark.parametrize(
+    ("text", "meant"),
+    [
+        ("pool: {backend: embre}", "'embree'"),
+        ("scene: {preset: sead}", "'seed'"),
+        ("scene: {files: [{file: a.stl, up_axis: Z}]}", "'z'"),
+    ],
+)
+def test_a_misspelt_choice_in_a_scenario_is_answered_too(text, meant, tmp_path, lidarpool):
+    (tmp_path / "s.yaml").write_text(text)
+    outcome = lidarpool("check", tmp_path / "s.yaml")
+    assert outcome.code == 2 and outcome.err.endswith(f"Did you mean {meant}?\n"), outcome.err

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 import reprlib
 from collections.abc import Sequence
 from typing import Any, get_args
@@ -13,6 +14,8 @@ from pydantic_core import ErrorDetails
 
 _GIVEN_LETTERS = 160  # of what was given
 _LINES = 2  # messages shown; a reader puts them right one by one anyway
+
+_CHOICE = re.compile(r"'([^']*)'")  # in pydantic's words for those that there are
 
 _EXPECTED = {
     "int": "a whole number",
@@ -88,7 +91,10 @@ def _line(detail: ErrorDetails, model: type[BaseModel]) -> str:
         entries = get_args(field.annotation) if field else ()
         allowed = f"a list of {len(entries)}" if entries else "a longer list"
         return f"{_dotted(place[:-1])} is {_given(detail['input'])}; it must be {allowed}."
-    return f"{_dotted(place)} is {_given(detail['input'])}; it must be {_allowed(detail, model)}."
+    text = f"{_dotted(place)} is {_given(detail['input'])}; it must be {_allowed(detail, model)}."
+    if kind == "literal_error" and isinstance(detail["input"], str):
+        text += did_you_mean(detail["input"], _CHOICE.findall(detail["ctx"]["expected"]))
+    return text
 
 
 def _allowed(detail: ErrorDetails, model: type[BaseModel]) -> str:
