@@ -452,5 +452,5 @@ def test_the_scenario_on_the_page_is_the_scenario(write):
 def test_a_million_poses_are_cut_short():
     scenario = Scenario.from_data({"poses": [{"position": [k, 0, 1]} for k in range(5000)]})
     recipe = make_recipe(scenario, None)
-    assert recipe.remark == "Only the first 2,000 of its 5,000 poses are written here."
-    assert len(yaml.safe_load(recipe.scenario)["poses"]) == 2000
+    assert recipe.remark == "Only the first 500 of its 5,000 poses are written here."
+    assert len(yaml.safe_load(recipe.scenario)["poses"]) == 500

@@ -5,7 +5,6 @@ from __future__ import annotations
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import click
 import yaml
@@ -13,7 +12,7 @@ from click.core import ParameterSource
 
 from ..scenario import Scenario
 
-POSES_MOST = 2000  # written out; a survey may have a million
+POSES_MOST = 500  # written out; a survey may have a million
 _ONCE = ("resume", "fresh", "quiet", "page")  # options that a repetition does not need
 
 
@@ -82,16 +81,15 @@ def _words(context: click.Context) -> list[str]:
 
 def _as_yaml(scenario: Scenario) -> tuple[str, str]:
     """Return a scenario as YAML that can be loaded, and what is to be said about it."""
+    poses, remark = scenario.poses, ""
+    if poses is not None and len(poses) > POSES_MOST:
+        remark = f"Only the first {POSES_MOST:,} of its {len(poses):,} poses are written here."
+        scenario = scenario.model_copy(update={"poses": poses[:POSES_MOST]})
     data = scenario.model_dump(mode="json", exclude_none=True)
     for entry in data["scene"]["files"]:
         if "matrix" in entry:  # says where a mesh stands; the other three would contradict it
             for name in ("translation", "rotation_deg", "scale"):
                 entry.pop(name, None)
-    remark = ""
-    poses: list[Any] = data.get("poses", [])
-    if len(poses) > POSES_MOST:
-        remark = f"Only the first {POSES_MOST:,} of its {len(poses):,} poses are written here."
-        data["poses"] = poses[:POSES_MOST]
     text = yaml.safe_dump(
         data, sort_keys=False, allow_unicode=True, default_flow_style=None, width=96
     )
