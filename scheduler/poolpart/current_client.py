@@ -1,10 +1,13 @@
-"""The client that a task uses, asked for by several at once."""
+"""The client that a task uses: made by one at a time, and made again where that failed."""
 
 from __future__ import annotations
 
 import threading
 
-from distributed import Client, get_client
+from distributed import Client, default_client, get_client
+
+_TRIES = 5
+_CLOSE_S = 5.0
 
 _one_at_a_time = threading.Lock()
 
@@ -12,9 +15,25 @@ _one_at_a_time = threading.Lock()
 def own_client() -> Client:
     """Client of this task's worker; elsewhere the current one.
 
-    `distributed.get_client` makes the worker's client when a task asks for it first. Of
-    several tasks that ask at the same moment, in threads of one worker, each may make one,
-    get another's that is still connecting, or fail with an AssertionError that has no words.
+    `distributed.get_client` makes the worker's client when a task asks for it first, and that
+    fails, with an AssertionError that has no words, when the scheduler has something to tell
+    all clients in the moment in which it greets the new one: that a worker has died, say. What
+    was made by then stays the default, connected to nothing, and every later task gets it.
+    Besides, of several tasks that ask at the same moment each may make one.
     """
     with _one_at_a_time:
+        for _ in range(_TRIES - 1):
+            try:
+                return get_client()
+            except AssertionError:
+                _close_half_made()
         return get_client()
+
+
+def _close_half_made() -> None:
+    try:
+        client = default_client()
+    except ValueError:  # it was not made at all
+        return
+    if client.status != "running":
+        client.close(timeout=_CLOSE_S)

@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from distributed import Client
+from distributed.diagnostics.plugin import SchedulerPlugin
 
 from poolpart.current_client import own_client
 
@@ -35,6 +36,37 @@ def test_one_that_fails_does_not_keep_others_out(monkeypatch):
     for _ in range(2):
         with pytest.raises(OSError, match="no scheduler"):
             own_client()
+
+
+class TellAtOnce(SchedulerPlugin):
+    """Has the scheduler tell the next client something in the message that greets it."""
+
+    name = "tell-at-once"
+
+    def __init__(self) -> None:
+        self.told = 0
+
+    def add_client(self, scheduler, client) -> None:
+        if not self.told:
+            self.told += 1
+            word = {"op": "lost-data", "key": "nothing"}
+            scheduler.loop.add_callback(lambda: scheduler.client_comms[client].send(word))
+
+
+def status_on_worker() -> str:
+    return own_client().status
+
+
+def test_one_that_was_told_too_much_at_once_is_made_again(nannies):
+    """Without a second try the task fails with an AssertionError."""
+    nannies.register_plugin(TellAtOnce())
+    worker = next(iter(nannies.scheduler_info()["workers"]))
+    futures = [nannies.submit(status_on_worker, workers=[worker], pure=False) for _ in range(3)]
+    assert nannies.gather(futures) == ["running"] * 3
+    told = nannies.run_on_scheduler(
+        lambda dask_scheduler: dask_scheduler.plugins[TellAtOnce.name].told
+    )
+    assert told == 1
 
 
 def identity(_: str) -> tuple[str, str]:
