@@ -149,6 +149,12 @@ def test_a_mistake_in_the_scenario(check):
     assert "Did you mean 'layers'?" in outcome.err
 
 
+def test_a_survey_that_hits_nothing_is_told_of(check):
+    outcome = check("--json", text=json.dumps(SHORT | {"poses": [[0, 0, 1000]]}))
+    assert outcome.code == 0
+    assert "no ray cast here hit anything" in json.loads(outcome.out)["notes"][0]
+
+
 def test_an_unfinished_run_is_told_of(check, tmp_path):
     (tmp_path / "out" / "journal").mkdir(parents=True)
     (tmp_path / "out" / "journal" / lidarpool.forecast.RECORDS).write_bytes(b"")

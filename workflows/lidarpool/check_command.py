@@ -89,7 +89,10 @@ def told(made: Forecast) -> Iterator[str]:
     job, needs, sample = made.job, made.needs, made.sample
     survey, planning = job.survey, job.planning
     sensor = survey.sensor
-    yield f"scene       {len(job.scene.names):,} objects, {len(job.scene.faces):,} triangles"
+    objects = len(job.scene.names)
+    yield (
+        f"scene       {objects:,} object{'s' * (objects != 1)}, {len(job.scene.faces):,} triangles"
+    )
     yield (
         f"survey      {survey.scan_count:,} scans from {len(survey.poses):,} poses, "
         f"{survey.ray_count:,} rays ({sensor.rays_per_revolution:,} x {sensor.layers:,} a turn)"

@@ -124,6 +124,8 @@ def forecast(job: Job, pool: PoolSection, out: Path, client: Client | None = Non
     # Casting here takes what it takes on a worker: it would be refused, or killed.
     if needs_of(job, 0).gpu_worker <= MEMORY_LIMIT:
         made.sample = sample_survey(job.scene, job.survey)
+        if not made.sample.hits:
+            made.notes.append("no ray cast here hit anything: look at poses, ranges and units")
     # Without a sample every ray may hit.
     points = made.sample.points if made.sample else job.survey.ray_count // job.survey.keep_every
     made.needs = needs_of(job, points)
