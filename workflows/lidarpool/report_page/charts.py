@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..plan import Plan, Trial
+from ..view.captions import without_common_prefix
 from ..view.stage import nice_step
 from .words import counted, share
 
@@ -26,9 +27,10 @@ Tick = tuple[float, str]  # per cent of the axis, label
 
 @dataclass(frozen=True)
 class Bar:
-    """A row of a bar chart: name, number, its share of all, its length in per cent."""
+    """A row of a bar chart: name in full and short, number, share of all, length in per cent."""
 
     name: str
+    label: str
     count: int
     share: str
     percent: float
@@ -70,7 +72,8 @@ def object_bars(counts: Mapping[str, int]) -> ObjectBars:
     hit = [item for item in ranked if item[1]]
     shown = hit[:OBJECTS_MOST]
     most = shown[0][1] if shown else 1
-    bars = [Bar(name, n, share(n, total), 100 * n / most) for name, n in shown]
+    labels = dict(zip(counts, without_common_prefix(list(counts)), strict=True))
+    bars = [Bar(name, labels[name], n, share(n, total), 100 * n / most) for name, n in shown]
     rest = []
     if more := hit[OBJECTS_MOST:]:
         points = sum(count for _, count in more)

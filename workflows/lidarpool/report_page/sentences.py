@@ -77,8 +77,8 @@ def pictures(report: Report) -> dict[str, tuple[str, str]]:
         ),
         "cloud.png": (
             "Point cloud of the scene, coloured by object or height, from the same viewpoint",
-            f"The cloud: {counted(report['points'], 'point')}, one of every "
-            f"{parameters['keep_every']} hits, rounded to {parameters['precision_m']:g} m.",
+            f"The cloud: {counted(report['points'], 'point')}, {_kept(parameters['keep_every'])}, "
+            f"rounded to {parameters['precision_m']:g} m.",
         ),
         "path.png": (
             "Plan of the obstacles as discs, with the paths of all trials and the best one",
@@ -86,3 +86,7 @@ def pictures(report: Report) -> dict[str, tuple[str, str]]:
         ),
     }
     return {name: said for name, said in shown.items() if name in report["files"]}
+
+
+def _kept(every: int) -> str:
+    return "one for each hit" if every == 1 else f"one for every {every:,} hits of a scan"
