@@ -14,7 +14,8 @@ class WorkerInfo:
     Parameters
     ----------
     name
-        The worker's name; it stays when a nanny restarts the worker, the address does not.
+        The worker's name. One that it was given stays when a nanny restarts the worker; the
+        address does not, nor a name that Dask made of the address.
     address, host
         Where it listens, and on which host.
     nthreads
