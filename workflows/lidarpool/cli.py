@@ -44,7 +44,13 @@ _json = click.option(
     "--json", "as_json", is_flag=True, help="Print the main figures as one JSON document."
 )
 
-_page = click.option("--page", is_flag=True, help="Serve a live page, and say where.")
+_live = click.option(
+    "--live", is_flag=True, help="Show the run in the browser; the page stays until Ctrl-C."
+)
+_no_stay = click.option("--no-stay", is_flag=True, help="With --live: end with the run.")
+_page = click.option(
+    "--page", is_flag=True, help="Add a page of partitions to Dask's dashboard, and say where."
+)
 _tls = click.option("--tls", is_flag=True, help="Encrypt the traffic of the local cluster.")
 
 
@@ -61,16 +67,27 @@ for _command in (init, check, schema, scene, completion, view):
 @cli.command()
 @_out
 @_tls
+@_live
+@_no_stay
 @_page
 @_quiet
 @_verbose
 @_json
-def demo(out: Path, tls: bool, page: bool, quiet: bool, verbose: bool, as_json: bool) -> None:
+def demo(
+    out: Path,
+    tls: bool,
+    live: bool,
+    no_stay: bool,
+    page: bool,
+    quiet: bool,
+    verbose: bool,
+    as_json: bool,
+) -> None:
     """Run the default survey and path planning on a cluster on this machine.
 
     \b
     Examples:
-      lidarpool demo
+      lidarpool demo --live
       lidarpool demo --out /tmp/demo
     """  # noqa: D301 - click wants the character, not its name
     options = RunOptions(
@@ -80,6 +97,8 @@ def demo(out: Path, tls: bool, page: bool, quiet: bool, verbose: bool, as_json: 
         quiet=quiet,
         verbose=verbose,
         as_json=as_json,
+        live=live,
+        stay=not no_stay,
         page=page,
     )
     run_scenario(Scenario(), options)
@@ -100,6 +119,8 @@ def demo(out: Path, tls: bool, page: bool, quiet: bool, verbose: bool, as_json: 
 @click.option("--no-plan", is_flag=True, help="Leave the path planning out.")
 @click.option("--resume", is_flag=True, help="Go on with an unfinished run, if there is one.")
 @click.option("--fresh", is_flag=True, help="Drop an unfinished run.")
+@_live
+@_no_stay
 @_page
 @_quiet
 @_verbose
@@ -112,6 +133,8 @@ def run(
     no_plan: bool,
     resume: bool,
     fresh: bool,
+    live: bool,
+    no_stay: bool,
     page: bool,
     quiet: bool,
     verbose: bool,
@@ -148,6 +171,8 @@ def run(
         quiet=quiet,
         verbose=verbose,
         as_json=as_json,
+        live=live,
+        stay=not no_stay,
         page=page,
     )
     run_scenario(Scenario.load(scenario), options)

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 from distributed import Client
@@ -28,6 +29,9 @@ from .summary import summary
 from .terminal import shown_progress, shown_status
 from .tls import NO_FILES, TlsFiles
 
+if TYPE_CHECKING:
+    from .live import LiveRun
+
 JOURNAL = "journal"  # the folder of the journal, in the output folder
 
 
@@ -35,7 +39,8 @@ JOURNAL = "journal"  # the folder of the journal, in the output folder
 class RunOptions:
     """How a scenario is to be run; see the options of `lidarpool run`.
 
-    `journal` says whether to keep one; without it, `resume` and `fresh` mean nothing.
+    `journal` says whether to keep one; without it, `resume` and `fresh` mean nothing. `stay` says
+    whether the page of `live` stays when all is done.
     """
 
     out: Path
@@ -50,6 +55,8 @@ class RunOptions:
     quiet: bool = False
     verbose: bool = False
     as_json: bool = False
+    live: bool = False
+    stay: bool = True
     page: bool = False
 
 
@@ -68,23 +75,38 @@ def run_scenario(scenario: Scenario, options: RunOptions) -> None:
     recipe = make_recipe(scenario, click.get_current_context(silent=True))
     _check_backend(options.backend or scenario.pool.backend, options)
     job = make_job(scenario, options.backend, options.no_plan)
-    with result_folder(options.out), logged_to(_log(options), options.verbose) as log:
-        kept = _deliveries(job, options)
-        with kept.kept_on_error():
-            result = _conduct(scenario, kept, options)
-            with shown_status("writing the cloud, the pictures and the report", options.quiet):
-                report = write_result(
-                    options.out, result, job.scene, job.survey, job.planning, recipe
-                )
-        kept.remove()
-    if options.as_json:
-        figures = summary(options.out, report, log.path if log.written else None)
-        click.echo(json.dumps(figures, indent=1, allow_nan=False))
-    else:
-        _tell(options.out, result, job, report["files"])
-        if log.written and not options.quiet:
-            name = click.format_filename(options.out / LOG)
-            click.echo(f"messages of Dask and other libraries are in {name}", err=True)
+    with _shown_live(job, options) as live:
+        with result_folder(options.out), logged_to(_log(options), options.verbose) as log:
+            kept = _deliveries(job, options)
+            with kept.kept_on_error():
+                result = _conduct(scenario, kept, options, live)
+                with shown_status("writing the cloud, the pictures and the report", options.quiet):
+                    report = write_result(
+                        options.out, result, job.scene, job.survey, job.planning, recipe
+                    )
+            kept.remove()
+        if options.as_json:
+            figures = summary(options.out, report, log.path if log.written else None)
+            click.echo(json.dumps(figures, indent=1, allow_nan=False))
+        else:
+            _tell(options.out, result, job, report["files"])
+            if log.written and not options.quiet:
+                name = click.format_filename(options.out / LOG)
+                click.echo(f"messages of Dask and other libraries are in {name}", err=True)
+        if live is not None and options.stay:
+            live.stay()
+
+
+@contextmanager
+def _shown_live(job: Job, options: RunOptions) -> Iterator[LiveRun | None]:
+    """Page that shows the run, if one is wanted."""
+    if not options.live:
+        yield None
+        return
+    from .live import live_run
+
+    with live_run(job) as live:
+        yield live
 
 
 def make_job(scenario: Scenario, backend: str | None = None, no_plan: bool = False) -> Job:
@@ -132,10 +154,21 @@ def _deliveries(job: Job, options: RunOptions) -> Deliveries:
     return journal
 
 
-def _conduct(scenario: Scenario, kept: Deliveries, options: RunOptions) -> Result:
+def _conduct(
+    scenario: Scenario, kept: Deliveries, options: RunOptions, live: LiveRun | None
+) -> Result:
     """Have everything delivered that is not there yet."""
-    if kept.complete:
-        return make_result(kept)
+    if live is not None:
+        live.follow(kept)
+    result = make_result(kept) if kept.complete else _drive(scenario, kept, options, live)
+    if live is not None:
+        live.finish()
+    return result
+
+
+def _drive(
+    scenario: Scenario, kept: Deliveries, options: RunOptions, live: LiveRun | None
+) -> Result:
     if kept.backend:
         _check_backend(kept.backend, options, kept.advice)
     if options.scheduler is None:
@@ -147,7 +180,10 @@ def _conduct(scenario: Scenario, kept: Deliveries, options: RunOptions) -> Resul
         shown_progress(options.quiet) as show,
         shown_on_page(client, options.page, show) as show_both,
     ):
-        return Run(client, kept).drive(None, show_both)
+        run = Run(client, kept)
+        if live is None:
+            return run.drive(None, show_both)
+        return run.drive(live.on_frame, live.with_progress(show_both, run.partitions))
 
 
 @contextmanager

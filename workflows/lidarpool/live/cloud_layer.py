@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .colouring import colours_of
-from .display import DISPLAY
 from .page import LivePage
 
 # Size of a point as a share of the scene's diagonal: that they can be seen where there are few,
@@ -44,16 +43,7 @@ class CloudLayer:
     ) -> None:
         self._page, self._names, self._size_m = page, names, size_m
         self._share = MOST_SHARE
-        empty = np.empty(0, DISPLAY)
-        self._node = page.scene.add_point_cloud(
-            "/cloud",
-            empty["position"],
-            np.empty((0, 3), np.uint8),
-            point_size=MOST_SHARE * size_m,
-            point_shape="circle",
-            point_shading="flat",
-            precision="float32",
-        )
+        self._node: Any = None  # viser shows no cloud without points
         with page.gui.add_folder("cloud"):
             self._shown = page.gui.add_checkbox("show", initial_value=True)
             self._colour = page.gui.add_dropdown("colour", tuple(quantities))
@@ -63,21 +53,48 @@ class CloudLayer:
 
         @self._shown.on_update
         def _show(_: Any) -> None:
-            self._node.visible = self._shown.value
+            if self._node is not None:
+                self._node.visible = self._shown.value
 
         @self._size.on_update
         def _resize(_: Any) -> None:
-            self._resize_points()
+            if self._node is not None:
+                self._node.point_size = self._point_size
+
+    @property
+    def quantity(self) -> str:
+        """Quantity that the colours are to be taken from."""
+        return self._colour.value
 
     def draw(self, rows: NDArray[np.void]) -> None:
         """Show these points (DISPLAY) instead of those before."""
         colours, legend = colours_of(rows, self._colour.value, self._names)
+        self._legend.content = legend.html
+        if not len(rows):
+            if self._node is not None:
+                self._node.visible = False
+            return
+        self._share = min(MOST_SHARE, SHARE_OF_MANY / len(rows) ** 0.5)
+        positions = np.ascontiguousarray(rows["position"])
+        if self._node is None:
+            self._node = self._page.scene.add_point_cloud(
+                "/cloud",
+                positions,
+                colours,
+                point_size=self._point_size,
+                point_shape="circle",
+                point_shading="flat",
+                precision="float32",
+                visible=self._shown.value,
+            )
+            return
         with self._page.atomic():  # else there would be points without colours for a moment
-            self._node.points = np.ascontiguousarray(rows["position"])
+            self._node.points = positions
             self._node.colors = colours
-            self._legend.content = legend.html
-            self._share = min(MOST_SHARE, SHARE_OF_MANY / max(1, len(rows)) ** 0.5)
-            self._resize_points()
+            self._node.point_size = self._point_size
+            self._node.visible = self._shown.value
 
-    def _resize_points(self) -> None:
-        self._node.point_size = self._share * self._size_m * self._size.value
+    @property
+    def _point_size(self) -> float:
+        """Metres."""
+        return self._share * self._size_m * self._size.value

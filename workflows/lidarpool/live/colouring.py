@@ -32,21 +32,26 @@ class ColourBar:
         What the colours mean, with its unit.
     low, high
         What the two ends stand for.
+    logarithmic
+        Whether the middle stands for their geometric mean.
     """
 
     title: str
     low: float
     high: float
+    logarithmic: bool = False
 
     @property
     def html(self) -> str:
         """The bar with its title above and its numbers below."""
         stops = ", ".join("#{:02x}{:02x}{:02x}".format(*TURBO[i]) for i in range(0, 256, 15))
-        middle = (self.low + self.high) / 2
-        numbers = "".join(
-            f"<span>{_number(value, self.high - self.low)}</span>"
-            for value in (self.low, middle, self.high)
-        )
+        if self.logarithmic:
+            values = (self.low, (self.low * self.high) ** 0.5, self.high)
+            texts = [f"{value:.2g}" if value < 10 else f"{value:,.0f}" for value in values]
+        else:
+            values = (self.low, (self.low + self.high) / 2, self.high)
+            texts = [_number(value, self.high - self.low) for value in values]
+        numbers = "".join(f"<span>{text}</span>" for text in texts)
         return (
             f'<div style="font-size:0.75em;padding:0.25em 0.8em">{escape(self.title)}'
             f'<div style="height:0.9em;border-radius:2px;margin:0.2em 0;'

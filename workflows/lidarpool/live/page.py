@@ -19,6 +19,7 @@ PORT = 8080  # or the next that is free
 
 _FOV = math.radians(45)
 _FROM = np.array([0.55, -1.0, 0.62])  # direction from the scene's middle to the camera
+_ASIDE = 0.13  # that the scene is left of the panel, as a share of its diagonal
 _GRID = (128, 134, 142)  # lines that are seen on a light page and on a dark one
 
 
@@ -45,10 +46,13 @@ class LivePage(viser.ViserServer):
         low, high = np.asarray(bounds, np.float64)
         size = float(np.linalg.norm(high - low)) or 1.0
         middle = (low + high) / 2
+        away = _FROM / np.linalg.norm(_FROM)
+        right = np.cross([0.0, 0.0, 1.0], away)
+        middle += _ASIDE * size * right / np.linalg.norm(right)
         camera = self.initial_camera
         camera.fov = _FOV
         camera.look_at = middle
-        camera.position = middle + _FROM / np.linalg.norm(_FROM) * 0.5 * size / math.tan(_FOV / 2)
+        camera.position = middle + away * 0.5 * size / math.tan(_FOV / 2)
         camera.up = np.array([0.0, 0.0, 1.0])
         camera.near, camera.far = size / 500, size * 50
         self._add_grid(low, high, size)

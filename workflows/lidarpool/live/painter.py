@@ -17,12 +17,12 @@ class Painter:
     Parameters
     ----------
     draw
-        What to call.
+        What to call; if it returns True, it is called again after its rest.
     every_s
         Seconds from one call to the next, at least.
     """
 
-    def __init__(self, draw: Callable[[], None], every_s: float) -> None:
+    def __init__(self, draw: Callable[[], object], every_s: float) -> None:
         self._draw, self._every_s = draw, every_s
         self._asked = threading.Event()
         self._ended = threading.Event()
@@ -52,7 +52,8 @@ class Painter:
             last = self._ended.is_set()
             self._asked.clear()
             started = time.monotonic()
-            self._draw()
+            if self._draw() is True:
+                self._asked.set()
             if last:
                 return
             took = time.monotonic() - started

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,6 +35,8 @@ class CloudBuilder:
         self._counts = np.zeros(scan_count, np.int64)  # points of each scan
         self._lowest = np.full(3, np.iinfo(np.int32).max, np.int64)  # cells, see POINT
         self._highest = -self._lowest
+        # Called with the points (POINT) of scans that were new, once they are kept.
+        self.on_points: Callable[[NDArray[np.void]], None] | None = None
 
     def add(self, part: Part) -> list[int]:
         """Enter a part; returns the scans that were new.
@@ -57,6 +61,8 @@ class CloudBuilder:
             self._enter(new, counts, self._store.append(new, counts, points), points)
         for scan in part.scans:
             self.ledger.accept(scan)
+        if new and self.on_points:
+            self.on_points(points)
         return new
 
     def restore(
@@ -84,6 +90,10 @@ class CloudBuilder:
         """
         cells = np.stack([self._lowest, self._highest]) if self.point_count else None
         return StoredCloud(self._store, self._offsets, self._counts, cells, precision_m, origin)
+
+    def stored_points(self) -> Iterator[NDArray[np.void]]:
+        """Read the points (POINT) so far in (scan, ray) order, a part at a time."""
+        yield from self.merge(1.0, np.zeros(3)).stored_points()
 
     def _enter(
         self,

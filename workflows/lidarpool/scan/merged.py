@@ -62,14 +62,24 @@ class StoredCloud:
         OSError
             If the store cannot be read.
         """
-        for first in range(0, len(self), points):
-            rows = self._read(first, min(first + points, len(self)))
+        for rows in self.stored_points(points):
             yield Cloud(
                 self._positions(rows["cell"]),
                 rows["scan"].astype(np.int32),
                 rows["ring"].copy(),
                 rows["object"].copy(),
             )
+
+    def stored_points(self, points: int = CHUNK_POINTS) -> Iterator[NDArray[np.void]]:
+        """Read the points (POINT) as they are stored, in order, so many at a time.
+
+        Raises
+        ------
+        OSError
+            If the store cannot be read.
+        """
+        for first in range(0, len(self), points):
+            yield self._read(first, min(first + points, len(self)))
 
     def load(self) -> Cloud:
         """Read the whole cloud into memory: 34 bytes a point."""

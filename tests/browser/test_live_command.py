@@ -1,0 +1,36 @@
+"""`lidarpool run --live` as a script calls it: nobody looks, and nobody is waited for."""
+
+import re
+import subprocess
+import sys
+
+import pytest
+
+pytestmark = pytest.mark.slow
+
+SCENARIO = "sensor: {rays_per_revolution: 100, layers: 8}\n"
+
+
+def test_a_run_with_a_page_ends_by_itself_where_it_is_not_to_stay(tmp_path):
+    (tmp_path / "small.yaml").write_text(SCENARIO)
+    ended = subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "lidarpool",
+            "run",
+            "small.yaml",
+            "--no-plan",
+            "--live",
+            "--no-stay",
+        ],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=180,
+    )
+    assert ended.returncode == 0, ended.stderr
+    assert re.search(r"live view: http://127\.0\.0\.1:\d+\n", ended.stderr)
+    assert "stays" not in ended.stderr
+    assert "viser" not in ended.stdout + ended.stderr
+    assert (tmp_path / "lidarpool-out" / "cloud.ply").exists()

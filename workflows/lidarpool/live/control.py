@@ -1,0 +1,55 @@
+"""Pause and stop, from the page to the run."""
+
+from __future__ import annotations
+
+import threading
+
+
+class RunControl:
+    """What somebody at the page wants of the run; the run asks for it in its own thread."""
+
+    def __init__(self) -> None:
+        self._may_run = threading.Event()
+        self._may_run.set()
+        self._stop = threading.Event()
+
+    @property
+    def paused(self) -> bool:
+        """Whether the run is to stand still."""
+        return not self._may_run.is_set() and not self._stop.is_set()
+
+    @property
+    def stopped(self) -> bool:
+        """Whether the run is to end."""
+        return self._stop.is_set()
+
+    def pause(self) -> None:
+        """Have the run stand still; nothing is lost."""
+        self._may_run.clear()
+
+    def go_on(self) -> None:
+        """Have it go on."""
+        self._may_run.set()
+
+    def stop(self) -> None:
+        """Have it end as by Ctrl-C, also when it stands still."""
+        self._stop.set()
+        self._may_run.set()
+
+    def obey(self) -> None:
+        """Wait as long as the run is paused.
+
+        Raises
+        ------
+        KeyboardInterrupt
+            If it is to stop.
+        """
+        while not self._may_run.wait(0.1):  # a wait without limit would keep Ctrl-C out
+            pass
+        if self._stop.is_set():
+            raise KeyboardInterrupt
+
+    def wait_for_stop(self) -> None:
+        """Wait until somebody presses stop, or Ctrl-C."""
+        while not self._stop.wait(0.2):
+            pass
