@@ -9,6 +9,7 @@ import subprocess
 import time
 import urllib.request
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,8 @@ OPTIONS = (
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-dev-shm-usage",
+    "--disable-backgrounding-occluded-windows",
+    "--disable-renderer-backgrounding",
     "--window-size=1280,800",
     "--remote-debugging-port=0",
 )
@@ -35,11 +38,19 @@ OPTIONS = (
 _ATTACH = {"autoAttach": True, "waitForDebuggerOnStart": True, "flatten": True}
 
 
+@dataclass(frozen=True)
+class Browser:
+    """Where a browser listens: its host, and the address for what is of no page."""
+
+    host: str
+    browser: str
+
+
 class Tab:
     """One page of a browser: what it asked for, what it complained of, what it shows."""
 
     def __init__(self, url: str):
-        self._socket = connect(url, max_size=None, compression=None)
+        self._socket = connect(url, max_size=None, compression=None, ping_interval=None)
         self._numbers = itertools.count(1)
         self.requests: list[str] = []  # addresses
         self.errors: list[str] = []  # of the console, and exceptions
@@ -132,7 +143,7 @@ class Tab:
 
 @pytest.fixture(scope="session")
 def chromium(tmp_path_factory):
-    """Return the port at which a browser listens."""
+    """Return where a browser listens."""
     program = next(filter(None, map(shutil.which, NAMES)), None)
     if program is None:
         pytest.skip(f"needs a browser: none of {', '.join(NAMES)} is installed")
@@ -150,7 +161,8 @@ def chromium(tmp_path_factory):
             assert process.poll() is None, f"{program} ended with {process.returncode}"
             assert time.monotonic() < deadline, f"{program} does not answer"
             time.sleep(0.05)
-        yield int(told.read_text().split()[0])
+        port, path = told.read_text().split()
+        yield Browser(f"127.0.0.1:{port}", f"ws://127.0.0.1:{port}{path}")
     finally:
         process.send_signal(signal.SIGTERM)
         try:
@@ -166,17 +178,17 @@ def new_tab(chromium):
     tabs = []
 
     def open_tab(url: str) -> Tab:
-        request = urllib.request.Request(
-            f"http://127.0.0.1:{chromium}/json/new?about:blank", method="PUT"
-        )
-        with urllib.request.urlopen(request, timeout=30) as answer:
-            told = json.load(answer)
-        tab = Tab(told["webSocketDebuggerUrl"])
-        tabs.append((tab, told["id"]))
+        # A window each: a tab behind another is not drawn.
+        with connect(chromium.browser) as browser:
+            params = {"url": "about:blank", "newWindow": True}
+            browser.send(json.dumps({"id": 1, "method": "Target.createTarget", "params": params}))
+            name = json.loads(browser.recv(timeout=60))["result"]["targetId"]
+        tab = Tab(f"ws://{chromium.host}/devtools/page/{name}")
+        tabs.append((tab, name))
         tab.open(url)
         return tab
 
     yield open_tab
     for tab, name in tabs:
         tab.close()
-        urllib.request.urlopen(f"http://127.0.0.1:{chromium}/json/close/{name}", timeout=30).close()
+        urllib.request.urlopen(f"http://{chromium.host}/json/close/{name}", timeout=30).close()

@@ -1,0 +1,150 @@
+"""A run, watched, paused and stopped in a browser while it goes on."""
+
+import re
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from lidarpool import Planning, Scene, Survey
+from lidarpool.connection import local_client
+from lidarpool.deliveries import Deliveries
+from lidarpool.job import Job
+from lidarpool.live import live_run
+from lidarpool.run import Run
+
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
+
+SCANS = 1080
+
+
+@pytest.fixture(scope="module")
+def client():
+    """Return the client of a small cluster."""
+    with local_client(gpu_workers=1, collectors=2, other_workers=1) as client:
+        yield client
+
+
+@pytest.fixture
+def live():
+    """Return a page, and deliveries that it follows, of a survey that takes its time."""
+    survey = Survey(poses=[(0, 0, 1 + step / 20) for step in range(SCANS // 36)])
+    job = Job(Scene.seed(), survey, scans_per_second=60)
+    kept = Deliveries(job)
+    with live_run(job, port=0, browser=False) as live:
+        live.follow(kept)
+        yield live, kept
+
+
+class Driven:
+    """A run in a thread of its own, and how it ended."""
+
+    def __init__(self, client, live, kept):
+        self.error = None
+        run = Run(client, kept)
+        show = live.with_progress(lambda progress: None, run.partitions)
+
+        def drive():
+            try:
+                run.drive(live.on_frame, show)
+                live.finish()
+            except BaseException as error:
+                self.error = error
+
+        self.thread = threading.Thread(target=drive)
+        self.thread.start()
+
+
+def opened(new_tab, live):
+    """Open the page of a run that has not begun."""
+    tab = new_tab(live._page.url)
+    tab.wait_for(lambda text: "starting" in text)
+    return tab
+
+
+def points_in(text):
+    """Number of points that the panel tells of."""
+    found = re.search(r"([\d,]+) points", text)
+    return int(found[1].replace(",", "")) if found else 0
+
+
+def test_points_grow_stand_still_and_grow_again(client, live, new_tab, tmp_path):
+    live, kept = live
+    tab, other = opened(new_tab, live), opened(new_tab, live)
+    run = Driven(client, live, kept)
+    try:
+        first = tab.wait_for(points_in)
+        tab.wait_for(lambda text: points_in(text) > first)
+        tab.click("Pause")
+        tab.wait_for(lambda text: "paused" in text and "Go on" in text)
+        other.wait_for(lambda text: "paused" in text)
+        still = kept.cloud.point_count
+        assert not kept.complete
+        time.sleep(2)
+        assert kept.cloud.point_count == still
+        other.click("Go on")
+        tab.wait_for(lambda text: "running" in text)
+        tab.wait_for(lambda text: points_in(text) > still)
+    finally:
+        if live.control.paused:
+            live.control.go_on()
+        run.thread.join(120)
+    assert run.error is None
+    assert kept.complete  # nothing was lost by the pause
+    total = f"{kept.cloud.point_count:,} points"
+    tab.wait_for(lambda text: "done" in text and total in text)
+    other.wait_for(lambda text: "done" in text and total in text)
+    tab.wait_for(lambda _: len(colours(tab.picture(tmp_path / "live.png"))) > 200)
+    assert tab.errors == []
+    own = (live._page.url, live._page.url.replace("http", "ws", 1), "data:", "blob:")
+    assert [request for request in tab.requests if not request.startswith(own)] == []
+
+
+def test_stop_ends_the_run_as_an_interrupt_does(client, live, new_tab):
+    live, kept = live
+    tab = opened(new_tab, live)
+    run = Driven(client, live, kept)
+    try:
+        tab.wait_for(points_in)
+        tab.click("Stop")
+    finally:
+        run.thread.join(60)
+        live.control.stop()
+    assert isinstance(run.error, KeyboardInterrupt)
+    assert not kept.complete
+
+
+def test_a_closed_tab_is_not_waited_for(client, live, new_tab):
+    live, kept = live
+    tab = opened(new_tab, live)
+    run = Driven(client, live, kept)
+    tab.wait_for(points_in)
+    tab.open("about:blank")
+    run.thread.join(120)
+    assert run.error is None
+    assert kept.complete
+    frames = live._scene.frames
+    frames.take()
+    assert frames.dropped > frames.taken
+    assert frames.dropped + frames.taken == SCANS
+
+
+def test_the_path_is_shown_when_it_is_planned(client, new_tab):
+    planning = Planning((25, 25), (-30, -20), [(0, 0)], 2.0, trials=2, iterations=20)
+    job = Job(Scene.seed(), Survey(poses=[(0, 0, 1)]), planning)
+    kept = Deliveries(job)
+    with live_run(job, port=0, browser=False) as live:
+        live.follow(kept)
+        tab = opened(new_tab, live)
+        run = Driven(client, live, kept)
+        run.thread.join(120)
+        tab.wait_for(lambda text: "done" in text and "2 / 2" in text)
+        for name in ("/path", "/path/start", "/path/target", "/discs/0"):
+            assert live._page.scene.get_handle_by_name(name) is not None
+        assert tab.errors == []
+
+
+def colours(picture):
+    """Colours left of the panel."""
+    return np.unique(picture[200:, :900].reshape(-1, 3), axis=0)
