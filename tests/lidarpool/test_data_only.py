@@ -18,7 +18,7 @@ from lidarpool import LidarpoolError, Scene, Sensor, Survey, read_cloud
 from lidarpool.job import Job
 from lidarpool.journal import open_journal
 from lidarpool.records import RecordFile
-from lidarpool.scan.messages import POINT
+from lidarpool.scan.messages import POINT, Part
 from lidarpool.scenario import Scenario
 
 ROOTS = [
@@ -96,7 +96,7 @@ def journal(tmp_path, job) -> Path:
     path = tmp_path / "journal"
     journal = open_journal(path, job, resume=True)
     journal.backend = "numpy"
-    journal.append([0], [1], np.zeros(1, POINT))
+    journal.cloud.add(Part((0,), (1,), np.zeros(1, POINT)))
     journal.close()
     return path
 

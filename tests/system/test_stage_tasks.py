@@ -46,14 +46,21 @@ def cluster():
 
 
 @pytest.fixture(scope="module")
-def client(cluster):
+def connected(cluster):
     with Client(cluster) as client:
         yield client
 
 
+@pytest.fixture
+def client(cluster, connected):
+    """Client of the cluster once all workers are there that an earlier test has killed."""
+    connected.wait_for_workers(len(cluster.worker_spec), timeout=60)
+    return connected
+
+
 @pytest.fixture(scope="module")
-def undisturbed(client):
-    return simulate(Scene.seed(), SURVEY, client=client).cloud
+def undisturbed(connected):
+    return simulate(Scene.seed(), SURVEY, client=connected).cloud
 
 
 def worker_of(client: Client, stage: str) -> str:
