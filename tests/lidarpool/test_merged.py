@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarpool import LidarpoolError, ply
-from lidarpool.cloud import Cloud, counts_by_object, even_choice
+from lidarpool.cloud import Cloud, counts_by_object
 from lidarpool.ply import read_cloud, save_cloud
 from lidarpool.scan.builder import CloudBuilder
 from lidarpool.scan.messages import POINT, Part
@@ -87,17 +87,6 @@ def test_scans_that_came_together_are_read_together():
     )  # fmt: skip
     assert len(builder.merge(0.01, np.zeros(3)).load()) == 1000
     assert reads == [1000 * POINT.itemsize]
-
-
-def test_an_even_choice_is_the_same_from_memory_and_from_disk():
-    cloud = build([7, 0, 30, 13], [[2], [0, 1, 3]]).merge(0.01, np.zeros(3))
-    whole = cloud.load()
-    for most in (1, 2, 7, 49, 50, 51, 1000):
-        chosen = even_choice(cloud, most)
-        assert len(chosen) == min(most, 50)
-        assert (chosen == even_choice(whole, most)).all()
-    assert (even_choice(cloud, 50) == whole.positions).all()
-    assert even_choice(cloud, 3).tolist() == whole.positions[[0, 24, 49]].tolist()
 
 
 @pytest.mark.parametrize("origin", [0.0, 5_000_000.0])

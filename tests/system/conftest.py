@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from distributed import Client
 
-import lidarpool.output
+import lidarpool.pictures
 from lidarpool import Cloud
 from lidarpool.cli import main
 from poolpart import local_cluster
@@ -173,9 +173,9 @@ def run_lidarpool(
 @pytest.fixture
 def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave the drawing out, which takes longer than a small survey."""
-    monkeypatch.setattr(lidarpool.output, "take_shot", lambda *_: None)
+    monkeypatch.setattr(lidarpool.pictures, "take_shot", lambda *_, **__: None)
     for name in ("draw_scene", "draw_intensity", "draw_cloud", "draw_path"):
-        monkeypatch.setattr(lidarpool.output, name, lambda path, *_, **__: path.write_bytes(b"x"))
+        monkeypatch.setattr(lidarpool.pictures, name, lambda path, *_, **__: path.write_bytes(b"x"))
 
 
 # -- the command as a process of its own ---------------------------------------------------------

@@ -62,7 +62,7 @@ def demo(tmp_path_factory) -> tuple[Path, subprocess.CompletedProcess[str]]:
     return out, ended
 
 
-def test_the_demo_makes_seven_files_and_says_so(demo):
+def test_the_demo_makes_all_files_and_says_so(demo):
     out, ended = demo
     assert ended.returncode == 0, ended.stderr
     assert sorted(path.name for path in out.iterdir()) == sorted(FILES)
@@ -428,3 +428,21 @@ def test_shelves_of_the_warehouse_stand_upright(lidarpool, cluster, tmp_path, no
             shelves += 1
             assert np.ptp(points[:, 2]) > 1.5  # metres of height, seen from the middle of the hall
     assert shelves >= 3
+
+
+# -- drawn again ---------------------------------------------------------------------------------
+
+
+def test_the_pictures_of_a_run_are_drawn_again_to_the_bit(demo, lidarpool, tmp_path):
+    out, _ = demo
+    again = lidarpool("plot", out, "--out", tmp_path)
+    assert (again.code, again.err) == (0, "")
+    for name in ("scene.png", "intensity.png", "cloud.png", "path.png"):
+        assert (tmp_path / name).read_bytes() == (out / name).read_bytes()
+
+
+def test_pictures_drawn_again_go_with_their_result(made, tmp_path, no_pictures):
+    for name in ("scene-dark.png", "path.pdf", "cloud-dark.pdf", "mine-dark.png"):
+        (tmp_path / name).write_text("an earlier one")
+    write_result(tmp_path, *made)
+    assert {path.name for path in tmp_path.iterdir()} == {*FILES, "mine-dark.png"}

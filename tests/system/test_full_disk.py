@@ -137,10 +137,11 @@ def test_the_disk_of_the_result_is_full(
 
 LIMIT = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({0}, {0}))\n"
 NO_PICTURES = """
-import lidarpool.output as output
-output.take_shot = lambda *_: None
+import lidarpool.pictures as pictures
+pictures.take_shot = lambda *_, **__: None
 def draw(path, *_, **__): path.write_bytes(b"x")
-output.draw_scene = output.draw_intensity = output.draw_cloud = output.draw_path = draw
+pictures.draw_scene = pictures.draw_intensity = draw
+pictures.draw_cloud = pictures.draw_path = draw
 """
 
 

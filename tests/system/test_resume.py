@@ -37,10 +37,11 @@ SMALL = "sensor: {layers: 4}\nplanning: {trials: 2}\n"
 
 # Drawing takes longer than the survey, and is not what is asked after.
 NO_PICTURES = """
-import lidarpool.output as output
-output.take_shot = lambda *_: None
+import lidarpool.pictures as pictures
+pictures.take_shot = lambda *_, **__: None
 def draw(path, *_, **__): path.write_bytes(b"x")
-output.draw_scene = output.draw_intensity = output.draw_cloud = output.draw_path = draw
+pictures.draw_scene = pictures.draw_intensity = draw
+pictures.draw_cloud = pictures.draw_path = draw
 """
 
 

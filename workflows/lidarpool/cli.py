@@ -20,6 +20,7 @@ from .connection import connected
 from .errors import LidarpoolError
 from .interrupts import INTERRUPTED, STOPPED, UNTOUCHED, interrupt_on_signals
 from .log_file import LOG
+from .plot_command import plot
 from .quiet import silence_logs
 from .report import versions
 from .run_command import RunOptions, run_scenario
@@ -60,7 +61,7 @@ def cli() -> None:
     """Simulate lidar surveys on a partitioned Dask cluster."""
 
 
-for _command in (init, check, schema, scene, completion, view):
+for _command in (init, check, schema, scene, completion, view, plot):
     cli.add_command(_command)
 
 

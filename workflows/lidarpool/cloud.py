@@ -99,18 +99,6 @@ def counts_by_object(cloud: CloudLike, objects: int) -> NDArray[np.int64]:
     return counts
 
 
-def even_choice(cloud: CloudLike, most: int) -> NDArray[np.float64]:
-    """Positions (k, 3) of at most so many points, evenly chosen; of all, where there are fewer."""
-    chosen = np.linspace(0, len(cloud) - 1, min(len(cloud), most)).astype(np.int64)
-    positions = np.empty((len(chosen), 3))
-    first = 0
-    for chunk in cloud.chunks():
-        low, high = np.searchsorted(chosen, [first, first + len(chunk)])
-        positions[low:high] = chunk.positions[chosen[low:high] - first]
-        first += len(chunk)
-    return positions
-
-
 def _whole(name: str, values: ArrayLike, kind: type[np.integer[Any]]) -> NDArray[Any]:
     """`values` as integers of type `kind`, where a plain cast would wrap around."""
     given = np.asarray(values)

@@ -9,6 +9,7 @@ import numpy as np
 from .cloud import CHUNK_POINTS
 from .job import Job
 from .output import ROOM_BYTES
+from .picture_file import TRIANGLE_BYTES as PICTURED_BYTES
 from .ply import real_type
 from .ply_format import row_type
 from .records import HEAD_BYTES
@@ -48,7 +49,7 @@ class Needs:
     driver: int
     journal: int
     cloud: int
-    pictures: int = ROOM_BYTES
+    pictures: int
 
     @property
     def disk(self) -> int:
@@ -83,4 +84,5 @@ def needs_of(job: Job, points: int) -> Needs:
         + 4 * POINT.itemsize * min(points, CHUNK_POINTS),
         journal=records + totals,
         cloud=row * (points + min(points, CHUNK_POINTS)),
+        pictures=ROOM_BYTES + PICTURED_BYTES * faces,
     )

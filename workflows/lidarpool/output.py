@@ -14,27 +14,29 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from .cloud import even_choice
 from .errors import LidarpoolError
 from .interrupts import deferred_interrupts
+from .picture_file import PICTURE_FILE, PICTURES, Pictured
+from .pictures import picture_makers
 from .plan import Planning
-from .ply import save_cloud
+from .ply import read_positions, save_cloud
 from .report import make_report
 from .report_page import Recipe, write_page
 from .result import Result
 from .scene import Scene
 from .survey import Survey
-from .view import MOST_POINTS, draw_cloud, draw_intensity, draw_path, draw_scene, take_shot
+from .view import MOST_POINTS
 
 if sys.platform != "win32":
     import fcntl
 
 ROOM_BYTES = 32 << 20  # what pictures and report may take; the cloud is checked when it is known
 
-PAGE, REPORT = "report.html", "report.json"
-FILES = ("cloud.ply", "scene.png", "intensity.png", "cloud.png", "path.png", PAGE, REPORT)
+CLOUD, PAGE, REPORT = "cloud.ply", "report.html", "report.json"
+_IMAGES = tuple(f"{name}.png" for name in PICTURES)
+FILES = (CLOUD, *_IMAGES, PICTURE_FILE, PAGE, REPORT)
+# What `lidarpool plot` leaves there, of a result that is replaced.
+_DRAWN_AGAIN = ("{}-dark.png", "{}.pdf", "{}-dark.pdf")
 
 # Folders within the output folder: a result being made, and one that is whole and on its way
 # into place. A run that was killed leaves one behind; the next run removes or finishes it.
@@ -89,12 +91,12 @@ def write_result(
     LidarpoolError
         If a file cannot be written.
     """
-    makers = _makers(result, scene, survey, planning)
+    staged = folder / f"{_WRITING}{secrets.token_hex(4)}"
+    makers = _makers(staged, result, scene, survey, planning)
     report = make_report(result, scene, survey, planning, [*makers, PAGE, REPORT])
     text = json.dumps(report, indent=1, allow_nan=False) + "\n"
     makers[PAGE] = lambda path: write_page(path, report, result, scene, survey, planning, recipe)
     makers[REPORT] = lambda path: path.write_text(text, encoding="utf-8")
-    staged = folder / f"{_WRITING}{secrets.token_hex(4)}"
     try:
         try:
             staged.mkdir()
@@ -117,26 +119,17 @@ def write_result(
 
 
 def _makers(
-    result: Result, scene: Scene, survey: Survey, planning: Planning | None
+    folder: Path, result: Result, scene: Scene, survey: Survey, planning: Planning | None
 ) -> dict[str, Callable[[Path], object]]:
-    """Functions that write each file but the report."""
-    poses = np.array([pose.position for pose in survey.poses]) + scene.origin
-    shot = take_shot(scene, poses)
-    cloud = result.points
-    makers: dict[str, Callable[[Path], object]] = {
-        "cloud.ply": lambda path: save_cloud(path, cloud, precision_m=survey.precision_m),
-        "scene.png": lambda path: draw_scene(path, scene, poses, shot=shot),
-        "intensity.png": lambda path: draw_intensity(
-            path, scene, result.hit_counts, poses, result.sample_rays + scene.origin, shot=shot
-        ),
-        "cloud.png": lambda path: draw_cloud(
-            path, even_choice(cloud, MOST_POINTS), poses, count=len(cloud), scene=scene, shot=shot
-        ),
+    """Functions that write each file but the report, in this order, into a folder."""
+    shown = Pictured.of(result, scene, survey, planning)
+    # Drawn from the file, as `lidarpool plot` does, so that both draw the same.
+    pictures = picture_makers(shown, lambda: read_positions(folder / CLOUD, MOST_POINTS))
+    return {
+        CLOUD: lambda path: save_cloud(path, result.points, precision_m=survey.precision_m),
+        **{f"{name}.png": draw for name, draw in pictures.items()},
+        PICTURE_FILE: shown.save,
     }
-    if planning is not None and result.plan is not None:
-        plan = result.plan
-        makers["path.png"] = lambda path: draw_path(path, planning, plan, result.trials)
-    return makers
 
 
 def _publish(whole: Path, folder: Path) -> None:
@@ -150,6 +143,9 @@ def _publish(whole: Path, folder: Path) -> None:
             (folder / name).unlink(missing_ok=True)
         elif (whole / name).exists():
             (whole / name).replace(folder / name)
+    for name in PICTURES:
+        for drawn in _DRAWN_AGAIN:  # they would pass for this one's, too
+            (folder / drawn.format(name)).unlink(missing_ok=True)
     whole.rmdir()
     _flush(folder)
 

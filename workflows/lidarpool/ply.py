@@ -122,6 +122,37 @@ def read_cloud(path: str | Path) -> Cloud:
     return Cloud(positions, rows["scan"], rows["ring"], rows["object"])
 
 
+def read_positions(path: str | Path, most: int) -> tuple[NDArray[np.float64], int]:
+    """Read positions of at most so many points, evenly chosen, and how many there are.
+
+    The others stay on disk.
+
+    Returns
+    -------
+    positions
+        (k, 3) metres, world coordinates.
+    count
+        Points of the whole cloud.
+
+    Raises
+    ------
+    LidarpoolError
+        As `read_cloud`.
+    """
+    path = Path(path)
+    try:
+        start, count, dtype = layout(path)
+        if not count:  # nothing cannot be mapped
+            return np.empty((0, 3)), 0
+        rows = np.memmap(path, dtype, "r", start, (count,))
+    except OSError as error:
+        raise LidarpoolError(f"{path} cannot be read: {error.strerror or error}.") from error
+    except ValueError as error:
+        raise LidarpoolError(f"{path} is not a point cloud of lidarpool: {error}.") from error
+    chosen = rows[np.linspace(0, count - 1, min(count, most)).astype(np.int64)]
+    return np.stack([chosen[axis] for axis in "xyz"], axis=1, dtype=np.float64), count
+
+
 def real_type(bounds: NDArray[np.floating], precision_m: float) -> np.dtype[np.floating]:
     """Least precise type that is precise enough for positions between these bounds."""
     if bounds.dtype == np.float32:

@@ -4,10 +4,11 @@ from .cloud_picture import MOST_POINTS, draw_cloud
 from .intensity_picture import draw_intensity
 from .path_picture import draw_path
 from .scene_picture import draw_scene
-from .shot import Shot, take_shot
+from .shot import SIZE, Shot, take_shot
 
 __all__ = [
     "MOST_POINTS",
+    "SIZE",
     "Shot",
     "draw_cloud",
     "draw_intensity",

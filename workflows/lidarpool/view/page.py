@@ -1,4 +1,4 @@
-"""The finished picture: a rendered image with axes, legend, colour bar and title, as PNG."""
+"""The finished picture: a rendered image with axes, legend, colour bar and title."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import os
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import IO
 
+import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -172,7 +174,7 @@ class Page:
         )  # fmt: skip
         axes.tick_params(which="minor", length=1.5 * self.unit)
         if isinstance(norm, LogNorm):
-            axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+            axes.yaxis.set_major_formatter(lambda value, _: f"{value:,.12g}")
             axes.yaxis.set_minor_formatter(lambda value, _: "")
 
     def note(self, axes: Axes, text: str) -> None:
@@ -184,7 +186,9 @@ class Page:
         )  # fmt: skip
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write the page as PNG under a temporary name in the same folder, then rename it.
+        """Write the page under a temporary name in the same folder, then rename it.
+
+        It is a PDF where the name says so, and else a PNG.
 
         Raises
         ------
@@ -195,15 +199,14 @@ class Page:
         target = Path(path)
         try:
             handle, name = tempfile.mkstemp(
-                prefix=f".{target.stem}-", suffix=".png", dir=target.parent
+                prefix=f".{target.stem}-", suffix=target.suffix, dir=target.parent
             )
         except OSError as error:
             raise cannot_write(target, error) from error
         temporary = Path(name)
         try:
             with os.fdopen(handle, "wb") as file:
-                # No version of matplotlib in the file: the same picture is the same bytes.
-                self.figure.savefig(file, format="png", dpi=DPI, metadata={"Software": None})
+                self._write(file, "pdf" if target.suffix.lower() == ".pdf" else "png")
             temporary.chmod(0o644)
             temporary.replace(target)
         except OSError as error:
@@ -211,6 +214,14 @@ class Page:
         finally:
             temporary.unlink(missing_ok=True)
         return target
+
+    def _write(self, file: IO[bytes], kind: str) -> None:
+        """Write the page as "png" or "pdf"."""
+        # No versions and no date in the file: the same picture is the same bytes.
+        silent = ("Software",) if kind == "png" else ("Creator", "Producer", "CreationDate")
+        # Journals ask for fonts of type 42, which can be edited; the default is 3.
+        with matplotlib.rc_context({"pdf.fonttype": 42}):
+            self.figure.savefig(file, format=kind, dpi=DPI, metadata=dict.fromkeys(silent))
 
 
 def cannot_write(target: Path, error: OSError) -> LidarpoolError:

@@ -6,6 +6,7 @@ import math
 import os
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -16,7 +17,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 
-from ..plan import Plan, Planning, Trial
+from ..plan import Plan, Planning
 from .page import FONT, Page
 from .shot import SIZE
 from .stage import Axis, axis, nice_step
@@ -29,11 +30,19 @@ MOST_TRIALS = 1000
 PATH_COLOUR, TRIAL_COLOUR = "#d6336c", "#5b8fd0"
 
 
+class HasWaypoints(Protocol):
+    """A trial, of which its path is drawn."""
+
+    @property
+    def waypoints(self) -> Floats:
+        """Corners of the path between its two ends, (k, 2), metres."""
+
+
 def draw_path(
     path: str | os.PathLike[str],
     planning: Planning,
     plan: Plan,
-    trials: Iterable[Trial] = (),
+    trials: Iterable[HasWaypoints] = (),
     *,
     size: tuple[int, int] = SIZE,
     dark: bool = False,
@@ -43,7 +52,7 @@ def draw_path(
     Parameters
     ----------
     path
-        The PNG to write.
+        The file to write, .png or .pdf.
     planning
         The problem: ends and discs.
     plan
@@ -100,7 +109,7 @@ def _verdict(plan: Plan) -> str:
     return f"{length} · {state} · best of {plan.trials:,} trial{'s' * (plan.trials != 1)}"
 
 
-def _trial_paths(best: Floats, trials: Iterable[Trial]) -> list[Floats]:
+def _trial_paths(best: Floats, trials: Iterable[HasWaypoints]) -> list[Floats]:
     """Paths (k + 2, 2) of the trials from end to end, thinned."""
     waypoints = [np.asarray(trial.waypoints, dtype=np.float64).reshape(-1, 2) for trial in trials]
     finite = [points for points in waypoints if np.isfinite(points).all()]

@@ -35,7 +35,7 @@ def draw_scene(
     Parameters
     ----------
     path
-        The PNG to write.
+        The file to write, .png or .pdf.
     scene
         What to draw.
     poses

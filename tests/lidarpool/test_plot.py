@@ -1,0 +1,262 @@
+"""The pictures of a finished result, drawn again from its folder."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+import pytest
+from PIL import Image
+
+from lidarpool import LidarpoolError, Planning, Scene
+from lidarpool.cli import cli
+from lidarpool.mesh import Mesh
+from lidarpool.picture_file import PICTURE_FILE, PICTURES, Pictured, TrialPath
+from lidarpool.plan import best
+from lidarpool.plan.trial import run_trial
+from lidarpool.ply import read_positions, write_cloud
+from lidarpool.shapes import seed_objects
+
+SIZE = (480, 300)
+SMALL = ("--size", "480x480")
+NAMES = ("Kübel\x00", "a\udc80", "")  # as files may have them
+
+
+@pytest.fixture(scope="module")
+def planned() -> Pictured:
+    objects = seed_objects(rings=8, segments=12)[:3]
+    scene = Scene.from_meshes(
+        [Mesh(name, o.vertices, o.faces) for name, o in zip(NAMES, objects, strict=True)]
+    )
+    counts = np.arange(len(scene.faces), dtype=np.int64) % 5
+    planning = Planning(
+        (0, 0), (30, 0), [(15, 1)], 4.0, trials=3, particles=30, iterations=20, waypoints=2
+    )
+    trials = [run_trial(planning, number) for number in range(3)]
+    rays = np.zeros((4, 2, 3), np.float32)
+    rays[:, 1] = scene.vertices[:4]
+    return Pictured(
+        scene,
+        np.array([[0, 0, 1], [0, 0, 2.0]]),
+        counts,
+        rays,
+        planning,
+        best(trials, planning),
+        tuple(TrialPath(trial.waypoints) for trial in trials),
+    )
+
+
+@pytest.fixture(scope="module")
+def unplanned(planned: Pictured) -> Pictured:
+    return Pictured(
+        planned.scene, planned.poses, planned.hit_counts, planned.sample_rays, None, None, ()
+    )
+
+
+def make(folder: Path, shown: Pictured) -> Path:
+    """Write the folder of a result."""
+    folder.mkdir()
+    positions = shown.scene.vertices[::2]
+    zeros = np.zeros(len(positions), np.int32)
+    write_cloud(folder / "cloud.ply", positions, zeros, zeros, zeros)
+    shown.save(folder / PICTURE_FILE)
+    return folder
+
+
+@pytest.fixture
+def result(planned: Pictured, tmp_path: Path) -> Path:
+    return make(tmp_path / "result", planned)
+
+
+def plot(*arguments: object) -> None:
+    cli.main(["plot", *map(str, arguments)], standalone_mode=False)
+
+
+def picture(path: Path) -> Image.Image:
+    with Image.open(path) as image:
+        image.load()
+        assert image.format == "PNG"
+        return image.convert("L")
+
+
+def names(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+# -- what they are drawn from --------------------------------------------------------------------
+
+
+def test_what_is_pictured_comes_back(planned, unplanned, tmp_path):
+    for shown in (planned, unplanned):
+        shown.save(tmp_path / "a.npz")
+        shown.save(tmp_path / "b.npz")
+        assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+        again = Pictured.load(tmp_path / "a.npz")
+        assert again.scene.names == shown.scene.names
+        for name in ("vertices", "faces", "face_object", "origin"):
+            assert np.array_equal(getattr(again.scene, name), getattr(shown.scene, name))
+        for name in ("poses", "hit_counts", "sample_rays"):
+            one, two = getattr(again, name), getattr(shown, name)
+            assert np.array_equal(one, two) and one.dtype == two.dtype
+        assert (again.plan is None) == (shown.plan is None)
+    planned.save(tmp_path / "a.npz")
+    again = Pictured.load(tmp_path / "a.npz")
+    assert again.planning and again.plan and planned.planning and planned.plan
+    for name in ("start", "target"):
+        assert getattr(again.planning, name) == getattr(planned.planning, name)
+    assert np.array_equal(again.planning.centres, planned.planning.centres)
+    assert np.array_equal(again.planning.radii, planned.planning.radii)
+    assert np.array_equal(again.plan.path, planned.plan.path)
+    for name in ("length", "shortest_possible", "clearance", "trial", "trials"):
+        assert getattr(again.plan, name) == getattr(planned.plan, name)
+    assert len(again.trials) == 3
+    for one, two in zip(again.trials, planned.trials, strict=True):
+        assert np.array_equal(one.waypoints, two.waypoints)
+
+
+def changed(data: bytes, **arrays: Any) -> bytes:
+    """Write an archive with other arrays in it."""
+    with np.load(io.BytesIO(data)) as archive:
+        content = {**archive, **arrays}
+    memory = io.BytesIO()
+    np.savez(memory, **{name: array for name, array in content.items() if array is not None})
+    return memory.getvalue()
+
+
+def bombs(data: bytes) -> bytes:
+    """Archive of an array whose header announces more than is there."""
+    memory = io.BytesIO(changed(data, poses=None))
+    with zipfile.ZipFile(memory, "a") as archive:
+        head = "{'descr': '<f8', 'fortran_order': False, 'shape': (90, 3), }"
+        head = head.ljust(117) + "\n"
+        archive.writestr("poses.npy", b"\x93NUMPY\x01\x00v\x00" + head.encode() + bytes(24))
+    return memory.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (lambda data: b"", "is damaged"),
+        (lambda data: b"nonsense", "is damaged"),
+        (lambda data: data[: len(data) // 2], "is damaged"),
+        (lambda data: data[:900] + bytes(40) + data[940:], "is damaged"),
+        (lambda data: changed(data, hit_counts=np.zeros(3)), r"hit_counts of \(3,\)"),
+        (lambda data: changed(data, faces=np.full((4, 3), 10**6)), "Faces must name"),
+        (lambda data: changed(data, radii=None), "radii"),
+        (lambda data: changed(data, format=None), "format"),
+        (lambda data: changed(data, poses=np.array([{}])), "allow_pickle"),
+        (lambda data: changed(data, names=np.array([1, 2])), "is damaged"),
+        (lambda data: changed(data, format=np.array(7)), "is of format 7"),
+        (bombs, "is damaged"),
+    ],
+)
+def test_a_damaged_file_is_refused(damage, said, result):
+    file = result / PICTURE_FILE
+    file.write_bytes(damage(file.read_bytes()))
+    with pytest.raises(LidarpoolError, match=said) as caught:
+        plot(result, "--only", "scene")
+    assert str(file) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_positions_are_read_evenly(tmp_path):
+    path = tmp_path / "cloud.ply"
+    positions = np.arange(30.0).reshape(10, 3)
+    write_cloud(path, positions, *np.zeros((3, 10), np.int32))
+    chosen, count = read_positions(path, 4)
+    assert count == 10 and chosen.tolist() == positions[[0, 3, 6, 9]].tolist()
+    for most in (10, 1000):
+        assert np.array_equal(read_positions(path, most)[0], positions)
+    write_cloud(path, np.empty((0, 3)), *np.zeros((3, 0), np.int32))
+    empty, none = read_positions(path, 4)
+    assert empty.shape == (0, 3) and none == 0
+
+
+# -- the command ---------------------------------------------------------------------------------
+
+
+def test_all_pictures_are_drawn_into_the_folder(result, capsys):
+    before = names(result)
+    plot(result, *SMALL)
+    made = [result / f"{name}.png" for name in PICTURES]
+    assert names(result) == before | {path.name for path in made}
+    assert capsys.readouterr().out.splitlines() == [str(path) for path in made]
+    light = {path: path.read_bytes() for path in made}
+    assert all(np.mean(picture(path)) > 180 for path in made)
+    assert all(picture(path).size == (480, 480) for path in made)
+    plot(result, *SMALL, "--dark")
+    for path in made:
+        assert path.read_bytes() == light[path], "the light ones stay"
+        assert np.mean(picture(path.with_stem(f"{path.stem}-dark"))) < 60
+
+
+def test_some_are_drawn_to_another_folder(result, tmp_path):
+    before = names(result)
+    out = tmp_path / "new" / "folder"
+    plot(result, "--only", "path", "--only", "scene", *SMALL, "--out", out, "--format", "pdf")
+    assert names(out) == {"scene.pdf", "path.pdf"}
+    assert names(result) == before
+
+
+def test_a_pdf_is_the_same_each_time_and_has_letters(result, tmp_path):
+    first, second = tmp_path / "a.pdf", tmp_path / "b.PDF"
+    for path in (first, second):
+        plot(result, "--only", "intensity", *SMALL, "--out", path)
+    data = first.read_bytes()
+    assert data == second.read_bytes() and data.startswith(b"%PDF-")
+    assert b"/FontFile2" in data and b"/Type3" not in data and b"/CreationDate" not in data
+
+
+def test_the_cloud_is_needed_for_its_own_picture_only(result):
+    (result / "cloud.ply").unlink()
+    plot(result, "--only", "path", *SMALL)
+    with pytest.raises(LidarpoolError, match=r"cloud\.ply cannot be read: No such file"):
+        plot(result, "--only", "cloud", *SMALL)
+
+
+def test_a_result_without_a_plan(unplanned, tmp_path):
+    result = make(tmp_path / "result", unplanned)
+    plot(result, *SMALL, "--out", tmp_path / "out")
+    assert names(tmp_path / "out") == {"scene.png", "intensity.png", "cloud.png"}
+    with pytest.raises(LidarpoolError, match=r"no picture 'path'.*scene, intensity, cloud\.$"):
+        plot(result, "--only", "path")
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--out", "all.png"], r"all\.png is one file, for 4 pictures: choose one with --only"),
+        (["--only", "path", "--out", "p.png", "--format", "pdf"], r"ends in \.png.*is pdf: drop"),
+        (["--out", "file/below"], r"file.below cannot be made"),
+        (["--only", "path", "--out", "none/p.png"], r"picture .*p\.png could not be written"),
+    ],
+)
+def test_targets_that_do_not_fit(options, said, result, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("")
+    before = names(tmp_path)
+    with pytest.raises(LidarpoolError, match=said):
+        plot(result, *SMALL, *options)
+    assert names(tmp_path) == before
+
+
+@pytest.mark.parametrize("size", ["big", "480", "480x", "0x0", "479x480", "9000x9000", "1000x480"])
+def test_sizes_that_cannot_be(size, result):
+    with pytest.raises(click.UsageError, match=f"'{size}' is no size.*such as 1600x1000"):
+        plot(result, "--size", size)
+
+
+def test_folders_that_hold_no_result(tmp_path):
+    with pytest.raises(LidarpoolError, match="none does not exist: give the folder of a finished"):
+        plot(tmp_path / "none")
+    with pytest.raises(LidarpoolError, match=r"holds no pictures\.npz.*give the folder"):
+        plot(tmp_path)
+    (tmp_path / "report.json").write_text(json.dumps({}))
+    with pytest.raises(LidarpoolError, match="by an earlier version; run it again"):
+        plot(tmp_path)
+    with pytest.raises(LidarpoolError, match=r"report\.json is a file: give the folder"):
+        plot(tmp_path / "report.json")
