@@ -4,7 +4,7 @@ BIN := $(VENV)/bin
 OUT ?= lidarpool-out
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test slow chaos soak lint format bench clean
+.PHONY: help demo test slow chaos soak lint docs format bench clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /\1\t/' | expand -t 10
@@ -29,12 +29,16 @@ soak:  ## 10,000 scans with a worker killed every few seconds; memory as a pictu
 	@VENV=$(VENV) sh .ci/setup dev
 	$(BIN)/python -m tests.chaos.soak --picture $(OUT)/soak.png
 
-lint:  ## format check, lint, types, layer contracts
+lint: docs  ## format check, lint, types, layer contracts, documentation
 	@VENV=$(VENV) sh .ci/setup dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+docs:  ## the documentation as a site in build/site; a warning is an error
+	@VENV=$(VENV) sh .ci/setup dev
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 format:  ## rewrite the sources in the project's format
 	@VENV=$(VENV) sh .ci/setup dev

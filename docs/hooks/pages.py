@@ -1,0 +1,100 @@
+"""What the site has that is no page of its own in docs/: README, reference, linked sources.
+
+MkDocs calls the functions whose names begin with `on_`.
+"""
+
+from __future__ import annotations
+
+import posixpath
+import re
+from pathlib import Path
+from typing import Any
+
+from mkdocs.exceptions import PluginError
+from mkdocs.structure.files import File, Files
+
+# MkDocs puts this folder on the path while it loads hooks.
+from reference_pages import command_page, members_page, scenario_page
+
+ROOT = Path(__file__).parents[2]
+
+# Pages that are kept elsewhere in the repository. {file: page}
+_ELSEWHERE = {
+    "README.md": "index.md",
+    "ARCHITECTURE.md": "architecture.md",
+    "CHANGELOG.md": "changelog.md",
+}
+_LINK = re.compile(r"(\]\()([^)#\s]+)([^)]*\))")
+# What a browser would fetch by itself, from elsewhere.
+_FETCHED = re.compile(
+    r"""(?:<(?:script|img|iframe)\b[^>]*\bsrc=|<link\b(?![^>]*\bcanonical)[^>]*\bhref=)"""
+    r"""["']?(?:https?:)?//[^\s"'>]+""",
+)
+
+
+def on_files(files: Files, config: Any) -> Files:
+    """Add README and the like, the reference, and the sources that pages link to."""
+    pages = {
+        page: _relinked((ROOT / file).read_text("utf-8"), file, page, files, config)
+        for file, page in _ELSEWHERE.items()
+    }
+    pages["reference/command.md"] = command_page()
+    pages["reference/scenario.md"] = scenario_page()
+    for package in ("lidarpool", "poolpart", "raybeam"):
+        pages[f"reference/{package}.md"] = members_page(package)
+    for page, content in pages.items():
+        files.append(File.generated(config, page, content=content))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
+    """Lead links out of docs/ to where the site has what they name."""
+    if page.file.abs_src_path is None:  # generated: done already
+        return markdown
+    path = page.file.src_uri
+    return _relinked(markdown, f"docs/{path}", path, files, config)
+
+
+def on_post_build(config: Any) -> None:
+    """Refuse a site that would fetch something from elsewhere when it is read."""
+    found = [
+        f"{path.relative_to(config['site_dir'])}: {match}"
+        for path in sorted(Path(config["site_dir"]).rglob("*.html"))
+        for match in _FETCHED.findall(path.read_text("utf-8"))
+    ]
+    if found:
+        raise PluginError("The site asks the network for\n" + "\n".join(found))
+
+
+def _relinked(text: str, file: str, page: str, files: Files, config: Any) -> str:
+    """Text of a file of the repository with links as they are from a page of the site."""
+
+    def relink(match: re.Match[str]) -> str:
+        target = match[2]
+        if "://" in target or target.startswith("mailto:"):
+            return match[0]
+        in_repository = posixpath.normpath(posixpath.join(posixpath.dirname(file), target))
+        in_site = _page_of(in_repository, files, config)
+        relative = posixpath.relpath(in_site, posixpath.dirname(page) or ".")
+        return f"{match[1]}{relative}{match[3]}"
+
+    return _LINK.sub(relink, text)
+
+
+def _page_of(path: str, files: Files, config: Any) -> str:
+    """Where the site has a file of the repository; one of the sources gets a page."""
+    if path in _ELSEWHERE:
+        return _ELSEWHERE[path]
+    if path.startswith("docs/"):
+        return path.removeprefix("docs/")
+    source = ROOT / path
+    if not source.is_file():
+        return path  # MkDocs warns of it
+    page = f"sources/{path}.md"
+    if files.get_file_from_path(page) is None:
+        kind = {".py": "python", ".yaml": "yaml", ".sh": "sh"}.get(source.suffix, "text")
+        fence = "`" * 4
+        content = f"# {path}\n\n{fence}{kind}\n{source.read_text('utf-8')}\n{fence}\n"
+        added = File.generated(config, page, content=content)
+        files.append(added)
+    return page

@@ -1,0 +1,120 @@
+"""Pages of the reference, made from what the packages say of themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from importlib import import_module
+from typing import Any
+
+import click
+
+from lidarpool.cli import cli
+from lidarpool.schema import scenario_schema
+
+# Sections in the order of a scenario file, and what stands in the sections of another.
+_SECTIONS = {
+    "scene": "SceneSection",
+    "scene: files": "MeshFile",
+    "scene: ground": "Ground",
+    "sensor": "SensorSection",
+    "poses": "PoseSection",
+    "cloud": "CloudSection",
+    "planning": "PlanningSection",
+    "planning: obstacles": "Obstacle",
+    "pool": "PoolSection",
+}
+
+
+def members_page(package: str) -> str:
+    """Public names of a package, each with its docstring."""
+    module = import_module(package)
+    names = sorted(name for name in module.__all__ if not name.startswith("__"))
+    parts = [f"# `{package}`\n\n{module.__doc__}\n"]
+    parts += [f"::: {package}.{name}\n" for name in names]
+    return "\n".join(parts)
+
+
+def command_page() -> str:
+    """`--help` of the command and of each of its commands."""
+    parts = ["# The command\n\nWhat `--help` prints.\n"]
+    for path, command in _commands(cli, "lidarpool"):
+        context = click.Context(command, info_name=path, max_content_width=88)
+        parts.append(f"## `{path}`\n\n```text\n{command.get_help(context)}\n```\n")
+    return "\n".join(parts)
+
+
+def _commands(command: click.Command, path: str) -> Iterator[tuple[str, click.Command]]:
+    yield path, command
+    if isinstance(command, click.Group):
+        for name in sorted(command.commands):
+            yield from _commands(command.commands[name], f"{path} {name}")
+
+
+def scenario_page() -> str:
+    """Tables of the fields of a scenario file, from its JSON Schema."""
+    schema = scenario_schema()
+    parts = [
+        "# Scenario files\n\n"
+        f"{schema['description']} All of it may be left out: an empty file is the default survey. "
+        "Fields that are not in these tables are refused. `lidarpool init` writes a file with all "
+        "of them, and `lidarpool schema` prints this as JSON Schema.\n",
+        "## The file\n",
+        _table(schema["properties"]),
+    ]
+    for heading, name in _SECTIONS.items():
+        section = schema["$defs"][name]
+        # Of a section with short forms, the one with fields.
+        fields = next(c for c in section.get("anyOf", [section]) if "properties" in c)
+        required = fields.get("required", [])
+        words = f"{section['description']}\n".replace("`Sensor`", "[Sensor][lidarpool.Sensor]")
+        parts += [f"## `{heading}`\n", words, _table(fields["properties"], required)]
+    missing = set(schema["$defs"]) - set(_SECTIONS.values())
+    if missing:
+        raise ValueError(f"sections of a scenario that its page does not show: {missing}")
+    return "\n".join(parts)
+
+
+def _table(fields: dict[str, Any], required: tuple[str, ...] | list[str] = ()) -> str:
+    rows = ["| field | takes | default | |", "|---|---|---|---|"]
+    for name, content in fields.items():
+        default = "must be given" if name in required else _default(content)
+        words = content.get("description", "see below")
+        cells = (f"`{name}`", _kinds(content), default, words)
+        rows.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+    return "\n".join(rows) + "\n"
+
+
+def _default(content: dict[str, Any]) -> str:
+    value = content.get("default")
+    return "" if value is None else f"`{value}`"
+
+
+def _kinds(content: dict[str, Any]) -> str:
+    """Say what a field takes."""
+    if "anyOf" in content:
+        choices = [_kinds(choice) for choice in content["anyOf"] if choice.get("type") != "null"]
+        return " or ".join(dict.fromkeys(choices))
+    if "enum" in content:
+        return ", ".join(f"`{value}`" for value in content["enum"])
+    if "const" in content:
+        return f"`{content['const']}`"
+    if "$ref" in content:
+        return "a section"
+    kind = content["type"]
+    if kind == "array":
+        return _list(content)
+    words = {"integer": "whole number", "string": "text", "boolean": "true or false"}
+    return words.get(kind, kind) + _limits(content)
+
+
+def _list(content: dict[str, Any]) -> str:
+    prefix = content.get("prefixItems")
+    if prefix:
+        return f"list of {len(prefix)}: {_kinds(prefix[0])}"
+    return f"list: {_kinds(content['items'])}"
+
+
+def _limits(content: dict[str, Any]) -> str:
+    signs = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
+    limits = [f"{sign} {content[key]:,}" for key, sign in signs.items() if key in content]
+    return " " + ", ".join(limits) if limits else ""
