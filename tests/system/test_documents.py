@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -60,3 +61,19 @@ def test_files_that_the_architecture_names_exist():
     assert [
         name for name in sorted(named) if not any(f"/{f}".endswith(f"/{name}") for f in tree)
     ] == []
+
+
+def test_a_site_that_asks_the_network_is_refused(tmp_path, monkeypatch):
+    mkdocs = pytest.importorskip("mkdocs.exceptions", reason="needs the extra docs")
+    monkeypatch.syspath_prepend(ROOT / "docs/hooks")
+    pages = import_module("pages")
+    page, config = tmp_path / "index.html", {"site_dir": str(tmp_path)}
+    page.write_text(
+        '<a href="https://example.org">there</a> <img src="images/live.png">'
+        '<link rel="canonical" href="https://example.org/"> <script src="assets/a.js"></script>'
+    )
+    pages.on_post_build(config)  # links are only followed when they are clicked
+    for fetched in ('<script src="https://cdn.example/a.js">', "<link href=//fonts.example/a.css>"):
+        page.write_text(fetched)
+        with pytest.raises(mkdocs.PluginError, match=r"index\.html: .*example"):
+            pages.on_post_build(config)
