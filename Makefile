@@ -45,11 +45,12 @@ format:  ## rewrite the sources in the project's format
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-bench:  ## benchmarks: pipeline, planning, ray casting; figures of the last in build/ as JSON
+bench:  ## benchmarks: pipeline, planning, live page, ray casting; figures of the last in build/ as JSON
 	@VENV=$(VENV) sh .ci/setup dev
 	$(BIN)/python -m benchmarks.pipeline
 	$(BIN)/python -m benchmarks.scale
 	$(BIN)/python -m benchmarks.planning
+	$(BIN)/python -m benchmarks.live
 	@mkdir -p build
 	$(BIN)/python -m benchmarks.raycast --json build/raycast.json
 	$(BIN)/python -m benchmarks.trees --json build/trees.json

@@ -23,6 +23,7 @@ PROGRESS = Progress(
     trials=10,
     trials_done=6,
     seconds=1.5,
+    replayed=7,
 )
 
 
@@ -51,7 +52,12 @@ def test_it_is_there_while_the_run_is(client, capsys):
             totals = json.load(answer)["totals"]
     assert said.out == ""
     assert shown == [PROGRESS, PROGRESS]
-    assert totals == {"scans": "2 of 1,200", "points": "5,000", "trials": "6 of 10"}
+    assert totals == {
+        "scans": "2 of 1,200",
+        "points": "5,000",
+        "trials": "6 of 10",
+        "replayed": "7",
+    }
     with pytest.raises(urllib.error.HTTPError, match="404"):
         urllib.request.urlopen(url, timeout=30)
 

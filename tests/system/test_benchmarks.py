@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
-from benchmarks import pipeline, scale
+from benchmarks import live, pipeline, scale
 
 
 def test_pipeline(tmp_path, capsys):
@@ -31,6 +31,15 @@ def test_scale(tmp_path, capsys):
         assert cluster["misplaced"] == 0
         assert all(cluster[way]["tasks_per_second"] > 0 for way in scale.WAYS)
     assert "growth from 4 to 8 workers" in capsys.readouterr().out
+
+
+def test_live(tmp_path, capsys):
+    path = tmp_path / "figures.json"
+    figures = live.main(["--poses", "1", "--runs", "1", "--json", str(path)])
+    assert json.loads(path.read_text()) == figures
+    assert figures["ratio"] > 0
+    assert figures["megabytes_sent"] > 0.1  # or nobody looked
+    assert "times as long" in capsys.readouterr().out
 
 
 @pytest.mark.slow

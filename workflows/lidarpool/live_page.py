@@ -54,4 +54,5 @@ def totals(progress: Progress) -> dict[str, str]:
     shown = {"scans": scans, "points": f"{progress.points:,}"}
     if progress.trials:
         shown["trials"] = f"{progress.trials_done:,} of {progress.trials:,}"
+    shown["replayed"] = f"{progress.replayed:,}"
     return shown

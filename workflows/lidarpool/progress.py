@@ -10,7 +10,8 @@ class Progress:
     """Counts at one moment of a run.
 
     `generated`, `cast`, `framed` and `collected` are scans that have passed stage 1 to 4, out
-    of `scans`; `trials_done` are planning trials out of `trials`. `seconds` is since the start.
+    of `scans`; `trials_done` are planning trials out of `trials`. `seconds` is since the start,
+    `replayed` are batches that were sent or cast once more.
     """
 
     scans: int
@@ -22,3 +23,4 @@ class Progress:
     trials: int
     trials_done: int
     seconds: float
+    replayed: int = 0

@@ -196,6 +196,7 @@ class Run:
             trials=self.job.trials,
             trials_done=len(trials.trials) if trials else 0,
             seconds=seconds,
+            replayed=survey.replayed,
         )
 
 

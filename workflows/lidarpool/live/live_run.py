@@ -59,6 +59,11 @@ class LiveRun:
         page.on_client_connect(self.painter.ask)
         self.painter.ask()
 
+    @property
+    def url(self) -> str:
+        """Where the page is."""
+        return self._page.url
+
     # -- the run's side, in its thread ---------------------------------------------------
 
     def follow(self, kept: Deliveries) -> None:

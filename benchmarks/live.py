@@ -1,0 +1,128 @@
+"""What the live page takes of a survey: `python -m benchmarks.live`.
+
+Surveys with and without the page, turn and turn about on one local cluster. A client that
+takes everything the page sends stands for a browser on a machine of its own: one that draws
+on the processor, on the same few cores, would be measured instead of the page.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import viser
+from distributed import Client
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
+
+from lidarpool import Planning, Scene, Sensor, Survey
+from lidarpool.deliveries import Deliveries
+from lidarpool.job import Job
+from lidarpool.live import live_run
+from lidarpool.run import Run
+from poolpart import local_cluster
+
+# The first word of a browser to viser: where its camera is.
+CAMERA = {
+    "type": "ViewerCameraMessage",
+    "wxyz": [1.0, 0.0, 0.0, 0.0],
+    "position": [40.0, -40.0, 30.0],
+    "fov": 0.8,
+    "near": 0.1,
+    "far": 1000.0,
+    "image_height": 800,
+    "image_width": 1280,
+    "look_at": [0.0, 0.0, 0.0],
+    "up_direction": [0.0, 0.0, 1.0],
+}
+
+
+def job(poses: int) -> Job:
+    """Make a survey of six objects with some 80 points a scan, and a short planning."""
+    sensor = Sensor(rays_per_revolution=3600, layers=64, step_deg=2)
+    survey = Survey(sensor, [(0, 0, 1 + i / 100) for i in range(poses)], steps=180)
+    return Job(Scene.seed(), survey, Planning((25, 25), (-30, -20), trials=4))
+
+
+def plain(client: Client, work: Job) -> float:
+    """Seconds of a survey without a page."""
+    return Run(client, Deliveries(work)).drive(None, None).survey_seconds
+
+
+def watched(client: Client, work: Job) -> tuple[float, int]:
+    """Seconds of a survey with a page that somebody looks at, and bytes that were sent."""
+    with live_run(work, port=0, browser=False) as live, _looking(live) as taken:
+        kept = Deliveries(work)
+        live.follow(kept)
+        run = Run(client, kept)
+        show = live.with_progress(lambda progress: None, run.partitions)
+        seconds = run.drive(live.on_frame, show).survey_seconds
+        live.finish()
+    return seconds, sum(taken)
+
+
+@contextmanager
+def _looking(live: Any) -> Iterator[list[int]]:
+    """Take what the page sends, as a browser would; gives the sizes of the messages."""
+    taken: list[int] = []
+    version = Subprotocol(f"viser-v{viser.__version__}")
+    address = live.url.replace("http", "ws")
+    with connect(address, subprotocols=[version], max_size=None, compression=None) as socket:
+        socket.send(msgspec.msgpack.encode(CAMERA))  # or nobody looks yet
+
+        def take() -> None:
+            with suppress(ConnectionClosed):
+                taken.extend(len(message) for message in socket)
+
+        thread = threading.Thread(target=take, daemon=True)
+        thread.start()
+        yield taken
+    thread.join(10)
+
+
+def main(arguments: list[str] | None = None) -> dict[str, Any]:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--poses", type=int, default=40, help="of 180 scans each")
+    parser.add_argument("--runs", type=int, default=5, help="of each kind")
+    parser.add_argument("--json", type=Path, help="also write the figures to this file")
+    options = parser.parse_args(arguments)
+
+    without, with_page, sent = [], [], 0
+    work = job(options.poses)
+    with local_cluster() as cluster, Client(cluster) as client:
+        plain(client, job(1))  # the first run imports everything on the workers
+        for _ in range(options.runs):
+            without.append(plain(client, work))
+            seconds, sent = watched(client, work)
+            with_page.append(seconds)
+            time.sleep(0.5)
+    ratios = [page / bare for page, bare in zip(with_page, without, strict=True)]
+    figures = {
+        "scans": work.survey.scan_count,
+        "seconds_without": round(statistics.median(without), 2),
+        "seconds_with": round(statistics.median(with_page), 2),
+        "ratio": round(sum(with_page) / sum(without), 3),
+        "ratios": [round(ratio, 3) for ratio in ratios],
+        "megabytes_sent": round(sent / 1e6, 2),
+    }
+    print(
+        f"{figures['scans']} scans: {figures['seconds_without']} s without the page, "
+        f"{figures['seconds_with']} s with it: {figures['ratio']} times as long "
+        f"(pairs {min(ratios):.2f} to {max(ratios):.2f}; {figures['megabytes_sent']} MB sent)"
+    )
+    if options.json:
+        options.json.write_text(json.dumps(figures, indent=1) + "\n")
+    return figures
+
+
+if __name__ == "__main__":
+    main()
