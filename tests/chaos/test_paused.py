@@ -88,7 +88,10 @@ def lonely(arena):
 def test_what_it_does_when_it_wakes_up_counts_once(arena, what, known, lonely, partition, point):
     name = lonely(partition)
     fault = Fault(0, STOP, point, scan=100, worker=name, stop_s=STOP_S)
-    outcome = disturbed(arena, what, known, [fault], None)
-    assert outcome.sound, outcome.error or outcome.verdict
+    for _ in range(3):
+        outcome = disturbed(arena, what, known, [fault], None)
+        assert outcome.sound, outcome.error or outcome.verdict
+        if outcome.done:
+            break  # else the survey was over before the newcomer had imported what it needs
     assert outcome.done == {(STOP, point): 1}
     assert outcome.verdict.recovered
