@@ -23,13 +23,17 @@ def test_idle_workers_of_other_help_to_cast(client):
     alone = simulate(Scene.seed(), SURVEY, client=client, backend="numpy")
     pool = Pool.from_client(client)
     pool.rebalance("OTHER", helps="GPU", idle_s=0.0)
-    helped = simulate(Scene.seed(), SURVEY, client=client, backend="numpy")
-    workers = {record.worker for record in helped.records if record.partition == "GPU"}
+    workers: set[str] = set()
+    for _ in range(4):  # on a busy machine a survey may be over before the helper is ready
+        helped = simulate(Scene.seed(), SURVEY, client=client, backend="numpy")
+        workers |= {record.worker for record in helped.records if record.partition == "GPU"}
+        assert not any(record.misplaced for record in helped.records)
+        for column in ("positions", "scan", "ring", "object"):
+            ours, theirs = getattr(helped.cloud, column), getattr(alone.cloud, column)
+            assert ours.tobytes() == theirs.tobytes()
+        if "OTHER-0" in workers:
+            break
     assert workers == {"GPU-0", "OTHER-0"}
-    assert not any(record.misplaced for record in helped.records)
-    for column in ("positions", "scan", "ring", "object"):
-        ours, theirs = getattr(helped.cloud, column), getattr(alone.cloud, column)
-        assert ours.tobytes() == theirs.tobytes()
     pool.stop_rebalancing("OTHER", helps="GPU")
     assert set(pool.dissolve()) == {"OTHER", "GPU"}
     assert {name: len(part) for name, part in Pool.from_client(client).partitions().items()} == {
