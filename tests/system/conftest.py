@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from distributed import Client
+from distributed import Client, Scheduler, SpecCluster, Worker
 
 import lidarpool.pictures
 from lidarpool import Cloud
@@ -52,6 +52,37 @@ def same_cloud() -> Callable[[Cloud, Cloud], bool]:
         )
 
     return same
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[str]:
+    """A cluster whose workers are threads of this process, for speed; its address."""
+    quiet = {"host": "127.0.0.1", "dashboard": False}
+    workers = {
+        name: {"cls": Worker, "options": {"resources": {name: n}, "nthreads": n, **quiet}}
+        for name, n in {"GPU": 1, "LIDAR": 4, "OTHER": 1}.items()
+    }
+    scheduler = {"cls": Scheduler, "options": {"port": 0, **quiet}}
+    with SpecCluster(workers=workers, scheduler=scheduler, silence_logs=50) as cluster:
+        yield cluster.scheduler_address
+
+
+@pytest.fixture
+def left_over() -> Callable[[Client], tuple[list[str], list[str], list[str]]]:
+    """What a scheduler still knows of tasks, queues and variables, after a moment."""
+
+    def look(dask_scheduler):
+        queues = dask_scheduler.extensions["queues"].queues
+        variables = dask_scheduler.extensions["variables"].variables
+        return [str(key) for key in dask_scheduler.tasks], list(queues), list(variables)
+
+    def left_over(client: Client) -> tuple[list[str], list[str], list[str]]:
+        until = time.monotonic() + 5  # cancelling is told to the scheduler, not asked
+        while any(found := client.run_on_scheduler(look)) and time.monotonic() < until:
+            time.sleep(0.05)
+        return found
+
+    return left_over
 
 
 class OutsideCluster:

@@ -13,14 +13,14 @@ import shlex
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from distributed import Client, Scheduler, SpecCluster, Worker
+from distributed import Client
 
 import lidarpool.output
 from lidarpool import LidarpoolError, read_cloud, simulate
@@ -39,19 +39,6 @@ def command(*arguments: object, **environment: str) -> subprocess.CompletedProce
     return subprocess.run(
         [*COMMAND, *map(str, arguments)], capture_output=True, text=True, env=env, check=False
     )
-
-
-@pytest.fixture(scope="module")
-def cluster() -> Iterator[str]:
-    """A cluster whose workers are threads of this process, for speed; its address."""
-    quiet = {"host": "127.0.0.1", "dashboard": False}
-    workers = {
-        name: {"cls": Worker, "options": {"resources": {name: n}, "nthreads": n, **quiet}}
-        for name, n in {"GPU": 1, "LIDAR": 4, "OTHER": 1}.items()
-    }
-    scheduler = {"cls": Scheduler, "options": {"port": 0, **quiet}}
-    with SpecCluster(workers=workers, scheduler=scheduler, silence_logs=50) as cluster:
-        yield cluster.scheduler_address
 
 
 @pytest.fixture(scope="module")

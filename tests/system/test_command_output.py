@@ -5,30 +5,16 @@ from __future__ import annotations
 import json
 import logging
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-from distributed import Scheduler, SpecCluster, Worker
 
 import lidarpool.run_command
 from lidarpool import read_cloud
 
 SHORT = "sensor: {layers: 8}\nplanning: {trials: 4, iterations: 20}\n"
-
-
-@pytest.fixture(scope="module")
-def cluster() -> Iterator[str]:
-    """A cluster whose workers are threads of this process, for speed; its address."""
-    quiet = {"host": "127.0.0.1", "dashboard": False}
-    workers = {
-        name: {"cls": Worker, "options": {"resources": {name: n}, "nthreads": n, **quiet}}
-        for name, n in {"GPU": 1, "LIDAR": 4, "OTHER": 1}.items()
-    }
-    scheduler = {"cls": Scheduler, "options": {"port": 0, **quiet}}
-    with SpecCluster(workers=workers, scheduler=scheduler, silence_logs=50) as cluster:
-        yield cluster.scheduler_address
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 import yaml
-from distributed import Client, Scheduler, SpecCluster, Worker
+from distributed import Client
 
 import lidarpool.output as lidarpool_output
 from lidarpool import LidarpoolError, save_cloud, simulate
@@ -20,19 +20,6 @@ from lidarpool.output import FILES
 from lidarpool.scenario import Scenario
 
 SCENARIO = "cloud: {keep_every: 1}\nplanning: {trials: 2, iterations: 20}\npool: {backend: numpy}\n"
-
-
-@pytest.fixture(scope="module")
-def cluster() -> Iterator[str]:
-    """A cluster whose workers are threads of this process."""
-    quiet = {"host": "127.0.0.1", "dashboard": False}
-    workers = {
-        name: {"cls": Worker, "options": {"resources": {name: n}, "nthreads": n, **quiet}}
-        for name, n in {"GPU": 1, "LIDAR": 4, "OTHER": 1}.items()
-    }
-    scheduler = {"cls": Scheduler, "options": {"port": 0, **quiet}}
-    with SpecCluster(workers=workers, scheduler=scheduler, silence_logs=50) as cluster:
-        yield cluster.scheduler_address
 
 
 @pytest.fixture(scope="module")

@@ -7,13 +7,13 @@ import random
 import re
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
-from distributed import Client, Scheduler, SpecCluster, Worker
+from distributed import Client
 
 from lidarpool import LidarpoolError, Scene, Sensor, Survey, remove_journal, save_cloud, simulate
 from lidarpool.report import make_report
@@ -43,19 +43,6 @@ def draw(path, *_, **__): path.write_bytes(b"x")
 pictures.draw_scene = pictures.draw_intensity = draw
 pictures.draw_cloud = pictures.draw_path = draw
 """
-
-
-@pytest.fixture(scope="module")
-def cluster() -> Iterator[str]:
-    """A cluster whose workers are threads of this process, which outlives the drivers."""
-    quiet = {"host": "127.0.0.1", "dashboard": False}
-    workers = {
-        name: {"cls": Worker, "options": {"resources": {name: n}, "nthreads": n, **quiet}}
-        for name, n in {"GPU": 1, "LIDAR": 4, "OTHER": 1}.items()
-    }
-    scheduler = {"cls": Scheduler, "options": {"port": 0, **quiet}}
-    with SpecCluster(workers=workers, scheduler=scheduler, silence_logs=50) as cluster:
-        yield cluster.scheduler_address
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import threading
-import time
 from contextlib import suppress
 
 import numpy as np
@@ -81,20 +80,6 @@ def kill_worker_of(client: Client, stage: str) -> None:
     os.kill(client.run(os.getpid, workers=[address])[address], signal.SIGKILL)
 
 
-def left_over(client: Client) -> tuple[list[str], list[str], list[str]]:
-    """What the scheduler still knows of tasks, queues and variables, after a moment."""
-
-    def look(dask_scheduler):
-        queues = dask_scheduler.extensions["queues"].queues
-        variables = dask_scheduler.extensions["variables"].variables
-        return [str(key) for key in dask_scheduler.tasks], list(queues), list(variables)
-
-    until = time.monotonic() + 5  # cancelling is told to the scheduler, not asked
-    while any(found := client.run_on_scheduler(look)) and time.monotonic() < until:
-        time.sleep(0.05)
-    return found
-
-
 def test_each_stage_has_a_slot_of_its_own(client, undisturbed):
     for _ in range(3):
         result = simulate(Scene.seed(), SURVEY, client=client)
@@ -104,7 +89,7 @@ def test_each_stage_has_a_slot_of_its_own(client, undisturbed):
 
 
 @pytest.mark.parametrize("stage", ["generate", "sort", "collect-0"])
-def test_a_stage_whose_worker_dies_is_started_elsewhere(client, undisturbed, stage):
+def test_a_stage_whose_worker_dies_is_started_elsewhere(client, undisturbed, stage, left_over):
     def on_frame(frame) -> None:
         if frame.scan == 300:
             kill_worker_of(client, stage)
@@ -117,7 +102,7 @@ def test_a_stage_whose_worker_dies_is_started_elsewhere(client, undisturbed, sta
     assert left_over(client) == ([], [], [])
 
 
-def test_more_deaths_than_dask_allows_a_task(client, undisturbed):
+def test_more_deaths_than_dask_allows_a_task(client, undisturbed, left_over):
     """Dask gives a task up for good when its fourth worker dies."""
     killed = []
 
@@ -135,7 +120,9 @@ def test_more_deaths_than_dask_allows_a_task(client, undisturbed):
 
 
 @pytest.mark.parametrize("pump", [SurveyPump, TrialPump])
-def test_an_interrupt_while_starting_leaves_nothing(client, undisturbed, monkeypatch, pump):
+def test_an_interrupt_while_starting_leaves_nothing(
+    client, undisturbed, monkeypatch, pump, left_over
+):
     method = "start" if pump is SurveyPump else "step"
     original = getattr(pump, method)
 
@@ -153,7 +140,7 @@ def test_an_interrupt_while_starting_leaves_nothing(client, undisturbed, monkeyp
     assert np.array_equal(again.positions, undisturbed.positions)
 
 
-def test_trials_cancelled_by_somebody_end_the_run(client):
+def test_trials_cancelled_by_somebody_end_the_run(client, left_over):
     planning = Planning((25, 25), (-30, -20), trials=500)
     pumps = []
     original = TrialPump.__init__
@@ -172,7 +159,7 @@ def test_trials_cancelled_by_somebody_end_the_run(client):
     assert left_over(client)[1:] == ([], [])
 
 
-def test_a_slot_lost_for_good_ends_the_run(monkeypatch):
+def test_a_slot_lost_for_good_ends_the_run(monkeypatch, left_over):
     monkeypatch.setattr(lidarpool.watch, "PATIENCE_S", 2.0)
     with cluster_of_slots() as cluster, Client(cluster) as client:
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import time
 from collections.abc import Iterator
 
 import pytest
@@ -64,23 +63,9 @@ def pid_of_worker(client: Client, stage: str) -> int:
     return client.run(os.getpid, workers=[address])[address]
 
 
-def left_over(client: Client) -> tuple[list[str], list[str], list[str]]:
-    """What the scheduler still knows of tasks, queues and variables, after a moment."""
-
-    def look(dask_scheduler):
-        queues = dask_scheduler.extensions["queues"].queues
-        variables = dask_scheduler.extensions["variables"].variables
-        return [str(key) for key in dask_scheduler.tasks], list(queues), list(variables)
-
-    until = time.monotonic() + 5  # cancelling is told to the scheduler, not asked
-    while any(found := client.run_on_scheduler(look)) and time.monotonic() < until:
-        time.sleep(0.05)
-    return found
-
-
 @pytest.mark.parametrize("stage", ["generate", "sort", "collect-0", "prepare"])
 def test_one_that_wakes_up_beside_its_successor_does_no_harm(
-    client, undisturbed, same_cloud, silent_soon, stage
+    client, undisturbed, same_cloud, silent_soon, stage, left_over
 ):
     """The scheduler would take it for dead after five minutes, and wait that long."""
     pids, seen, events = [], [], set()
