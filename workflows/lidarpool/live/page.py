@@ -14,6 +14,8 @@ import rich
 import viser
 from numpy.typing import ArrayLike, NDArray
 
+from .visitors import refuse_strangers
+
 HOST = "127.0.0.1"
 PORT = 8080  # or the next that is free
 
@@ -24,7 +26,19 @@ _GRID = (128, 134, 142)  # lines that are seen on a light page and on a dark one
 
 
 class LivePage(viser.ViserServer):
-    """A page for anybody on this machine, and for nobody else."""
+    """A page for anybody on this machine, and for nobody else.
+
+    Parameters
+    ----------
+    title
+        Title of its panel.
+    port
+        Port to listen on, or the next that is free; 0 for any.
+    """
+
+    def __init__(self, title: str, port: int) -> None:
+        super().__init__(host=HOST, port=port, label=title, verbose=False)
+        refuse_strangers(self)
 
     def request_share_url(self, verbose: bool = True) -> None:
         """Do nothing: viser would open a way to this page from the whole internet."""
@@ -101,7 +115,7 @@ def live_page(title: str, port: int = PORT) -> Iterator[LivePage]:
     console = rich.get_console()  # viser tells there what is going on, as it runs and as it ends
     before, console.quiet = console.quiet, True
     try:
-        page = LivePage(host=HOST, port=port, label=title, verbose=False)
+        page = LivePage(title, port)
         try:
             page.show_theme(dark=False)
             yield page

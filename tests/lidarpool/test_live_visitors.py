@@ -1,0 +1,165 @@
+"""Pages from elsewhere neither see what a live page shows nor press its buttons."""
+
+import base64
+import os
+import queue
+import socket
+import time
+from importlib.metadata import version
+
+import msgspec
+import pytest
+import zstandard
+from websockets.exceptions import ConnectionClosed
+from websockets.frames import OP_BINARY, Frame
+from websockets.sync.client import connect
+
+from lidarpool.live.page import live_page
+from lidarpool.live.visitors import may_connect
+
+STRANGERS = [
+    "http://example.com",
+    "https://localhost.example.com:8080",  # rebound to 127.0.0.1 by its own DNS server
+    "https://127.0.0.1.example.com",
+    "http://192.168.0.2:8080",
+    "http://0.0.0.0:8080",
+    "file://",
+    "chrome-extension://localhost",
+    "null",
+    "http://[::1",
+    "",
+]
+OWN = ["http://127.0.0.1:8080", "http://localhost:18080", "https://LOCALHOST", "http://[::1]:80"]
+PROTOCOL = f"viser-v{version('viser')}"
+CAMERA = {
+    "type": "ViewerCameraMessage",
+    "wxyz": [1.0, 0.0, 0.0, 0.0],
+    "position": [0.0, 0.0, 1.0],
+    "fov": 1.0,
+    "near": 0.1,
+    "far": 10.0,
+    "image_height": 10,
+    "image_width": 10,
+    "look_at": [0.0, 0.0, 0.0],
+    "up_direction": [0.0, 0.0, 1.0],
+}
+
+
+@pytest.fixture
+def served():
+    """Return a page with a button, the messages that press it, and how often it was pressed."""
+    pressed = queue.Queue()
+    with live_page("a page", port=0) as page:
+        page.gui.add_html("a secret")
+        button = page.gui.add_button("Stop")
+        button.on_click(pressed.put)
+        press = {"type": "GuiUpdateMessage", "uuid": button._impl.uuid, "updates": {"value": True}}
+        yield page, [msgspec.msgpack.encode(message) for message in (CAMERA, press)], pressed
+
+
+def visit(page, origin, messages=()):
+    """Connect, say something, and return what was said before the connection was closed."""
+    url = page.url.replace("http", "ws", 1)
+    with connect(url, origin=origin, subprotocols=[PROTOCOL], max_size=None) as visitor:
+        said = []
+        try:
+            for message in messages:
+                visitor.send(message)
+            while True:
+                said.append(visitor.recv(timeout=1.0))
+        except TimeoutError:  # it has said all it has to say
+            return said, None
+        except ConnectionClosed as closed:
+            return said, closed.rcvd.code
+
+
+@pytest.mark.parametrize("origin", STRANGERS)
+def test_strangers(origin):
+    assert not may_connect([origin])
+    assert not may_connect([OWN[0], origin])
+
+
+@pytest.mark.parametrize("origin", OWN)
+def test_pages_of_this_machine(origin):
+    assert may_connect([origin])
+
+
+@pytest.mark.parametrize("origin", [OWN[1], None], ids=["own", "no browser"])
+def test_whoever_is_of_this_machine_sees_the_page_and_may_press(served, origin):
+    page, messages, pressed = served
+    said, closed = visit(page, origin, messages)
+    assert any(b"a secret" in text for text in map(unpacked, said))
+    assert closed is None
+    pressed.get(timeout=30)
+
+
+@pytest.mark.parametrize("origin", ["http://example.com:8080", "null"])
+def test_a_stranger_sees_nothing_and_presses_nothing(served, origin, caplog):
+    page, messages, pressed = served
+    for _ in range(3):
+        assert visit(page, origin, messages) == ([], 1008)
+    settle(page)
+    assert pressed.empty()
+    assert page.get_clients() == {}
+    assert [record.getMessage() for record in caplog.records] == [
+        f"a page of {origin!r} wanted to connect to the live view: refused"
+    ]
+
+
+def test_what_comes_with_the_first_bytes_is_not_taken_either(served):
+    """A message that lies in wait when the connection is made is not closed away."""
+    page, messages, pressed = served
+    with socket.create_connection(("127.0.0.1", page.get_port())) as stranger:
+        head = (
+            f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{page.get_port()}\r\nUpgrade: websocket\r\n"
+            f"Connection: Upgrade\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: "
+            f"{base64.b64encode(os.urandom(16)).decode()}\r\nSec-WebSocket-Protocol: {PROTOCOL}"
+            "\r\nOrigin: http://example.com\r\n\r\n"
+        )
+        frames = [Frame(OP_BINARY, message).serialize(mask=True) for message in messages]
+        stranger.sendall(b"".join([head.encode(), *frames]))
+        stranger.settimeout(30)
+        answer = b""
+        while b"may connect" not in answer:  # the reason, in the frame that closes
+            piece = stranger.recv(1 << 16)
+            assert piece, answer
+            answer += piece
+    assert b"101 Switching Protocols" in answer
+    assert b"a secret" not in answer
+    settle(page)
+    assert pressed.empty()
+
+
+def test_a_page_is_served_to_many_after_a_stranger_was_sent_away(served):
+    page, messages, pressed = served
+    visit(page, "http://example.com", messages)
+    for _ in range(2):
+        visit(page, OWN[0], messages)
+        pressed.get(timeout=30)
+    assert pressed.empty()
+
+
+def test_of_two_origins_each_must_be_of_this_machine(served):
+    page, *_ = served
+    url = page.url.replace("http", "ws", 1)
+    other = [("Origin", "http://example.com")]
+    with (
+        connect(url, origin=OWN[0], additional_headers=other, subprotocols=[PROTOCOL]) as visitor,
+        pytest.raises(ConnectionClosed, match="1008"),
+    ):
+        visitor.recv(timeout=30)
+
+
+def settle(page):
+    """Wait until the server has forgotten all that were connected."""
+    server = page._websock_server
+    deadline = time.monotonic() + 30
+    while server._live_connections or server._client_state_from_id:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def unpacked(data):
+    """Messages of a window as they were before they were compressed."""
+    packed = int.from_bytes(data[8:16], "little")
+    return zstandard.ZstdDecompressor().decompress(data[16 : 16 + packed])
