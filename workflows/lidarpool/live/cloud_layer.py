@@ -53,6 +53,7 @@ class CloudLayer:
 
         @self._shown.on_update
         def _show(_: Any) -> None:
+            self._legend.visible = self._shown.value
             if self._node is not None:
                 self._node.visible = self._shown.value
 
@@ -72,7 +73,8 @@ class CloudLayer:
         self._legend.content = legend.html
         if not len(rows):
             if self._node is not None:
-                self._node.visible = False
+                self._node.remove()
+                self._node = None
             return
         self._share = min(MOST_SHARE, SHARE_OF_MANY / len(rows) ** 0.5)
         positions = np.ascontiguousarray(rows["position"])

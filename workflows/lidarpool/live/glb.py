@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,9 @@ _LINEAR = np.round(
 ).astype(np.uint8)
 
 
-def coloured_triangles(corners: NDArray[np.float32], colours: NDArray[np.uint8]) -> bytes:
+def coloured_triangles(
+    corners: NDArray[np.float32], colours: NDArray[np.uint8], two_sided: int | None = None
+) -> bytes:
     """Write triangles, each of one colour, as a binary glTF file (glTF 2.0, Khronos 2017).
 
     Parameters
@@ -29,9 +32,14 @@ def coloured_triangles(corners: NDArray[np.float32], colours: NDArray[np.uint8])
         float32 (f, 3, 3), f >= 1, finite.
     colours
         uint8 (f, 3), as on a screen.
+    two_sided
+        How many of them, from the first, are seen from both sides; the others are seen from
+        where their corners run anticlockwise. All by default.
     """
     count = 3 * len(corners)
     flat = corners.reshape(-1, 3)
+    split = count if two_sided is None else 3 * two_sided
+    parts = [(first, end) for first, end in ((0, split), (split, count)) if first < end]
     rgba = np.full((count, 4), 255, np.uint8)  # four bytes each, as the format has them aligned
     rgba[:, :3] = np.repeat(_LINEAR[colours], 3, axis=0)
     places, paints = np.ascontiguousarray(flat, "<f4").tobytes(), rgba.tobytes()
@@ -40,29 +48,26 @@ def coloured_triangles(corners: NDArray[np.float32], colours: NDArray[np.uint8])
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "COLOR_0": 1}, "material": 0}]}],
-        "materials": [
+        "meshes": [
             {
-                "doubleSided": True,
-                "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.9},
+                "primitives": [
+                    {
+                        "attributes": {"POSITION": 2 * part, "COLOR_0": 2 * part + 1},
+                        "material": part,
+                    }
+                    for part in range(len(parts))
+                ]
             }
         ],
+        "materials": [
+            {
+                "doubleSided": first < split,
+                "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.9},
+            }
+            for first, _ in parts
+        ],
         "accessors": [
-            {
-                "bufferView": 0,
-                "componentType": _FLOAT,
-                "count": count,
-                "type": "VEC3",
-                "min": flat.min(axis=0).tolist(),
-                "max": flat.max(axis=0).tolist(),
-            },
-            {
-                "bufferView": 1,
-                "componentType": _BYTE,
-                "normalized": True,
-                "count": count,
-                "type": "VEC4",
-            },
+            accessor for first, end in parts for accessor in _accessors(flat[first:end], first)
         ],
         "bufferViews": [
             {"buffer": 0, "byteLength": len(places)},
@@ -83,3 +88,25 @@ def coloured_triangles(corners: NDArray[np.float32], colours: NDArray[np.uint8])
             paints,
         )
     )
+
+
+def _accessors(corners: NDArray[np.float32], first: int) -> list[dict[str, Any]]:
+    """Describe places and colours of corners (n, 3), n >= 1, that begin with the `first`."""
+    places = {
+        "bufferView": 0,
+        "byteOffset": 12 * first,
+        "componentType": _FLOAT,
+        "count": len(corners),
+        "type": "VEC3",
+        "min": corners.min(axis=0).tolist(),
+        "max": corners.max(axis=0).tolist(),
+    }
+    paints = {
+        "bufferView": 1,
+        "byteOffset": 4 * first,
+        "componentType": _BYTE,
+        "normalized": True,
+        "count": len(corners),
+        "type": "VEC4",
+    }
+    return [places, paints]

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,10 +10,13 @@ from numpy.typing import NDArray
 
 from ..deliveries import Deliveries
 from ..job import Job
-from ..plan import best
+from ..plan import Planning, best
 from ..scan import Frame
+from ..scene import Scene
 from .cloud_layer import CloudLayer
 from .colouring import QUANTITIES
+from .due_parts import DueParts, Part
+from .height_cut import HeightCut
 from .latest import Latest
 from .live_points import LivePoints
 from .page import LivePage, grid_step
@@ -44,16 +46,22 @@ class RunScene:
         self.frames: Latest[Frame] = Latest()
         self.points = LivePoints(job.survey)
         self.displayed = 0  # points
-        bounds = _bounds(job)
+        poses = np.array([pose.position for pose in job.survey.poses])
+        bounds = scene_bounds(job.scene, poses, job.planning)
         self._level = float(bounds[0, 2])
         self.size_m = float(np.linalg.norm(bounds[1] - bounds[0]))
         page.frame_scene(bounds)
-        self._cloud = CloudLayer(page, job.scene.names, QUANTITIES, self.size_m, on_change)
-        self._scene = SceneLayer(page, job.scene)
+        self._parts = DueParts()
+
+        def change(event: Any) -> None:
+            self._parts.hurry()
+            on_change(event)
+
+        self._cut = HeightCut(page, bounds, float(job.scene.origin[2]), change)
+        self._cloud = CloudLayer(page, job.scene.names, QUANTITIES, self.size_m, change)
+        self._scene = SceneLayer(page, job.scene, poses, self._cut, change)
         self._sensor = SensorLayer(page, self.size_m)
         page.add_page_controls(grid_step(self.size_m))
-        self._drawn: dict[str, Hashable] = {}  # {part: what it was like when it was drawn}
-        self._due_at: dict[str, float] = {}
 
     def draw(self, kept: Deliveries, final: bool) -> bool:
         """Draw what is due, or all that has changed; returns whether something is left.
@@ -63,35 +71,37 @@ class RunScene:
         kept
             What has been delivered; another thread adds to it meanwhile.
         """
+        cut = self._cut.height
         if (frame := self.frames.take()) is not None:
-            self._sensor.draw(frame)
+            self._sensor.place(frame.pose.position)
+            self._sensor.draw_latest(frame.pose.position, frame.samples, cut)
         totals = kept.totals
-        parts: tuple[tuple[str, Hashable, float, Callable[[], None]], ...] = (
-            ("cloud", (self.points.seen, self._cloud.quantity), CLOUD_EVERY_S, self._draw_cloud),
-            ("scene", (totals.hits,), SCENE_EVERY_S, lambda: self._scene.draw(totals.hit_counts)),
-            (
-                "rays",
-                (totals.frames,),
-                RAYS_EVERY_S,
-                lambda: self._sensor.draw_earlier(totals.sample_rays),
+        parts = (
+            Part(
+                "cloud",
+                (self.points.seen, self._cloud.quantity, cut),
+                CLOUD_EVERY_S,
+                self._draw_cloud,
             ),
-            ("path", (self._planned(kept),), 0.0, lambda: self._draw_path(kept)),
+            Part(
+                "scene",
+                (totals.hits, self._scene.state),
+                SCENE_EVERY_S,
+                lambda: self._scene.draw(totals.hit_counts),
+            ),
+            Part(
+                "rays",
+                (totals.frames, cut),
+                RAYS_EVERY_S,
+                lambda: self._sensor.draw_earlier(totals.sample_rays, cut),
+            ),
+            Part("path", self._planned(kept), 0.0, lambda: self._draw_path(kept)),
         )
-        left = False
-        for name, state, every_s, draw in parts:
-            if self._drawn.get(name) == state:
-                continue
-            now = time.monotonic()
-            if now < self._due_at.get(name, now) and not final:
-                left = True
-                continue
-            draw()
-            self._drawn[name] = state
-            self._due_at[name] = time.monotonic() + every_s
-        return left
+        left = self._parts.draw(parts, final)
+        return self._scene.settle() or left
 
     def _draw_cloud(self) -> None:
-        rows = self.points.rows
+        rows = self._cut.below(self.points.rows)
         self.displayed = len(rows)
         self._cloud.draw(rows)
 
@@ -107,16 +117,14 @@ class RunScene:
         add_route(self._page, plan.path, self._level, self.size_m)
 
 
-def _bounds(job: Job) -> NDArray[np.float64]:
-    """Box (2, 3) that holds the scene, the sensor and both ends of the path, local."""
-    places = [
-        job.scene.vertices.min(axis=0),
-        job.scene.vertices.max(axis=0),
-        *(np.array(pose.position) for pose in job.survey.poses),
-    ]
+def scene_bounds(
+    scene: Scene, poses: NDArray[np.float64], planning: Planning | None
+) -> NDArray[np.float64]:
+    """Box (2, 3) that holds the scene, the sensors at (p, 3) and both ends of the path, local."""
+    places = [scene.vertices.min(axis=0), scene.vertices.max(axis=0), *poses]
     low, high = np.min(places, axis=0), np.max(places, axis=0)
-    if job.planning is not None:
-        ends = np.array([job.planning.start, job.planning.target])
+    if planning is not None:
+        ends = np.array([planning.start, planning.target])
         low[:2] = np.minimum(low[:2], ends.min(axis=0))
         high[:2] = np.maximum(high[:2], ends.max(axis=0))
     return np.stack([low, high])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Hashable
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -9,17 +11,24 @@ from numpy.typing import NDArray
 
 from ..scene import Scene
 from ..view.intensity_picture import density_range
+from .clipping import triangles_below
 from .colouring import TURBO, ColourBar
 from .glb import coloured_triangles
+from .height_cut import HeightCut
+from .inside import InsideView
+from .mesh_node import MeshNode
 from .page import LivePage
 from .surface import DisplaySurface
 
 TITLE = "hits per square metre; grey: none"
 _UNSEEN = np.array([186, 190, 196], np.float64)
 
+Corners = NDArray[np.float32]
+Ints = NDArray[np.int64]
+
 
 class SceneLayer:
-    """The scene's surface, a colour bar, and a switch to hide it.
+    """The scene's surface, a colour bar, and switches for it and for its near walls.
 
     Parameters
     ----------
@@ -27,36 +36,117 @@ class SceneLayer:
         Where it is shown.
     scene
         The scene.
+    poses
+        (p, 3) where the sensors stand, metres, local.
+    cut
+        Above which nothing is shown; if the sensors are under a roof, it is set below that.
+    on_change
+        Called when something else is to be shown; `draw` shows it.
     """
 
-    def __init__(self, page: LivePage, scene: Scene) -> None:
-        self._page, self._scene = page, scene
-        self._surface: DisplaySurface | None = None
-        self._node: Any = None
+    def __init__(
+        self,
+        page: LivePage,
+        scene: Scene,
+        poses: NDArray[np.float64],
+        cut: HeightCut,
+        on_change: Callable[[Any], None],
+    ) -> None:
+        self._scene, self._poses, self._cut = scene, poses, cut
+        self._node = MeshNode(page, "/scene")
+        self._shape: tuple[Hashable, Corners, Ints, int] | None = None
         with page.gui.add_folder("scene"):
             self._shown = page.gui.add_checkbox("show", initial_value=True)
+            self._near = page.gui.add_checkbox(
+                "near walls",
+                initial_value=False,
+                visible=False,
+                hint="Walls and roofs between you and the sensors.",
+            )
             self._legend = page.gui.add_html("")
+        self._near.on_update(on_change)
 
         @self._shown.on_update
         def _show(_: Any) -> None:
-            if self._node is not None:
-                self._node.visible = self._shown.value
+            self._node.visible = self._legend.visible = self._shown.value
+
+        # Of millions of triangles it takes seconds, which the rest of the page need not wait for.
+        executor = ThreadPoolExecutor(1, thread_name_prefix="lidarpool-live")
+        self._prepared: Future[tuple[DisplaySurface, InsideView]] = executor.submit(self._prepare)
+        self._prepared.add_done_callback(on_change)
+        executor.shutdown(wait=False)
+
+    @property
+    def state(self) -> Hashable:
+        """What `draw` depends on, beside the hits."""
+        return self._prepared.done(), self._cut.height, self._near.value
 
     def draw(self, hit_counts: NDArray[np.int64]) -> None:
-        """Show the hits (f,) of each triangle so far."""
-        if self._surface is None:  # of millions of triangles it takes seconds
-            self._surface = DisplaySurface(self._scene)
-        density, hit = self._surface.density(hit_counts)
+        """Show the hits (f,) of each triangle so far, as soon as there is something to show.
+
+        Raises
+        ------
+        Exception
+            If the scene could not be made ready.
+        """
+        if not self._prepared.done():
+            return
+        surface, _ = self._prepared.result()
+        density, hit = surface.density(hit_counts)
         limits = density_range(density)
-        data = coloured_triangles(self._surface.corners, intensity_colours(density, hit, limits))
-        if self._node is None:
-            self._node = self._page.scene.add_glb(
-                "/scene", data, cast_shadow=False, receive_shadow=False, visible=self._shown.value
-            )
+        key, corners, source, two_sided = self._shape_now()
+        if len(corners):
+            colours = intensity_colours(density, hit, limits)[source]
+            self._node.show(coloured_triangles(corners, colours, two_sided), key)
         else:
-            self._node.glb_data = data
+            self._node.clear()
         if density.any():
             self._legend.content = ColourBar(TITLE, *limits, logarithmic=True).html
+
+    def settle(self) -> bool:
+        """Clear up after `draw`; returns whether there is more to be cleared up later."""
+        return self._node.settle()
+
+    def _prepare(self) -> tuple[DisplaySurface, InsideView]:
+        surface = DisplaySurface(self._scene)
+        inside = InsideView.of(surface.coarse, self._poses)
+        if inside.ceiling is not None:
+            self._cut.propose(inside.ceiling)
+        self._near.visible = bool(inside.shell.any())
+        return surface, inside
+
+    def _shape_now(self) -> tuple[Hashable, Corners, Ints, int]:
+        """Triangles to show.
+
+        Returns
+        -------
+        key
+            What they depend on.
+        corners
+            (n, 3, 3).
+        source
+            (n,): which triangle of the surface each is of.
+        two_sided
+            How many of them, from the first, are seen from both sides.
+        """
+        height = self._cut.height
+        key = height, self._near.value
+        if self._shape is not None and self._shape[0] == key:
+            return self._shape
+        surface, inside = self._prepared.result()
+        corners, source = surface.corners, np.arange(len(surface.corners))
+        shell = inside.shell & (not self._near.value)
+        turned = shell & inside.turned
+        corners = np.where(turned[:, None, None], corners[:, ::-1], corners)
+        order = np.argsort(shell, kind="stable")
+        corners, source = corners[order], source[order]
+        if height is not None:
+            corners, kept = triangles_below(corners, height)
+            kept_order = np.argsort(kept, kind="stable")
+            corners, source = corners[kept_order], source[kept[kept_order]]
+        two_sided = int((~shell[source]).sum())
+        self._shape = key, corners, source, two_sided
+        return self._shape
 
 
 def intensity_colours(

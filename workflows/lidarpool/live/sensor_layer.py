@@ -1,17 +1,21 @@
-"""The sensor on a page, and some of its rays."""
+"""The sensor on a page, where else it stands, and some of its rays."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+import trimesh
+from numpy.typing import ArrayLike, NDArray
 
-from ..scan import Frame
+from .clipping import lines_below
 from .page import LivePage
 
 _RED = (224, 24, 45)
 _EARLIER = (232, 140, 150)
+_RADIUS = 0.009  # of the ball, as a share of the scene's diagonal
+_SMALL = 0.6  # of that have the balls where the sensor stands at other times
+MOST_POSES = 1000  # that have a ball
 
 
 class SensorLayer:
@@ -26,9 +30,9 @@ class SensorLayer:
     """
 
     def __init__(self, page: LivePage, size_m: float) -> None:
-        self._page = page
+        self._page, self._radius = page, _RADIUS * size_m
         self._ball = page.scene.add_icosphere(
-            "/sensor", 0.009 * size_m, _RED, visible=False, cast_shadow=False
+            "/sensor", self._radius, _RED, visible=False, cast_shadow=False
         )
         page.scene.add_label("/sensor/label", "sensor", anchor="bottom-left")
         self._rays: dict[str, Any] = {}  # {name: node}; viser shows no empty ones
@@ -40,24 +44,53 @@ class SensorLayer:
             for node in self._rays.values():
                 node.visible = self._shown.value
 
-    def draw(self, frame: Frame) -> None:
-        """Show the sensor and the rays of a frame."""
-        place = np.asarray(frame.pose.position, np.float32)
-        self._ball.position = place
+    def place(self, position: ArrayLike) -> None:
+        """Show the sensor at a position, (3,) metres."""
+        self._ball.position = np.asarray(position, np.float64)
         self._ball.visible = True
-        starts = np.broadcast_to(place, frame.samples.shape)
-        self._draw_rays("latest", np.stack([starts, frame.samples], axis=1), _RED, 1.6)
 
-    def draw_earlier(self, rays: NDArray[np.float32]) -> None:
-        """Show rays (n, 2, 3) of all frames so far."""
-        self._draw_rays("earlier", rays, _EARLIER, 1.0)
+    def draw_poses(self, positions: NDArray[np.float64]) -> None:
+        """Show small balls at positions (p, 3) in metres, or at some where they are many."""
+        count = min(len(positions), MOST_POSES)
+        some = positions[np.linspace(0, len(positions) - 1, count).astype(np.int64)]
+        ball = trimesh.creation.icosphere(subdivisions=2, radius=_SMALL * self._radius)
+        self._page.scene.add_batched_meshes_simple(
+            "/poses",
+            ball.vertices,
+            ball.faces,
+            batched_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
+            batched_positions=some,
+            batched_colors=_RED,
+            lod="off",
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+
+    def draw_latest(
+        self, position: ArrayLike, ends: NDArray[np.float32], cut: float | None
+    ) -> None:
+        """Show rays from a position, (3,), to ends (n, 3), below the height `cut`, metres."""
+        starts = np.broadcast_to(np.asarray(position, np.float32), ends.shape)
+        self._draw_rays("latest", np.stack([starts, ends], axis=1), cut, _RED, 1.6)
+
+    def draw_earlier(self, rays: NDArray[np.float32], cut: float | None) -> None:
+        """Show rays (n, 2, 3) of other times, below the height `cut`, metres."""
+        self._draw_rays("earlier", rays, cut, _EARLIER, 1.0)
 
     def _draw_rays(
-        self, name: str, rays: NDArray[np.float32], colour: tuple[int, int, int], width: float
+        self,
+        name: str,
+        rays: NDArray[np.float32],
+        cut: float | None,
+        colour: tuple[int, int, int],
+        width: float,
     ) -> None:
+        if cut is not None:
+            rays = lines_below(rays, cut)
         if not len(rays):
-            return
-        if name in self._rays:
+            if name in self._rays:
+                self._rays.pop(name).remove()
+        elif name in self._rays:
             self._rays[name].points = rays
         else:
             self._rays[name] = self._page.scene.add_line_segments(

@@ -88,10 +88,16 @@ def _clustered(scene: Scene, cell: float) -> tuple[Scene, NDArray[np.int64]]:
     middles = np.stack([np.bincount(vertex, v, count) / size for v in scene.vertices.T], axis=1)
     faces = vertex[scene.faces]
     a, b, c = faces.T
-    faces = faces[(a != b) & (b != c) & (c != a)]
-    if not len(faces):  # all within one cell: something must be shown
-        faces = np.zeros((1, 3), np.int64)
-    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
-    faces = faces[np.sort(first)]
-    owners = np.zeros(len(faces), np.int32)
-    return Scene(middles, faces.astype(np.int32), owners, ("all",), scene.origin), vertex
+    kept = np.flatnonzero((a != b) & (b != c) & (c != a))
+    if not len(kept):  # all within one cell: something must be shown
+        kept = np.zeros(1, np.int64)
+    _, first = np.unique(np.sort(faces[kept], axis=1), axis=0, return_index=True)
+    kept = kept[np.sort(first)]
+    coarse = Scene(
+        middles,
+        faces[kept].astype(np.int32),
+        scene.face_object[kept],
+        scene.names,
+        scene.origin,
+    )
+    return coarse, vertex

@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+from html import escape
 from pathlib import Path
 from typing import Any
 
 import click
 import numpy as np
+from numpy.typing import NDArray
 
+from ..picture_file import Pictured
 from .cloud_layer import CloudLayer
 from .colouring import QUANTITIES
+from .due_parts import DueParts, Part
+from .height_cut import HeightCut
 from .page import LivePage, grid_step, live_page, open_browser
 from .painter import Painter
 from .result_file import ResultFile
-from .route import add_route
+from .route import add_discs, add_route
+from .run_scene import scene_bounds
+from .scene_layer import SceneLayer
+from .sensor_layer import SensorLayer
 
 VIEW_POINTS = 500_000  # in the browser at a time
 DRAW_EVERY_S = 0.1
@@ -33,20 +41,27 @@ class ResultView:
     """
 
     def __init__(self, page: LivePage, file: ResultFile, most: int = VIEW_POINTS) -> None:
-        self._file, self._most = file, most
+        self._page, self._file, self._most = page, file, most
         self.painter = Painter(self._draw, DRAW_EVERY_S)
-        whole, _ = file.choose(*file.scans, 100_000)
-        bounds = _bounds(whole["position"])
-        size = float(np.linalg.norm(bounds[1] - bounds[0])) or 1.0
+        self._parts = DueParts()
+        bounds = _bounds(file)
+        self._level = float(bounds[0, 2])
+        self._size_m = float(np.linalg.norm(bounds[1] - bounds[0])) or 1.0
         page.frame_scene(bounds)
         self._facts = page.gui.add_html("")
         self._scans = self._add_slider(page)
+        ask = self.painter.ask
+        self._cut = HeightCut(page, bounds, float(file.origin[2]), ask)
         known = [q for q in QUANTITIES if q != "range" or file.has_ranges]
-        self._layer = CloudLayer(page, file.names, known, size, self.painter.ask)
+        self._cloud = CloudLayer(page, file.names, known, self._size_m, ask)
+        self._scene: SceneLayer | None = None
+        self._sensor: SensorLayer | None = None
+        if file.pictured is not None:
+            self._add_pictured(file.pictured)
         if len(file.route):
-            add_route(page, file.route - file.origin[:2], float(bounds[0, 2]), size)
-        page.add_page_controls(grid_step(size))
-        self.painter.ask()
+            add_route(page, file.route - file.origin[:2], self._level, self._size_m)
+        page.add_page_controls(grid_step(self._size_m))
+        ask()
 
     def _add_slider(self, page: LivePage) -> Any:
         first, last = self._file.scans
@@ -56,17 +71,44 @@ class ResultView:
         slider.on_update(self.painter.ask)
         return slider
 
-    def _draw(self) -> None:
-        first, last = self._scans.value if self._scans else self._file.scans
+    def _add_pictured(self, pictured: Pictured) -> None:
+        poses = pictured.poses - pictured.scene.origin
+        self._scene = SceneLayer(self._page, pictured.scene, poses, self._cut, self.painter.ask)
+        self._sensor = SensorLayer(self._page, self._size_m)
+        self._sensor.draw_poses(poses)
+        if (planning := pictured.planning) is not None:
+            add_discs(self._page, planning.centres, planning.radii, self._level, self._size_m)
+
+    def _draw(self) -> bool:
+        """Draw what has changed; returns whether something was left for later."""
+        scans = self._scans.value if self._scans else self._file.scans
+        cut, quantity = self._cut.height, self._cloud.quantity
+        parts = [Part("cloud", (scans, cut, quantity), 0.0, lambda: self._draw_cloud(*scans))]
+        scene, sensor, pictured = self._scene, self._sensor, self._file.pictured
+        if scene is not None and sensor is not None and pictured is not None:
+            rays, hits = pictured.sample_rays, pictured.hit_counts
+            parts += [
+                Part("sensor", scans[1], 0.0, lambda: self._place(sensor, scans[1])),
+                Part("rays", cut, 0.0, lambda: sensor.draw_earlier(rays, cut)),
+                Part("scene", scene.state, 0.0, lambda: scene.draw(hits)),
+            ]
+        self._parts.draw(parts)
+        return scene is not None and scene.settle()
+
+    def _draw_cloud(self, first: int, last: int) -> None:
         rows, count = self._file.choose(first, last, self._most)
-        self._layer.draw(rows)
+        self._cloud.draw(self._cut.below(rows))
         shown = "all shown" if len(rows) == count else f"{len(rows):,} shown"
-        away = self._file.origin
-        moved = f"<br>relative to {away[0]:.0f}, {away[1]:.0f}, {away[2]:.0f}" if away.any() else ""
-        self._facts.content = (
-            '<div style="padding:0 0.8em">'
-            f"{count:,} of {len(self._file):,} points, {shown}{moved}</div>"
-        )
+        lines = [f"{count:,} of {len(self._file):,} points, {shown}"]
+        if (away := self._file.origin).any():
+            lines.append("relative to " + ", ".join(f"{metres:.0f}" for metres in away) + " m")
+        if self._file.note:
+            lines.append(escape(self._file.note))
+        self._facts.content = f'<div style="padding:0 0.8em">{"<br>".join(lines)}</div>'
+
+    def _place(self, sensor: SensorLayer, scan: int) -> None:
+        if (position := self._file.sensor_at(scan)) is not None:
+            sensor.place(position)
 
 
 def view_result(path: Path, *, port: int, browser: bool = True) -> None:
@@ -87,6 +129,8 @@ def view_result(path: Path, *, port: int, browser: bool = True) -> None:
         If there is no cloud, or it is damaged.
     """
     file = ResultFile(path)
+    if file.note:
+        click.echo(f"note: {file.note}", err=True)
     with live_page(f"lidarpool: {file.path.parent.name or file.path.name}", port) as page:
         view = ResultView(page, file)
         click.echo(f"{page.url} shows {len(file):,} points; Ctrl-C ends it", err=True)
@@ -98,8 +142,13 @@ def view_result(path: Path, *, port: int, browser: bool = True) -> None:
             return
 
 
-def _bounds(positions: np.ndarray) -> np.ndarray:
-    """Box (2, 3) that holds nearly all positions (n, 3): few strays do not count."""
+def _bounds(file: ResultFile) -> NDArray[np.float64]:
+    """Box (2, 3) of what there is to see, displayed positions."""
+    if (pictured := file.pictured) is not None:
+        poses = pictured.poses - pictured.scene.origin
+        return scene_bounds(pictured.scene, poses, pictured.planning)
+    positions = file.choose(*file.scans, 100_000)[0]["position"]
     if not len(positions):
         return np.array([[-1.0, -1.0, 0.0], [1.0, 1.0, 1.0]])
+    # Nearly all positions: few strays do not count.
     return np.percentile(positions, [0.5, 99.5], axis=0).astype(np.float64)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..scene import Scene
 from .surface import Surface
 
 Floats = NDArray[np.float64]
@@ -15,6 +16,46 @@ Ints = NDArray[np.int64]
 MAX_LAYERS = 12  # walls have two faces, roofs have beams; more than this is no wall
 ENCLOSED = 0.7  # of the level rays from the sensors end in the scene: they stand indoors
 HIDDEN = 0.65  # less than this of what the sensors see is seen by the camera
+
+
+@dataclass(frozen=True, eq=False)
+class Shell:
+    """Walls and roofs: the outer shells of the objects that surround the sensors.
+
+    Parameters
+    ----------
+    scene
+        The triangles.
+    surrounds
+        bool (objects,): whether the sensors are within it, seen from above.
+    core
+        (objects, 2, 3) box inside each object's shell.
+    """
+
+    scene: Scene
+    surrounds: NDArray[np.bool_]
+    core: Floats
+
+    @classmethod
+    def around(cls, scene: Scene, sensors: Floats) -> Shell:
+        """Return the shell around sensors at (p, 3)."""
+        box = scene.object_bounds
+        flat = sensors[:, None, :2]
+        inside = ((flat > box[None, :, 0, :2]) & (flat < box[None, :, 1, :2])).all(axis=2)
+        core = box.copy()
+        width = np.where(np.isfinite(box).all(axis=1), box[:, 1] - box[:, 0], 0.0)
+        core[:, 0, :2] += 0.06 * width[:, :2]
+        core[:, 1, :2] -= 0.06 * width[:, :2]
+        # The roof and what hangs from it: all above the middle between sensors and top.
+        core[:, 1, 2] = (core[:, 1, 2] + sensors[:, 2].max()) / 2
+        return cls(scene, inside.mean(axis=0) >= 0.5, core)
+
+    def holds(self, points: Floats, triangle: Ints) -> NDArray[np.bool_]:
+        """Whether points (n, 3) on triangles (n,) are of it."""
+        owner = self.scene.face_object[triangle]
+        low, high = self.core[owner, 0], self.core[owner, 1]
+        beside = (points[:, :2] < low[:, :2]) | (points[:, :2] > high[:, :2])
+        return self.surrounds[owner] & (beside.any(axis=1) | (points[:, 2] > high[:, 2]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,33 +75,24 @@ class Cutaway:
         (p, 3) metres.
     eye
         (3,) the camera.
-    surrounds
-        bool (objects,).
-    core
-        (objects, 2, 3) box inside each object's shell.
+    shell
+        What may be taken away.
     """
 
     surface: Surface
     sensors: Floats
     eye: Floats
-    surrounds: NDArray[np.bool_]
-    core: Floats
+    shell: Shell
 
     def removes(self, points: Floats, triangle: Ints) -> NDArray[np.bool_]:
         """Whether the hits at points (n, 3) on triangles (n,) are taken away."""
-        owner = self.surface.scene.face_object[triangle]
-        out = self.surrounds[owner]
+        out = self.shell.holds(points, triangle)
         which = np.flatnonzero(out)
-        points, owner = points[which], owner[which]
-        low, high = self.core[owner, 0], self.core[owner, 1]
-        beside = (points[:, :2] < low[:, :2]) | (points[:, :2] > high[:, :2])
-        shell = beside.any(axis=1) | (points[:, 2] > high[:, 2])
         normal = self.surface.face_normals[triangle[which]]
-        height = (normal * points).sum(axis=1)
+        height = (normal * points[which]).sum(axis=1)
         eye_above = normal @ self.eye > height
         sensor_above = normal @ self.sensors.T > height[:, None]
-        opposite = (sensor_above != eye_above[:, None]).mean(axis=1) >= 0.5
-        out[which] = shell & opposite
+        out[which] = (sensor_above != eye_above[:, None]).mean(axis=1) >= 0.5
         return out
 
 
@@ -71,11 +103,10 @@ def plan_cutaway(surface: Surface, poses: Floats, eye: Floats) -> Cutaway | None
     """
     if not len(poses):
         return None
-    sensors = poses[np.linspace(0, len(poses) - 1, min(len(poses), 8)).astype(int)]
-    level = surface.caster.cast(*_probes(sensors, 128, 0.0, 15.0))
-    if np.isfinite(level.distance).mean() < ENCLOSED:
+    sensors = some_of(poses)
+    if not enclosed(surface, sensors):
         return None
-    origins, directions = _probes(sensors, 512, -60.0, 30.0)
+    origins, directions = probes(sensors, 512, -60.0, 30.0)
     seen = surface.caster.cast(origins, directions).distance
     hit = np.isfinite(seen)
     points = origins[hit] + seen[hit, None] * directions[hit]
@@ -84,7 +115,18 @@ def plan_cutaway(surface: Surface, poses: Floats, eye: Floats) -> Cutaway | None
     nearest = surface.caster.cast(eye, offset / distance[:, None]).distance
     if (nearest >= distance * (1 - 1e-3)).mean() >= HIDDEN:
         return None
-    return Cutaway(surface, sensors, eye, *_shells(surface, sensors))
+    return Cutaway(surface, sensors, eye, Shell.around(surface.scene, sensors))
+
+
+def some_of(poses: Floats) -> Floats:
+    """Return a few of the poses (p, 3), p >= 1, from the first to the last."""
+    return poses[np.linspace(0, len(poses) - 1, min(len(poses), 8)).astype(int)]
+
+
+def enclosed(surface: Surface, sensors: Floats) -> bool:
+    """Whether most level rays from sensors at (p, 3) end in the scene."""
+    level = surface.caster.cast(*probes(sensors, 128, 0.0, 15.0))
+    return bool(np.isfinite(level.distance).mean() >= ENCLOSED)
 
 
 def cast_through(
@@ -132,22 +174,11 @@ def blocked(
     return met
 
 
-def _shells(surface: Surface, sensors: Floats) -> tuple[NDArray[np.bool_], Floats]:
-    """For each object: whether it surrounds the sensors, and the box inside its shell."""
-    box = surface.scene.object_bounds
-    flat = sensors[:, None, :2]
-    inside = ((flat > box[None, :, 0, :2]) & (flat < box[None, :, 1, :2])).all(axis=2)
-    core = box.copy()
-    width = np.where(np.isfinite(box).all(axis=1), box[:, 1] - box[:, 0], 0.0)
-    core[:, 0, :2] += 0.06 * width[:, :2]
-    core[:, 1, :2] -= 0.06 * width[:, :2]
-    # The roof and what hangs from it: all above the middle between sensors and top.
-    core[:, 1, 2] = (core[:, 1, 2] + sensors[:, 2].max()) / 2
-    return inside.mean(axis=0) >= 0.5, core
+def probes(sensors: Floats, count: int, low_deg: float, high_deg: float) -> tuple[Floats, Floats]:
+    """Origins and directions of `count` rays from each sensor, between two elevations.
 
-
-def _probes(sensors: Floats, count: int, low_deg: float, high_deg: float) -> tuple[Floats, Floats]:
-    """Origins and directions of `count` rays from each sensor, between two elevations."""
+    Those of a sensor follow one another: (p * count, 3) both.
+    """
     n = np.arange(count)
     azimuth = 2 * np.pi * 0.6180339887 * n
     low, high = np.sin(np.radians([low_deg, high_deg]))
