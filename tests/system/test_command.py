@@ -14,6 +14,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -281,6 +282,21 @@ def test_plain_lines_say_once_that_something_is_done():
     assert stream.getvalue().count("plan    done: 10 trials in 600.0 s") == 1
 
 
+def test_plain_lines_tell_of_a_pause_and_are_silent_in_it():
+    stream = StringIO()
+    show = PlainLines(stream)
+    show(progress(1.0, 10))
+    for second in range(2, 100):
+        show(replace(progress(float(second), 20), paused=True))
+    show(progress(100.0, 40))
+    lines = [line[10:] for line in stream.getvalue().splitlines()]
+    assert lines[:2] == [
+        "run     paused from the live page, 20 scans are done",
+        "run     goes on, 40 scans are done",
+    ]
+    assert [line[:6] for line in lines[2:]] == ["survey", "plan  "]
+
+
 @pytest.mark.parametrize(
     ("seconds", "words"),
     [(0, "0 s"), (99, "99 s"), (101, "2 min"), (5900, "98 min"), (7500, "2 h 05 min")],
@@ -371,7 +387,7 @@ def test_a_crash_while_moving_into_place_is_made_good(made, tmp_path, monkeypatc
         patch.setattr(Path, "replace", crash)
         with pytest.raises(SystemExit):
             write_result(out, *made)
-    assert (out / "report.json").read_text() == "an earlier report.json"
+    assert not (out / "report.json").exists() and not (out / "report.html").exists()
     with result_folder(out):  # as the next run begins
         assert sorted(path.name for path in out.iterdir()) == sorted(FILES)
         assert not any(data.startswith(b"an earlier") for data in content(out).values())

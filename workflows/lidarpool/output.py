@@ -103,6 +103,7 @@ def write_result(
             for name, make in makers.items():
                 make(staged / name)
                 _flush(staged / name)
+            _flush(staged)
             with deferred_interrupts():
                 whole = staged.rename(folder / f"{_COMPLETE}{secrets.token_hex(4)}")
                 _publish(whole, folder)
@@ -135,17 +136,22 @@ def _makers(
 def _publish(whole: Path, folder: Path) -> None:
     """Move a whole result into place; called again after a crash, it does the rest.
 
-    The report goes last: as long as it is in `whole`, it says what belongs to the result.
+    A folder with a report is a result: the earlier one's goes first, and the new one comes
+    last. As long as that is in `whole`, it says what belongs to the result.
     """
     files = json.loads((whole / REPORT).read_text(encoding="utf-8"))["files"]
+    for name in (REPORT, PAGE):
+        if (whole / name).exists():
+            (folder / name).unlink(missing_ok=True)
+    _flush(folder)
+    for name in PICTURES:
+        for drawn in _DRAWN_AGAIN:  # they would pass for this one's
+            (folder / drawn.format(name)).unlink(missing_ok=True)
     for name in FILES:
-        if name not in files:  # a path of an earlier run would pass for this one's
+        if name not in files:  # a path of an earlier run would pass for this one's, too
             (folder / name).unlink(missing_ok=True)
         elif (whole / name).exists():
             (whole / name).replace(folder / name)
-    for name in PICTURES:
-        for drawn in _DRAWN_AGAIN:  # they would pass for this one's, too
-            (folder / drawn.format(name)).unlink(missing_ok=True)
     whole.rmdir()
     _flush(folder)
 
