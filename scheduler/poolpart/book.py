@@ -7,7 +7,7 @@ between, what it should declare can be read here.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 from .errors import PoolError
@@ -46,7 +46,7 @@ class Seat:
         It joined after the cluster was divided, and no rule has wanted it yet.
     """
 
-    key: str
+    key: Hashable
     info: WorkerInfo
     found: Resources
     partition: str | None = None
@@ -69,7 +69,7 @@ class Book:
     """Rules of the partitions, and the seats of all workers."""
 
     rules: dict[str, Rule] = field(default_factory=dict)  # in the order in which they choose
-    seats: dict[str, Seat] = field(default_factory=dict)  # by key
+    seats: dict[Hashable, Seat] = field(default_factory=dict)  # by key
     names: set[str] = field(default_factory=set)  # of all partitions that there ever were
 
     def members(self, name: str, present: bool = False) -> list[Seat]:
@@ -159,12 +159,14 @@ class Book:
                     del self.seats[key]
 
 
-def seat_key(name: object, address: str, nanny: str | None) -> str:
+def seat_key(name: Hashable, address: str, nanny: str | None) -> Hashable:
     """Name a worker for all its lives: by its name or, if it has none, by its nanny.
 
-    A worker that was given no name goes by its address, which is another after a restart.
+    A worker that was given no name goes by its address, which is another after a restart. The
+    name is left as it is: to Dask 0, as `LocalCluster` has it, and "0", as from a command line,
+    are two workers.
     """
-    return str(name) if str(name) != address else nanny or address
+    return name if name != address else nanny or address
 
 
 def names_of(seats: Iterable[Seat]) -> str:

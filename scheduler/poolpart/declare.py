@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 from distributed import Client
 
 from .book import Seat, names_of
 from .errors import PoolError
-from .fence_plugin import lower
+from .fence_plugin import enclose, lower, settle_fences
+from .inherit import begin_inheritance, end_inheritance
 from .remote import on_scheduler
 from .rules import Rule
+from .stats import statistics_of
 from .steward import Steward, steward_of
 from .worker_info import WorkerInfo
 
@@ -49,7 +51,10 @@ def declare(
     chosen: Mapping[str, Sequence[WorkerInfo]],
     pool: Sequence[WorkerInfo],
 ) -> None:
-    """Put workers into partitions, and have the scheduler follow the rules from now on.
+    """Make partitions, and have the scheduler follow their rules from now on; all or none.
+
+    It is one question to the scheduler: a client that dies leaves the whole answer behind, or
+    nothing, and of two that ask at the same moment one is first.
 
     Parameters
     ----------
@@ -60,18 +65,20 @@ def declare(
     chosen
         Workers to begin with, by partition.
     pool
-        All workers of which something is known.
+        All workers, as the client saw them when it chose.
 
     Raises
     ------
     PoolError
-        If one of them left meanwhile, or somebody else has put it into a partition.
+        If one of them left meanwhile, somebody else has put it into a partition or made a
+        partition of such a name, or other workers have it.
     """
     ask(
         client,
         _declare,
         rules=dict(rules),
         chosen={name: [worker.address for worker in chosen[name]] for name in rules},
+        seen=sorted({name for worker in pool for name in worker.partitions}),
         gpus={worker.address: worker.gpus for worker in pool},
     )
 
@@ -80,21 +87,24 @@ async def _declare(
     steward: Steward,
     rules: Mapping[str, Rule],
     chosen: Mapping[str, Sequence[str]],
+    seen: Collection[str],
     gpus: Mapping[str, Sequence[str]],
 ) -> None:
-    for address, devices in gpus.items():
-        if seat := steward.seat_at(address):
-            seat.info = seat.info.with_gpus(devices)
+    # Up to the first await nothing else happens on the scheduler.
     seats = {name: [_seat(steward, name, a) for a in chosen[name]] for name in rules}
+    for name in rules:
+        _check_sole(steward, name, seats[name], seen)
+    _begin(steward, rules)
+    for address, devices in gpus.items():
+        if devices and (seat := steward.seat_at(address)):
+            seat.info = seat.info.with_gpus(devices)
     for name, rule in rules.items():
-        before = steward.book.rules.get(name)
-        if before and before.exclusive and not rule.exclusive:
-            lower(steward.scheduler, name)
         steward.book.enter(name, rule)
         for seat in seats[name]:
             steward.book.put(seat, name, rule.slots_of(seat.info))
     everyone = [seat for group in seats.values() for seat in group]
     late = await steward.arrive(everyone, PATIENCE_S)
+    await settle_fences(steward.scheduler)
     if late or not all(seat.holds for seat in everyone):
         away = [seat for seat in everyone if seat in late or not seat.holds]
         raise PoolError(
@@ -104,6 +114,24 @@ async def _declare(
         )
 
 
+def _begin(steward: Steward, rules: Mapping[str, Rule]) -> None:
+    """Have tasks inherit the partitions, raise or lower their fences, and count their tasks."""
+    scheduler, book = steward.scheduler, steward.book
+    try:
+        for name, rule in rules.items():
+            begin_inheritance(scheduler, name)
+            if rule.exclusive:
+                enclose(scheduler, name)
+            elif name in book.rules and book.rules[name].exclusive:
+                lower(scheduler, name)
+    except PoolError:  # this version of Dask lacks what these build on
+        for name in rules.keys() - book.rules.keys():
+            lower(scheduler, name)
+            end_inheritance(scheduler, name)
+        raise
+    statistics_of(scheduler)
+
+
 def _seat(steward: Steward, name: str, address: str) -> Seat:
     seat = steward.seat_at(address)
     if seat is None:
@@ -111,9 +139,31 @@ def _seat(steward: Steward, name: str, address: str) -> Seat:
             f"The worker at {address} could not be put into partition {name!r}: it has left. "
             "Make the pool anew and divide that."
         )
-    if seat.partition not in (None, name):
+    if others := sorted(_declared_by(steward, seat) - {name}):
         raise PoolError(
-            f"Worker {seat.info.name} already declares {seat.partition}; a worker belongs to "
-            "one partition."
+            f"Worker {seat.info.name} already declares {', '.join(others)}; a worker belongs to "
+            f"one partition. If somebody has put it there meanwhile, make the pool anew "
+            "(Pool.from_client) and divide what is left."
         )
     return seat
+
+
+def _check_sole(steward: Steward, name: str, chosen: Sequence[Seat], seen: Collection[str]) -> None:
+    """Refuse a partition that others have; one that was seen can be made again."""
+    seats = steward.book.seats.values()
+    members = [s for s in seats if s.absent_since is None and name in _declared_by(steward, s)]
+    if members and name not in seen:
+        raise PoolError(
+            f"Somebody else has made a partition {name!r} meanwhile, with {names_of(members)}: "
+            f"use Pool.partitions()[{name!r}] of a new pool, or give another name."
+        )
+    if others := [seat for seat in members if seat not in chosen]:
+        raise PoolError(
+            f"There is a partition {name!r} already, with {names_of(others)}, which this "
+            f"call does not choose: give another name, or use Pool.partitions()[{name!r}]."
+        )
+
+
+def _declared_by(steward: Steward, seat: Seat) -> set[str]:
+    """Partitions that a worker belongs to, or soon will."""
+    return {name for name, slots in steward.book.wanted(seat).items() if slots}

@@ -12,11 +12,11 @@ from distributed import Client
 from .book import names_of
 from .declare import ask
 from .errors import PoolError
-from .fence_plugin import lower
+from .fence_plugin import fences_of, lower
 from .inherit import end_inheritance
-from .page import remove_partitions_page
+from .page_server import close_page
 from .placing import asks_for
-from .stats import unwatch
+from .stats import forget_statistics
 from .steward import LOOK_EVERY_S, Steward
 
 _UNFINISHED = ("waiting", "queued", "no-worker", "processing")
@@ -46,9 +46,6 @@ def dissolve(client: Client, names: Collection[str] | None, timeout_s: float) ->
     """
     asked = None if names is None else list(names)
     done: list[str] = ask(client, _dissolve, names=asked, timeout_s=timeout_s)
-    if names is None:
-        remove_partitions_page(client)
-        unwatch(client)
     return done
 
 
@@ -77,6 +74,11 @@ async def _dissolve(steward: Steward, names: list[str] | None, timeout_s: float)
         # fence may be there also if the rule does not say so: somebody has raised it.
         lower(scheduler, name)
         end_inheritance(scheduler, name)
+    if names is None:
+        for fence in fences_of(scheduler):  # raised by hand, of workers that were started so
+            lower(scheduler, fence)
+        close_page(scheduler)
+        forget_statistics(scheduler)
     for seat in seats:
         book.put(seat, None)
     _lift_restrictions(scheduler, gone)

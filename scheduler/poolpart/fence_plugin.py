@@ -44,13 +44,31 @@ _SETTLE_S = 5.0  # longest wait for workers to give up tasks that they have not 
 
 async def raise_(scheduler: Any, name: str) -> None:
     """Raise a fence, and wait a moment for tasks to leave."""
+    enclose(scheduler, name)
+    await settle_fences(scheduler)
+
+
+def enclose(scheduler: Any, name: str) -> None:
+    """Raise a fence: from now on no task comes in.
+
+    Raises
+    ------
+    PoolError
+        If this version of Dask decides by other means.
+    """
     fences: Fences | None = scheduler.plugins.get(NAME)
     if fences is None:
         fences = Fences(scheduler)
         fences.install()
     fences.names.add(name)
     fences.look_again()
-    await fences.settle()
+
+
+async def settle_fences(scheduler: Any) -> None:
+    """Turn out what has not started behind fences, if there are any."""
+    fences: Fences | None = scheduler.plugins.get(NAME)
+    if fences is not None:
+        await fences.settle()
 
 
 def lower(scheduler: Any, name: str) -> None:

@@ -47,15 +47,20 @@ def disinherit(client: Client, name: str) -> None:
 
 
 async def _inherit(name: str, dask_scheduler: Any = None) -> None:
-    rule: Inheritance | None = dask_scheduler.plugins.get(NAME)
-    if rule is None:
-        rule = Inheritance(dask_scheduler)
-        rule.install()
-    rule.names.add(name)
+    begin_inheritance(dask_scheduler, name)
 
 
 async def _disinherit(name: str, dask_scheduler: Any = None) -> None:
     end_inheritance(dask_scheduler, name)
+
+
+def begin_inheritance(scheduler: Any, name: str) -> None:
+    """Do what `inherit` does, on the scheduler."""
+    rule: Inheritance | None = scheduler.plugins.get(NAME)
+    if rule is None:
+        rule = Inheritance(scheduler)
+        rule.install()
+    rule.names.add(name)
 
 
 def end_inheritance(scheduler: Any, name: str) -> None:

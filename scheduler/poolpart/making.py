@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
 
 from distributed import Client
 
 from .declare import declare
-from .dissolve import dissolve
-from .errors import PoolError
-from .fence import raise_fence
-from .inherit import inherit
 from .partition import Partition
 from .rules import Rule
-from .stats import watch
 from .worker_info import WorkerInfo
 
 logger = logging.getLogger(__name__)
@@ -26,7 +20,7 @@ def make_partitions(
     rules: Mapping[str, Rule],
     chosen: Mapping[str, Sequence[WorkerInfo]],
     notes: Mapping[str, str],
-    cluster: Iterable[WorkerInfo],
+    cluster: Sequence[WorkerInfo],
 ) -> dict[str, Partition]:
     """Make partitions, all of them or none.
 
@@ -46,30 +40,11 @@ def make_partitions(
     Raises
     ------
     PoolError
-        If another worker has such a partition already, or one leaves meanwhile.
+        If another worker has such a partition already, one leaves meanwhile, or somebody else
+        makes such a partition or takes one of the workers at the same moment.
     """
-    for name in rules:
-        names = {worker.name for worker in chosen[name]}
-        _check_sole(name, [worker for worker in cluster if worker.name not in names])
-        if note := notes.get(name):
+    for name, note in notes.items():
+        if note:
             logger.warning("Partition %r: %s", name, note)
-    declare(client, rules, chosen, list(cluster))
-    try:
-        watch(client)
-        for name, rule in rules.items():
-            inherit(client, name)
-            if rule.exclusive:
-                raise_fence(client, name)
-    except PoolError:
-        with suppress(PoolError):  # the first error is the one to tell of
-            dissolve(client, list(rules), timeout_s=0)
-        raise
+    declare(client, rules, chosen, cluster)
     return {name: Partition(name, client, notes.get(name, "")) for name in rules}
-
-
-def _check_sole(name: str, others: Iterable[WorkerInfo]) -> None:
-    if members := [worker.name for worker in others if name in worker.partitions]:
-        raise PoolError(
-            f"There is a partition {name!r} already, with {', '.join(members)}, which this "
-            f"call does not choose: give another name, or use Pool.partitions()[{name!r}]."
-        )

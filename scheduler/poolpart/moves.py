@@ -76,9 +76,9 @@ async def _grow(
     if source is not None:
         book.adopt(source)
     lender = source or book.remainder()
-    there = [] if source else book.free()
+    there = [] if source else [seat for seat in book.free() if steward.settled(seat)]
     if lender is not None and lender != name:
-        members = book.members(lender, present=True)
+        members = _arrived(steward, lender)
         spare = max(0, len(members) - book.rules[lender].minimum)
         there += _by_load(steward, members)[:spare]
     if len(there) < count:
@@ -93,7 +93,7 @@ async def _grow(
 async def _shrink(steward: Steward, name: str, count: int, timeout_s: float) -> list[str]:
     book = steward.book
     book.adopt(name)
-    members, least = book.members(name, present=True), book.rules[name].minimum
+    members, least = _arrived(steward, name), book.rules[name].minimum
     if len(members) - count < least:
         raise PoolError(
             f"Partition {name!r} cannot shrink by {count}: it has {len(members)} workers and "
@@ -150,7 +150,17 @@ async def _move(
             f"{len(late)} of {len(seats)} workers could not be moved within {timeout_s:g} s and "
             f"stay where they are: {names_of(late)}{_held(steward, late, leaving)}."
         )
+    # Whoever else moves workers waits until they have arrived; dissolving does not.
+    if target is not None and target not in steward.book.rules:
+        raise PoolError(
+            f"{names_of(seats)} did not arrive in partition {target!r}: somebody has dissolved it."
+        )
     return [seat.info.name for seat in seats if seat.holds]
+
+
+def _arrived(steward: Steward, name: str) -> list[Seat]:
+    """Members that are not under way: those may turn back, and belong to another's move."""
+    return [s for s in steward.book.members(name, present=True) if steward.settled(s)]
 
 
 def _resize(steward: Steward, name: str | None, change: int) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import replace
 
 from distributed import Client
@@ -182,9 +182,9 @@ class Pool:
         """
         check_rules(rules)
         cluster = self._cluster_now()
-        mine = [cluster[worker.name] for worker in self.workers if worker.name in cluster]
+        mine = self._mine(cluster)
         chosen, notes = divide(rules, mine)
-        return make_partitions(self.client, rules, chosen, notes, cluster.values())
+        return make_partitions(self.client, rules, chosen, notes, cluster)
 
     def partition(
         self,
@@ -245,7 +245,7 @@ class Pool:
         }
         check_request(name, given, slots)
         cluster = self._cluster_now()
-        mine = [cluster[worker.name] for worker in self.workers if worker.name in cluster]
+        mine = self._mine(cluster)
         chosen, note = choose(
             name,
             mine,
@@ -257,11 +257,9 @@ class Pool:
         common = {"slots": slots, "minimum": minimum, "exclusive": exclusive}
         rule = rule_of(given, [worker.name for worker in chosen], common)
         check_rule(name, rule)
-        made = make_partitions(
-            self.client, {name: rule}, {name: chosen}, {name: note}, cluster.values()
-        )
-        names = {worker.name for worker in chosen}
-        rest = Pool(self.client, [worker for worker in mine if worker.name not in names])
+        made = make_partitions(self.client, {name: rule}, {name: chosen}, {name: note}, cluster)
+        taken = {worker.address for worker in chosen}
+        rest = Pool(self.client, [worker for worker in mine if worker.address not in taken])
         return made[name], rest
 
     def page(self) -> str:
@@ -329,9 +327,21 @@ class Pool:
         """
         return dissolve(self.client, None, timeout_s)
 
-    def _cluster_now(self) -> dict[str, WorkerInfo]:
-        """Every worker of the cluster by name; the GPUs of those in this pool are known."""
+    def _cluster_now(self) -> list[WorkerInfo]:
+        """Every worker of the cluster; the GPUs of those in this pool are known."""
         gpus = {worker.name: worker.gpus for worker in self.workers}
+        gpus |= {worker.address: worker.gpus for worker in self.workers}
         identities = worker_identities(self.client)
         workers = (WorkerInfo.from_identity(a, i) for a, i in identities.items())
-        return {w.name: replace(w, gpus=gpus.get(w.name, ())) for w in workers}
+        return [replace(w, gpus=gpus.get(w.address, gpus.get(w.name, ()))) for w in workers]
+
+    def _mine(self, cluster: Iterable[WorkerInfo]) -> list[WorkerInfo]:
+        """Those of the workers that are in this pool, also those that were restarted since.
+
+        By address, since two workers may have one name as it is written here, 0 and "0".
+        """
+        known = {worker.address for worker in self.workers}
+        here = {worker.address: worker for worker in cluster}
+        restarted = {w.name: w for w in cluster if w.address not in known}
+        found = (here.get(w.address, restarted.get(w.name)) for w in self.workers)
+        return [worker for worker in found if worker is not None]

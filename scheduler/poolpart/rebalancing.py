@@ -42,12 +42,18 @@ class Rebalancing:
         Who is where; changed here.
     settle
         Has workers follow the book.
+    settled
+        Whether a worker has done so.
     """
 
     def __init__(
-        self, scheduler: Any, book: Book, settle: Callable[[Iterable[Seat]], None]
+        self,
+        scheduler: Any,
+        book: Book,
+        settle: Callable[[Iterable[Seat]], None],
+        settled: Callable[[Seat], bool],
     ) -> None:
-        self.scheduler, self.book, self._settle = scheduler, book, settle
+        self.scheduler, self.book, self._settle, self._settled = scheduler, book, settle, settled
         self.helps: dict[tuple[str, str], Help] = {}
         self._idle_since: dict[str, float] = {}  # {address: when it was first seen idle}
 
@@ -115,7 +121,8 @@ class Rebalancing:
         return [s for s in self.book.members(borrower, present=True) if s.home == lender]
 
     def _lend(self, rule: Help, most: int, now: float) -> None:
-        members = self.book.members(rule.lender, present=True)
+        # Not those on their way: they may turn back.
+        members = [s for s in self.book.members(rule.lender, present=True) if self._settled(s)]
         spare = max(0, len(members) - self.book.rules[rule.lender].minimum)
         # A worker that is itself lent goes home first.
         idle = [s for s in members if s.home is None and self._idle(s, rule.idle_s, now)]

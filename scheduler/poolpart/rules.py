@@ -198,15 +198,15 @@ def divide(
     """
     chosen: dict[str, list[WorkerInfo]] = {}
     notes: dict[str, str] = {}
-    taken: set[str] = set()
+    taken: set[str] = set()  # addresses: names need not differ
     named_by = {n for rule in rules.values() if isinstance(rule, Named) for n in rule.names}
     for name, rule in rules.items():
         free = [worker for worker in pool if worker.partitions == {name}]
-        free += [w for w in pool if not w.partitions and w.name not in taken]
+        free += [w for w in pool if not w.partitions and w.address not in taken]
         if not isinstance(rule, Named):
             free = [worker for worker in free if not named_by & {worker.name, worker.address}]
         chosen[name] = rule.choose(free)
-        taken |= {worker.name for worker in chosen[name]}
+        taken |= {worker.address for worker in chosen[name]}
         if len(chosen[name]) < rule.minimum:
             raise PoolError(
                 f"Partition {name!r} would have {len(chosen[name])} workers of the {rule.minimum} "

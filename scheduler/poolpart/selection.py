@@ -78,14 +78,24 @@ def choose(
 
 def by_name(partition: str, pool: Sequence[WorkerInfo], wanted: Sequence[str]) -> list[WorkerInfo]:
     """Take these workers, by name or address."""
-    known = {key: worker for worker in pool for key in (worker.name, worker.address)}
-    if unknown := [str(name) for name in wanted if str(name) not in known]:
+    known: dict[str, list[WorkerInfo]] = {}  # {name or address: workers}
+    for worker in pool:
+        for key in {worker.name, worker.address}:
+            known.setdefault(key, []).append(worker)
+    times = Counter(map(str, wanted))
+    if unknown := [name for name in times if name not in known]:
         raise PoolError(
             f"Partition {partition!r}: {', '.join(unknown)} not in this pool, which has "
             f"{', '.join(worker.name for worker in pool) or 'no workers'}."
         )
-    names = {known[str(name)].name for name in wanted}
-    chosen = [worker for worker in pool if worker.name in names]
+    for name, count in times.items():
+        if len(known[name]) > count:  # all of them are meant if it is listed for each
+            raise PoolError(
+                f"Partition {partition!r}: {len(known[name])} workers are named {name}; give "
+                f"addresses: {', '.join(worker.address for worker in known[name])}."
+            )
+    asked = {worker.address for name in times for worker in known[name]}
+    chosen = [worker for worker in pool if worker.address in asked]
     for worker in chosen:
         if others := sorted(worker.partitions - {partition}):
             raise PoolError(

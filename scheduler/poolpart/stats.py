@@ -124,8 +124,13 @@ async def _watch(dask_scheduler: Any = None) -> None:
 
 
 async def _unwatch(dask_scheduler: Any = None) -> None:
-    if NAME in dask_scheduler.plugins:
-        dask_scheduler.remove_plugin(NAME)
+    forget_statistics(dask_scheduler)
+
+
+def forget_statistics(scheduler: Any) -> None:
+    """Do what `unwatch` does, on the scheduler."""
+    if NAME in scheduler.plugins:
+        scheduler.remove_plugin(NAME)
 
 
 async def _told(name: str, dask_scheduler: Any = None) -> dict[str, Any]:

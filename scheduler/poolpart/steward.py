@@ -49,7 +49,7 @@ class Steward(SchedulerPlugin):
         self.scheduler = scheduler
         self.book = Book()
         self.asked = 0  # questions of clients that are being answered
-        self.rebalancing = Rebalancing(scheduler, self.book, self.settle)
+        self.rebalancing = Rebalancing(scheduler, self.book, self.settle, self.settled)
         self._looked_at: Any = None  # rules and members when nobody wanted those without a place
         self._resources_before = set(scheduler.resources)
         self._declared: dict[str, Resources] = {}  # {address: what the worker itself declares}

@@ -65,6 +65,7 @@ def test_a_partition_that_nobody_declares():
 
 
 def test_a_worker_is_known_by_its_name_or_by_its_nanny():
-    assert seat_key(3, "tcp://a", "tcp://n") == "3"
+    assert seat_key(3, "tcp://a", "tcp://n") == 3
+    assert seat_key("3", "tcp://a", "tcp://n") == "3"
     assert seat_key("tcp://a", "tcp://a", "tcp://n") == "tcp://n"
     assert seat_key("tcp://a", "tcp://a", None) == "tcp://a"

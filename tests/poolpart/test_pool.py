@@ -6,7 +6,8 @@ from dataclasses import replace
 import pytest
 from distributed import Client, LocalCluster, get_worker
 
-from poolpart import Partition, Pool, PoolError, probe
+from poolpart import Partition, Pool, PoolError, n_workers, probe
+from poolpart import rest as rest_of_them
 
 PLAIN = {name: {} for name in ("a", "b", "c")}
 
@@ -94,6 +95,25 @@ def test_workers_that_local_cluster_numbers():
         assert [worker.name for worker in part.workers] == ["0", "2"]
         assert rest.names == ["1"]
         assert part.submit(here).result() in ("0", "2")
+
+
+def test_two_workers_whose_names_are_written_alike(start):
+    client = start({0: {}, "0": {}, "1": {}})
+    pool = Pool.from_client(client)
+    state = {worker.name: worker for worker in client.cluster.scheduler.workers.values()}
+    with pytest.raises(PoolError, match=r"2 workers are named 0; give addresses: inproc://"):
+        pool.partition("P", workers=["0"])
+    part, rest = pool.partition("P", workers=[state[0].address])
+    assert [worker.address for worker in part.workers] == [state[0].address]
+    assert sorted(rest.names) == ["0", "1"]
+    other, _ = rest.partition("Q", workers=rest.names)
+    assert {worker.address for worker in other.workers} == {state[n].address for n in ("0", "1")}
+    assert [state[name].resources for name in (0, "0", "1")] == [{"P": 1}, {"Q": 1}, {"Q": 1}]
+    pool.dissolve()
+    both, _ = pool.partition("R", workers=["0", "0"])
+    assert len(both) == 2
+    parts = pool.divide({"R": n_workers(2), "S": rest_of_them()})
+    assert [len(part) for part in parts.values()] == [2, 1]
 
 
 def test_a_refused_request_changes_nothing(start):

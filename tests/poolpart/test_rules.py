@@ -262,6 +262,18 @@ def test_a_late_worker_is_asked_for_its_gpus(start, wait_until, monkeypatch):
     assert declared(client) == {"a": {"GPU": 1}, "second": {"GPU": 1}, "third": {"OTHER": 1}}
 
 
+def test_a_later_partition_of_the_remainder_forgets_no_gpus(start, wait_until, monkeypatch):
+    monkeypatch.setattr(probe, "visible_gpus", lambda: ("x",))
+    client = start({"a": {}, "b": {}})
+    gpu, remainder = Pool.from_client(client).partition("GPU", max_workers_per_gpu=1)
+    remainder.partition("OTHER", n_workers=1)
+    seats = client.cluster.scheduler.plugins[steward.NAME].book.seats
+    join(client, "late")
+    wait_until(lambda: seats["late"].info.gpus == ("x",))
+    assert seats["late"].partition is None
+    assert len(gpu) == 1
+
+
 def test_a_late_worker_that_cannot_be_asked_has_no_gpu(start, wait_until, monkeypatch):
     client = start({"a": {}})
     Pool.from_client(client).divide({"GPU": per_gpu(1), "OTHER": rest()})
@@ -310,7 +322,7 @@ def test_rules_that_a_cluster_cannot_meet_change_nothing(start):
 def test_two_who_divide_one_cluster_at_a_time(start):
     client = start({"a": {}, "b": {}})
     mine, theirs = Pool.from_client(client), Pool.from_client(client)
-    mine._cluster_now = theirs._cluster_now = lambda: {w.name: w for w in mine}
+    mine._cluster_now = theirs._cluster_now = lambda: list(mine)
     mine.partition("P", workers=["a"])
     with pytest.raises(PoolError, match="Worker a already declares P; a worker belongs to one"):
         theirs.divide({"Q": rest()})
