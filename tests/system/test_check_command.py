@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import trimesh
 from distributed import Client, Scheduler, SpecCluster, Worker
 
 import lidarpool.forecast
@@ -196,3 +197,43 @@ def test_a_folder_that_is_not_there_yet(lidarpool, tmp_path, monkeypatch):
     outcome = lidarpool("check", "s.yaml", "--out", "made/here", "--json")
     assert outcome.code == 0
     assert json.loads(outcome.out)["disk"]["folder"] == "made/here"
+
+
+def box(tmp_path: Path, size: tuple[float, float, float]) -> Path:
+    mesh = trimesh.creation.box(size)
+    (tmp_path / "my box.stl").write_bytes(mesh.export(file_type="stl"))
+    return tmp_path / "my box.stl"
+
+
+@pytest.mark.parametrize(
+    ("size", "unit"), [((8000, 6000, 3000), "mm"), ((0.008, 0.006, 0.003), "km"), ((8, 6, 3), None)]
+)
+def test_sizes_that_speak_of_another_unit(size, unit, tmp_path, lidarpool):
+    outcome = lidarpool("check", box(tmp_path, size))
+    assert outcome.code == 0
+    assert ("states no unit" in outcome.out) == (unit is not None)
+    if unit:
+        assert f"lidarpool init DIR --mesh 'my box.stl' --unit {unit}" in outcome.out
+
+
+def test_a_unit_that_was_given_is_not_doubted(check, tmp_path):
+    box(tmp_path, (8, 6, 3))
+    outcome = check(text="scene: {files: [{file: my box.stl, unit: km}]}")
+    assert "size        8,000 x 6,000 x 3,000 m; x -4,000 to 4,000, y" in outcome.out
+    assert "states no unit" not in outcome.out
+
+
+@pytest.mark.parametrize(
+    ("pose", "hidden"), [("0, 0, 1", True), ("0, 0, 3", False), ("9, 0, 1", False)]
+)
+def test_a_sensor_within_an_object(pose, hidden, check, tmp_path):
+    box(tmp_path, (8, 6, 3))
+    outcome = check(text=f"scene: [my box.stl]\nposes: [[{pose}]]\n")
+    assert outcome.code == 0
+    assert (f"from ({pose}) nearly all that is seen are backs" in outcome.out) == hidden
+
+
+def test_a_scene_that_is_not_hit_says_where_it_is(check, tmp_path):
+    box(tmp_path, (8, 6, 3))
+    outcome = check(text="scene: [my box.stl]\nposes: [[900, 0, 90]]\nsensor: {layers: 1}\n")
+    assert "the scene reaches from (-4, -3, -1.5) to (4, 3, 1.5)" in outcome.out

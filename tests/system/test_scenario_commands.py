@@ -10,6 +10,7 @@ import subprocess
 import sys
 
 import pytest
+import trimesh
 
 from lidarpool.cli import cli
 from lidarpool.scenario import Scenario
@@ -50,6 +51,42 @@ def test_init_leaves_an_untouched_scenario_alone_as_well(tmp_path, lidarpool):
     assert lidarpool("init", tmp_path).code == 2
     (tmp_path / "scenario.yaml").unlink()
     assert lidarpool("init", tmp_path).code == 0  # the schema was as it should be
+
+
+def test_init_with_meshes_names_them_as_seen_from_the_scenario(tmp_path, lidarpool, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("my room.stl", "#1: é.glb"):
+        (tmp_path / name).write_bytes(trimesh.creation.box().export(file_type=name[-3:]))
+    options = ["--mesh", "my room.stl", "--mesh", "#1: é.glb", "--unit", "mm"]
+    outcome = lidarpool("init", "a/b", *options)
+    assert (outcome.code, outcome.err) == (0, "")
+    assert outcome.out.startswith("a/b/scenario.yaml is a survey of my room.stl, #1: é.glb:")
+    made = Scenario.load("a/b/scenario.yaml")
+    assert [(entry.file, entry.unit) for entry in made.scene.files] == [
+        ("../../my room.stl", "mm"),
+        ("../../#1: é.glb", "mm"),
+    ]
+    assert len(made.build_scene().names) == 2
+    rest = {"scene": {"files", "preset"}}
+    assert made.model_dump(exclude=rest) == Scenario().model_dump(exclude=rest)
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--mesh", "nowhere.stl"], "nowhere.stl is not a file"),
+        (["--mesh", "notes.txt"], "has the ending .txt"),
+        (["--unit", "mm"], "name it with --mesh"),
+        (["--mesh", "notes.txt", "--unit", "ells"], "ells"),
+    ],
+)
+def test_init_with_what_is_no_mesh_writes_nothing(options, says, tmp_path, lidarpool, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "notes.txt").write_text("")
+    outcome = lidarpool("init", "new", *options)
+    assert (outcome.code, outcome.out) == (2, "")
+    assert says in outcome.err
+    assert not (tmp_path / "new").exists()
 
 
 def test_init_where_there_can_be_no_folder(tmp_path, lidarpool):

@@ -70,7 +70,7 @@ def check(
     job = make_job(read, backend, no_plan)
     cluster = nullcontext() if scheduler is None else connected(scheduler, files)
     with cluster as client, shown_status("casting some rays", as_json):
-        made = forecast(job, read.pool, out, client)
+        made = forecast(job, read.pool, out, client, read.unitless_files)
     if as_json:
         click.echo(json.dumps(made.as_data(), indent=1, allow_nan=False))
     else:
@@ -84,6 +84,7 @@ def check(
 
 def told(made: Forecast) -> Iterator[str]:
     """Tell of it in lines for people."""
+    from .doubts import in_metres
     from .forecast import in_bytes
 
     job, needs, sample = made.job, made.needs, made.sample
@@ -92,6 +93,11 @@ def told(made: Forecast) -> Iterator[str]:
     objects = len(job.scene.names)
     yield (
         f"scene       {objects:,} object{'s' * (objects != 1)}, {len(job.scene.faces):,} triangles"
+    )
+    low, high = job.scene.bounds + job.scene.origin
+    yield f"size        {' x '.join(map(in_metres, high - low))} m; " + ", ".join(
+        f"{axis} {in_metres(a)} to {in_metres(b)}"
+        for axis, a, b in zip("xyz", low, high, strict=True)
     )
     yield (
         f"survey      {survey.scan_count:,} scans from {len(survey.poses):,} poses, "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -19,6 +19,7 @@ from poolpart.probe import visible_gpus
 from raybeam import available_backends
 
 from .checks import check_backend_here, common_backend, survey_pool
+from .doubts import doubts
 from .errors import LidarpoolError
 from .job import Job
 from .journal_folder import RECORDS
@@ -77,6 +78,7 @@ class Forecast:
             "notes": self.notes,
             "objects": len(scene.names),
             "triangles": len(scene.faces),
+            "bounds": (scene.bounds + scene.origin).tolist(),
             "poses": len(survey.poses),
             "scans": survey.scan_count,
             "rays": survey.ray_count,
@@ -102,7 +104,13 @@ class Forecast:
         }
 
 
-def forecast(job: Job, pool: PoolSection, out: Path, client: Client | None = None) -> Forecast:
+def forecast(
+    job: Job,
+    pool: PoolSection,
+    out: Path,
+    client: Client | None = None,
+    unitless: Sequence[str] = (),
+) -> Forecast:
     """Find out what a run would do and take, and whether it can.
 
     Parameters
@@ -113,6 +121,8 @@ def forecast(job: Job, pool: PoolSection, out: Path, client: Client | None = Non
         Sizes of a cluster on this machine, which is not started.
     client
         Client of the cluster to run on instead.
+    unitless
+        Names of mesh files whose unit is neither stated nor given.
     """
     made = Forecast(job, out)
     with _taken_for_reason(made):
@@ -124,8 +134,7 @@ def forecast(job: Job, pool: PoolSection, out: Path, client: Client | None = Non
     # Casting here takes what it takes on a worker: it would be refused, or killed.
     if needs_of(job, 0).gpu_worker <= MEMORY_LIMIT:
         made.sample = sample_survey(job.scene, job.survey)
-        if not made.sample.hits:
-            made.notes.append("no ray cast here hit anything: look at poses, ranges and units")
+    made.notes += doubts(job.scene, job.survey, unitless, made.sample)
     # Without a sample every ray may hit.
     points = made.sample.points if made.sample else job.survey.ray_count // job.survey.keep_every
     made.needs = needs_of(job, points)

@@ -17,6 +17,7 @@ from .threemf import placed_objects
 from .transform import UNITS_M, UP_AXES, Transform
 
 SUFFIXES = (".glb", ".gltf", ".obj", ".stl", ".ply", ".off", ".dae", ".3mf")
+UNITLESS = (".obj", ".stl", ".ply", ".off")  # that cannot say in which unit their numbers are
 
 # By the 3MF core specification, 3.4.
 _3MF_UNITS_M = {

@@ -17,6 +17,8 @@ from .survey import Survey
 RAYS_MOST = {"numpy": 20_000}
 RAYS_MOST_ELSE = 200_000
 SCANS_MOST = 500
+# Of the hits seen from a pose, what makes one believe that it stands within something.
+BEHIND_SHARE = 0.95
 
 _SEED = 0  # the same survey gets the same estimate
 
@@ -33,12 +35,15 @@ class Sample:
         Rays that were cast.
     hits, points
         Of the whole survey, estimated; counted if all of its rays were cast.
+    behind
+        Numbers of the poses from which nearly all hits are on the backs of triangles.
     """
 
     backend: str
     rays: int
     hits: int
     points: int
+    behind: tuple[int, ...] = ()
 
 
 def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> Sample:
@@ -66,21 +71,35 @@ def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> Sample
     each = most if survey.ray_count <= most else max(1, most // len(scans))
     cast = 0
     hits, points = [], []  # of each of these scans
+    seen = np.zeros((len(survey.poses), 2))  # hits of each pose, on front and back
     for index in scans.tolist():
         spec = survey.scan(index)
         count = spec.ray_count(survey.sensor)
         rays = _spread(count, each, rng)
+        directions = ray_directions(survey.sensor, spec, rays)
         found = caster.returns(
             np.asarray(spec.pose.position),
-            ray_directions(survey.sensor, spec, rays),
+            directions,
             survey.sensor.min_range_m,
             survey.sensor.max_range_m,
         )
+        backs = _on_backs(scene, directions[found.ray], found.triangle)
+        seen[index // survey.steps] += (len(found.ray) - backs, backs)
         cast += len(rays)
         hits.append(len(found.ray) * count / len(rays))
         points.append(_kept(hits[-1], survey.keep_every, len(rays) == count))
     share = survey.scan_count / len(scans)
-    return Sample(caster.backend, cast, round(sum(hits) * share), round(sum(points) * share))
+    behind = np.flatnonzero(seen[:, 1] > BEHIND_SHARE * seen.sum(axis=1)).tolist()
+    return Sample(
+        caster.backend, cast, round(sum(hits) * share), round(sum(points) * share), tuple(behind)
+    )
+
+
+def _on_backs(scene: Scene, directions: NDArray[np.floating], triangles: NDArray[np.int32]) -> int:
+    """How many rays (k, 3) hit the back of their triangle (k,)."""
+    a, b, c = np.moveaxis(scene.vertices[scene.faces[triangles]], 1, 0)
+    normals = np.cross(b - a, c - a)
+    return int(((normals * directions).sum(axis=1) > 0).sum())
 
 
 def _kept(hits: float, keep_every: int, counted: bool) -> float:

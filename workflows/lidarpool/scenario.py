@@ -13,8 +13,9 @@ from pydantic import Field, PrivateAttr, Strict, ValidationError, field_validato
 
 from .complaints import complain, did_you_mean
 from .errors import LidarpoolError
+from .floor import floor_under
 from .mesh import Mesh
-from .meshfile import SUFFIXES, load_meshes
+from .meshfile import SUFFIXES, UNITLESS, load_meshes
 from .plan import Planning
 from .scene import Scene
 from .sections import (
@@ -52,8 +53,8 @@ class Scenario(Section):
         See `lidarpool.sections`.
     poses
         Where the sensor scans from, in world coordinates. Where none are given it stands at
-        the origin (default objects) or over the middle of the scene (mesh files), 1, 2 and 3
-        metres above the ground.
+        the origin (default objects) or in the middle of the scene (mesh files), 1, 2 and 3
+        metres above the ground or floor there; see `floor_under`.
     steps
         Time steps from each pose.
 
@@ -152,6 +153,15 @@ class Scenario(Section):
             scenario.sensor.sensor()
         return scenario
 
+    @property
+    def unitless_files(self) -> tuple[str, ...]:
+        """Mesh files of which neither their format nor the scenario says the unit."""
+        return tuple(
+            entry.file
+            for entry in self.scene.files
+            if entry.unit is None and Path(entry.file).suffix.lower() in UNITLESS
+        )
+
     def build_scene(self) -> Scene:
         """Read the mesh files and put the scene together.
 
@@ -240,7 +250,8 @@ class Scenario(Section):
         x, y, floor = 0.0, 0.0, 0.0
         if not self.scene.has_seed:
             low, high = scene.bounds + scene.origin
-            (x, y), floor = (low[:2] + high[:2]) / 2, low[2]
+            x, y = (low[:2] + high[:2]) / 2
+            floor = floor_under(scene, x, y)
         for height in _HEIGHTS_M:
             yield (float(x), float(y), float(floor + height)), 0.0, 0.0, 0.0
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 from pathlib import Path
 
 import click
 
 from .errors import LidarpoolError
+from .meshfile import SUFFIXES
 from .schema import SCHEMA_FILE, schema_text
 from .template import scenario_template
+from .transform import UNITS_M, UP_AXES
 
 SCENARIO_FILE = "scenario.yaml"
 
@@ -18,7 +21,25 @@ SCENARIO_FILE = "scenario.yaml"
 @click.argument(
     "folder", metavar="[DIR]", type=click.Path(path_type=Path), default=Path(), required=False
 )
-def init(folder: Path) -> None:
+@click.option(
+    "--mesh",
+    "meshes",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    multiple=True,
+    help="Survey this mesh file; may be given several times.",
+)
+@click.option(
+    "--unit",
+    type=click.Choice(list(UNITS_M)),
+    help="Length unit of these files; by default what they state, else metres.",
+)
+@click.option(
+    "--up-axis",
+    type=click.Choice(list(UP_AXES)),
+    help="Axis of these files that points up; by default what they state, else z.",
+)
+def init(folder: Path, meshes: tuple[Path, ...], unit: str | None, up_axis: str | None) -> None:
     """Write a commented scenario file with all defaults into a folder.
 
     Beside it goes its JSON Schema, with which editors complete and check it. Nothing that is
@@ -27,18 +48,44 @@ def init(folder: Path) -> None:
     \b
     Examples:
       lidarpool init
-      lidarpool init surveys/hall
+      lidarpool init surveys/hall --mesh hall.stl --unit mm
     """  # noqa: D301 - click wants the character, not its name
     target = folder / SCENARIO_FILE
     commands = tuple(f"lidarpool {verb} {SCENARIO_FILE}" for verb in ("check", "run"))
+    if not meshes and (unit or up_axis):
+        raise click.UsageError("--unit and --up-axis say how to read a mesh: name it with --mesh.")
+    files = [_entry(path, folder, unit, up_axis) for path in meshes]
     _write_new(
         {
-            target: scenario_template(commands, SCHEMA_FILE),
+            target: scenario_template(commands, SCHEMA_FILE, files),
             folder / SCHEMA_FILE: schema_text(),
         }
     )
-    click.echo(f"{click.format_filename(target)} is the default survey: change what you like.")
+    name = click.format_filename(target)
+    if meshes:
+        listed = ", ".join(click.format_filename(path) for path in meshes)
+        click.echo(f"{name} is a survey of {listed}: change what you like.")
+    else:
+        click.echo(f"{name} is the default survey: change what you like.")
+        click.echo("for a mesh of your own: lidarpool init DIR --mesh FILE [--unit mm]")
     click.echo(f"next: lidarpool check {shlex.quote(str(target))}")
+
+
+def _entry(path: Path, folder: Path, unit: str | None, up_axis: str | None) -> dict[str, str]:
+    """Entry of `scene.files` for a mesh file, named as seen from the scenario's folder."""
+    if not path.is_file():
+        raise LidarpoolError(f"{path} is not a file: give a mesh file with --mesh.")
+    if path.suffix.lower() not in SUFFIXES:
+        raise LidarpoolError(
+            f"{path} has the ending {path.suffix or '(none)'}, which is not a mesh format that "
+            f"can be read; these are: {' '.join(SUFFIXES)}."
+        )
+    try:
+        name = Path(os.path.relpath(path, folder)).as_posix()
+    except ValueError:  # on another drive of Windows
+        name = path.absolute().as_posix()
+    said = {"file": name, "unit": unit, "up_axis": up_axis}
+    return {field: value for field, value in said.items() if value}
 
 
 @click.command()

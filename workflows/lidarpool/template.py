@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import yaml
@@ -22,7 +22,11 @@ _HEAD = """\
 """
 
 
-def scenario_template(commands: tuple[str, ...] = (), schema: str | None = None) -> str:
+def scenario_template(
+    commands: tuple[str, ...] = (),
+    schema: str | None = None,
+    files: Sequence[str | dict[str, str]] = (),
+) -> str:
     """Return a commented scenario in YAML that holds all defaults.
 
     Parameters
@@ -31,6 +35,8 @@ def scenario_template(commands: tuple[str, ...] = (), schema: str | None = None)
         What to do with it, for its head.
     schema
         Name of the JSON Schema beside it, which editors then use; None for none.
+    files
+        Mesh files to begin with, as in `scene.files`.
     """
     # Only a comment's first line is looked at by editors.
     lines = [f"# yaml-language-server: $schema={schema}\n"] if schema else []
@@ -38,12 +44,16 @@ def scenario_template(commands: tuple[str, ...] = (), schema: str | None = None)
     if commands:
         lines += ["#\n", *(f"#     {command}\n" for command in commands)]
     for name, field in Scenario.model_fields.items():
-        lines += ["\n", *(f"{line}\n" for line in _top(name, field))]
+        given = {"files": list(files)} if name == "scene" and files else {}
+        lines += ["\n", *(f"{line}\n" for line in _top(name, field, given))]
     return "".join(lines)
 
 
-def _top(name: str, field: FieldInfo) -> Iterator[str]:
-    """Give the lines of a section, or of a field that stands beside them."""
+def _top(name: str, field: FieldInfo, given: dict[str, Any]) -> Iterator[str]:
+    """Give the lines of a section, or of a field that stands beside them.
+
+    `given` are values of its fields that stand there instead of their defaults.
+    """
     section = field.annotation
     if not (isinstance(section, type) and issubclass(section, BaseModel)):
         yield from _lines(name, field, "")
@@ -51,7 +61,10 @@ def _top(name: str, field: FieldInfo) -> Iterator[str]:
     summary = (section.__doc__ or "").partition("\n")[0].partition(";")[0].rstrip(".")
     yield from _beside(f"{name}:", summary, "")
     for inner, content in section.model_fields.items():
-        yield from _lines(inner, content, "  ")
+        if inner in given:
+            yield from _beside(f"{inner}: {_flow(given[inner])}", content.description or "", "  ")
+        else:
+            yield from _lines(inner, content, "  ")
 
 
 def _lines(name: str, field: FieldInfo, indent: str) -> Iterator[str]:

@@ -1,0 +1,48 @@
+"""Where a sensor stands if nobody says where."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from lidarpool.floor import floor_under
+from lidarpool.mesh import Mesh
+from lidarpool.scene import Scene
+from lidarpool.terrain import terrain
+
+
+def boxes(*sizes_and_middles):
+    """Boxes, each of a size and with its middle at a height, over (0, 0)."""
+    meshes = []
+    for size, height in sizes_and_middles:
+        mesh = trimesh.creation.box(size)
+        meshes.append(Mesh("box", mesh.vertices + np.array([0, 0, height]), np.asarray(mesh.faces)))
+    return Scene.from_meshes(meshes)
+
+
+def test_on_the_ground_of_a_terrain():
+    scene = terrain(2000, 3, 100)
+    floor = floor_under(scene, 0, 0)
+    assert floor > scene.bounds[0, 2] + 0.1
+    nearest = np.hypot(*scene.vertices[:, :2].T).argmin()
+    assert floor == pytest.approx(scene.vertices[nearest, 2], abs=5)
+
+
+def test_on_a_slab_and_not_on_the_roof():
+    floor_and_roof = boxes(((8, 6, 0.2), -0.1), ((8, 6, 0.2), 3))
+    assert floor_under(floor_and_roof, 0, 0) == pytest.approx(0)
+
+
+def test_within_a_hall_that_is_one_box():
+    assert floor_under(boxes(((8, 6, 3), 1.5)), 0, 0) == 0
+
+
+def test_beside_everything():
+    assert floor_under(boxes(((8, 6, 3), 1.5)), 50, 0) == 0
+
+
+def test_in_world_coordinates():
+    shift = np.array([500_000.0, 4_000_000.0, 20_000.0])
+    ground = np.array([[-9, -9, 0], [9, -9, 0], [9, 9, 3.6], [-9, 9, 3.6]])
+    scene = Scene.from_meshes([Mesh("g", ground + shift, np.array([[0, 1, 2], [0, 2, 3]]))])
+    assert floor_under(scene, 500_001, 4_000_000) == pytest.approx(20_001.8)
+    assert floor_under(scene, 500_001, 4_000_005) == pytest.approx(20_002.8)

@@ -1,0 +1,53 @@
+"""How high the floor is at a place: what a sensor stands on where no pose is given."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .scene import Scene
+
+# Thicker than floors are; what is thicker, such as a hall that is one box, one stands in.
+SLAB_M = 0.5
+
+
+def floor_under(scene: Scene, x: float, y: float) -> float:
+    """Height of the ground or of a floor slab at a place.
+
+    Parameters
+    ----------
+    scene
+        What was read from mesh files.
+    x, y
+        World coordinates, metres.
+
+    Returns
+    -------
+    z in world metres: of the lowest triangle there if it faces up, as ground does, or of the top
+    of a slab that is the lowest thing there; else of the lowest point of the whole scene.
+    """
+    heights, up = _crossings(scene, np.array([x, y]) - scene.origin[:2])
+    if up.any() and heights[up].min() <= heights.min() + SLAB_M:
+        return float(heights[up].min() + scene.origin[2])
+    return float(scene.bounds[0, 2] + scene.origin[2])
+
+
+def _crossings(
+    scene: Scene, at: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Heights (k,) at which a vertical line crosses triangles, and which of them face up."""
+    a, b, c = np.moveaxis(scene.vertices[scene.faces], 1, 0)
+    # Twice the areas of the triangles that the place makes with each side, seen from above.
+    parts = np.stack([_areas(p, q, at) for p, q in ((b, c), (c, a), (a, b))], axis=1)
+    whole = parts.sum(axis=1)
+    here = ((parts >= 0).all(axis=1) | (parts <= 0).all(axis=1)) & (whole != 0)
+    corners = np.stack([a[here, 2], b[here, 2], c[here, 2]], axis=1)
+    return (corners * parts[here]).sum(axis=1) / whole[here], whole[here] > 0
+
+
+def _areas(
+    p: NDArray[np.float64], q: NDArray[np.float64], at: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Twice the areas of p, q and a place from above, positive where they turn left: (f,)."""
+    to_p, to_q = p[:, :2] - at, q[:, :2] - at
+    return np.asarray(to_p[:, 0] * to_q[:, 1] - to_p[:, 1] * to_q[:, 0])
