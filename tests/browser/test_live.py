@@ -42,7 +42,7 @@ class Driven:
 
     def __init__(self, client, live, kept):
         self.error = None
-        run = Run(client, kept)
+        run = Run(client, kept, live.wants_pause)
         show = live.with_progress(lambda progress: None, run.partitions)
 
         def drive():

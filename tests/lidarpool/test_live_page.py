@@ -53,6 +53,7 @@ def test_it_is_there_while_the_run_is(client, capsys):
     assert said.out == ""
     assert shown == [PROGRESS, PROGRESS]
     assert totals == {
+        "run": "running",
         "scans": "2 of 1,200",
         "points": "5,000",
         "trials": "6 of 10",

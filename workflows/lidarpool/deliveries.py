@@ -54,6 +54,9 @@ class Deliveries:
     def look(self) -> None:
         """Do what is to be done from time to time; the run calls it often."""
 
+    def sync(self) -> None:
+        """Make sure of what there is: for a while nothing may come."""
+
     def save(self) -> None:
         """Make sure of everything, at the end."""
 

@@ -110,6 +110,7 @@ class Journal(Deliveries):
         self.path, self.terms = path, terms
         self._store = JournalStore(path, Identity.of(job.scene, job.survey, job.planning))
         super().__init__(job, self._store)
+        self._gone = False  # removed, and not needed any more
         self._totals_file = TotalsFile(path, self.totals)
 
     # -- what is in it -----------------------------------------------------------------
@@ -226,6 +227,13 @@ class Journal(Deliveries):
                 file.sync_if_due()
                 self._totals_file.write_if_due()
 
+    def sync(self) -> None:
+        """Write everything to the disk that was delivered so far."""
+        if (file := self._store.file) is not None:
+            with self._store.explained():
+                file.sync()
+                self._totals_file.write()
+
     # -- the end -----------------------------------------------------------------------
 
     def save(self) -> None:
@@ -244,6 +252,7 @@ class Journal(Deliveries):
 
     def remove(self) -> None:
         """Remove the journal and let go of its files."""
+        self._gone = True
         self.close()
         remove_journal(self.path)
 
@@ -256,7 +265,11 @@ class Journal(Deliveries):
         try:
             yield
         except BaseException as error:
+            if self._gone:
+                raise
             with suppress(LidarpoolError):  # the first error is the one to tell of
+                if not self.kept:
+                    self._store.discard()
                 self.save()
             if self.kept:
                 error.add_note(

@@ -51,7 +51,8 @@ def shown_on_page(client: Client, wanted: bool, show: Show) -> Iterator[Show]:
 def totals(progress: Progress) -> dict[str, str]:
     """Tell what the page shows of a run, beside its tasks."""
     scans = f"{progress.framed:,} of {progress.scans:,}"
-    shown = {"scans": scans, "points": f"{progress.points:,}"}
+    state = "paused" if progress.paused else "running"
+    shown = {"run": state, "scans": scans, "points": f"{progress.points:,}"}
     if progress.trials:
         shown["trials"] = f"{progress.trials_done:,} of {progress.trials:,}"
     shown["replayed"] = f"{progress.replayed:,}"

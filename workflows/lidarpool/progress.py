@@ -11,7 +11,8 @@ class Progress:
 
     `generated`, `cast`, `framed` and `collected` are scans that have passed stage 1 to 4, out
     of `scans`; `trials_done` are planning trials out of `trials`. `seconds` is since the start,
-    `replayed` are batches that were sent or cast once more.
+    `replayed` are batches that were sent or cast once more. `paused` says that somebody has
+    paused the run, and that nothing is under way any more.
     """
 
     scans: int
@@ -24,3 +25,4 @@ class Progress:
     trials_done: int
     seconds: float
     replayed: int = 0
+    paused: bool = False

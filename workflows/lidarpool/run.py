@@ -27,6 +27,7 @@ from .plan import best
 from .progress import Progress
 from .result import Result
 from .scan import GPU, LIDAR, OTHER, Frame, SurveyPump, SurveySetup
+from .standstill import Standstill
 from .task_book import TaskBook
 from .trials import TrialPump
 from .watch import Watch
@@ -37,6 +38,7 @@ T = TypeVar("T")
 _CLUSTER_LOST = (OSError, CommClosedError, FutureCancelledError, PipeClosed, PipeFailed)
 
 PROGRESS_EVERY_S = 0.1
+STANDING_S = 0.1  # from one look at a paused run to the next
 
 
 class Run:
@@ -48,6 +50,8 @@ class Run:
         Client of the cluster.
     kept
         Where the deliveries go, and what an earlier run has left there.
+    wants_pause
+        Asked over and over; while it says yes, what is under way arrives and no more is begun.
 
     Raises
     ------
@@ -55,7 +59,9 @@ class Run:
         If the cluster lacks something.
     """
 
-    def __init__(self, client: Client, kept: Deliveries) -> None:
+    def __init__(
+        self, client: Client, kept: Deliveries, wants_pause: Callable[[], bool] = lambda: False
+    ) -> None:
         job = kept.job
         pool = survey_pool(client, job.collectors, job.planning is not None)
         self.client, self.job, self.kept = client, job, kept
@@ -72,6 +78,7 @@ class Run:
         devices = assign_devices(casting)
         self.setup = SurveySetup(job.scene, job.survey.sensor, kept.backend, devices)
         self.callers_error: BaseException | None = None  # raised by a callback
+        self.standstill = Standstill(wants_pause, kept.sync)
 
     def drive(
         self,
@@ -120,8 +127,13 @@ class Run:
             planning_seconds=times.get(TrialPump, 0.0),
             replayed=survey.replayed,
             duplicates_dropped=survey.duplicates_dropped,
-            notes=self.notes,
+            notes=[*self.notes, *self._note_of_pauses()],
         )
+
+    def _note_of_pauses(self) -> list[str]:
+        """Say how long the run stood still, for whoever reads its times."""
+        seconds = self.standstill.seconds
+        return [f"the run was paused for {seconds:.0f} s, in its times too"] if seconds >= 1 else []
 
     def _survey_pump(self, on_frame: Callable[[Frame], None] | None) -> SurveyPump:
         def take(frame: Frame) -> None:
@@ -166,6 +178,7 @@ class Run:
         told = float("-inf")
         while len(times) < len(pumps):
             moved = False
+            self.standstill.look(pumps)
             for pump in pumps:
                 if not pump.finished:
                     moved |= pump.step()
@@ -179,7 +192,9 @@ class Run:
             if on_progress and (now - told >= PROGRESS_EVERY_S or len(times) == len(pumps)):
                 told = now
                 self._call(on_progress, self._progress(survey, trials, now - started))
-            if moved:
+            if self.standstill.still:
+                time.sleep(STANDING_S)
+            elif moved:
                 pause.reset()
             else:
                 (time.sleep if survey.finished else survey.wait)(pause.next())
@@ -197,6 +212,7 @@ class Run:
             trials_done=len(trials.trials) if trials else 0,
             seconds=seconds,
             replayed=survey.replayed,
+            paused=self.standstill.still,
         )
 
 

@@ -75,16 +75,20 @@ def run_scenario(scenario: Scenario, options: RunOptions) -> None:
     recipe = make_recipe(scenario, click.get_current_context(silent=True))
     _check_backend(options.backend or scenario.pool.backend, options)
     job = make_job(scenario, options.backend, options.no_plan)
-    with _shown_live(job, options) as live:
+    with _told_when_whole(options.out) as whole, _shown_live(job, options) as live:
+
+        def in_place() -> None:
+            whole.append(options.out)
+            kept.remove()
+
         with result_folder(options.out), logged_to(_log(options), options.verbose) as log:
             kept = _deliveries(job, options)
             with kept.kept_on_error():
                 result = _conduct(scenario, kept, options, live)
                 with shown_status("writing the cloud, the pictures and the report", options.quiet):
                     report = write_result(
-                        options.out, result, job.scene, job.survey, job.planning, recipe
+                        options.out, result, job.scene, job.survey, job.planning, recipe, in_place
                     )
-            kept.remove()
         if options.as_json:
             figures = summary(options.out, report, log.path if log.written else None)
             click.echo(json.dumps(figures, indent=1, allow_nan=False))
@@ -95,6 +99,18 @@ def run_scenario(scenario: Scenario, options: RunOptions) -> None:
                 click.echo(f"messages of Dask and other libraries are in {name}", err=True)
         if live is not None and options.stay:
             live.stay()
+
+
+@contextmanager
+def _told_when_whole(out: Path) -> Iterator[list[Path]]:
+    """Let an error say that the result is whole once that is in the list: so is an interrupt."""
+    whole: list[Path] = []
+    try:
+        yield whole
+    except BaseException as error:
+        if whole:
+            error.add_note(f"The result in {out} is complete.")
+        raise
 
 
 @contextmanager
@@ -180,9 +196,9 @@ def _drive(
         shown_progress(options.quiet) as show,
         shown_on_page(client, options.page, show) as show_both,
     ):
-        run = Run(client, kept)
         if live is None:
-            return run.drive(None, show_both)
+            return Run(client, kept).drive(None, show_both)
+        run = Run(client, kept, live.wants_pause)
         return run.drive(live.on_frame, live.with_progress(show_both, run.partitions))
 
 

@@ -107,13 +107,15 @@ class PlainLines:
         self._next = PLAIN_EVERY_S[0]  # seconds since the start at which to tell again
         self._survey, self._planning = _Pace(), _Pace()
         self._done: set[str] = set()
+        self._paused = False
 
     def __call__(self, progress: Progress) -> None:
         """Write what is new, if it is time or something has been completed."""
         now = progress.seconds
         self._survey.add(now, progress.collected)
         self._planning.add(now, progress.trials_done)
-        due = now >= self._next
+        self._tell_pause(progress)
+        due = now >= self._next and not progress.paused
         if due:
             least, most = PLAIN_EVERY_S
             self._next = now + min(max(least, now / 10), most)
@@ -135,6 +137,12 @@ class PlainLines:
                 self._planning.told(progress.trials),
                 progress.trials_done == progress.trials,
             )
+
+    def _tell_pause(self, progress: Progress) -> None:
+        if progress.paused != self._paused:
+            self._paused = progress.paused
+            words = "paused from the live page" if self._paused else "goes on"
+            _tell(self.stream, f"run     {words}, {progress.collected:,} scans are done")
 
     def _line(self, what: str, due: bool, whole: str, part: str, pace: str, done: bool) -> None:
         if what in self._done or not (due or done):
@@ -207,6 +215,8 @@ class _Left(TextColumn):
         super().__init__("")
 
     def render(self, task: Bar) -> Text:
+        if task.fields["paused"] and not task.finished:
+            return Text("paused", style="bold yellow")
         if task.finished:
             return Text(f"in {task.finished_time or 0:.1f} s", style="progress.elapsed")
         left = task.time_remaining
@@ -231,8 +241,9 @@ def _bars(console: Console) -> Iterator[Show]:
             for label, done, total in _BARS:
                 whole = getattr(progress, total)
                 if whole and label not in lines:
-                    lines[label] = bars.add_task(label, total=whole, unit=total)
+                    lines[label] = bars.add_task(label, total=whole, unit=total, paused=False)
                 if label in lines:
-                    bars.update(lines[label], completed=getattr(progress, done))
+                    done_now = getattr(progress, done)
+                    bars.update(lines[label], completed=done_now, paused=progress.paused)
 
         yield show

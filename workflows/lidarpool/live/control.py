@@ -9,14 +9,12 @@ class RunControl:
     """What somebody at the page wants of the run; the run asks for it in its own thread."""
 
     def __init__(self) -> None:
-        self._may_run = threading.Event()
-        self._may_run.set()
-        self._stop = threading.Event()
+        self._pause, self._stop = threading.Event(), threading.Event()
 
     @property
     def paused(self) -> bool:
         """Whether the run is to stand still."""
-        return not self._may_run.is_set() and not self._stop.is_set()
+        return self._pause.is_set() and not self._stop.is_set()
 
     @property
     def stopped(self) -> bool:
@@ -25,27 +23,24 @@ class RunControl:
 
     def pause(self) -> None:
         """Have the run stand still; nothing is lost."""
-        self._may_run.clear()
+        self._pause.set()
 
     def go_on(self) -> None:
         """Have it go on."""
-        self._may_run.set()
+        self._pause.clear()
 
     def stop(self) -> None:
         """Have it end as by Ctrl-C, also when it stands still."""
         self._stop.set()
-        self._may_run.set()
 
-    def obey(self) -> None:
-        """Wait as long as the run is paused.
+    def check(self) -> None:
+        """Do nothing, unless the run is to stop.
 
         Raises
         ------
         KeyboardInterrupt
-            If it is to stop.
+            If it is.
         """
-        while not self._may_run.wait(0.1):  # a wait without limit would keep Ctrl-C out
-            pass
         if self._stop.is_set():
             raise KeyboardInterrupt
 

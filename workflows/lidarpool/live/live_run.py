@@ -96,7 +96,7 @@ class LiveRun:
         self.painter.ask()
 
     def on_progress(self, progress: Progress) -> None:
-        """Note how far the run is; waits as long as it is paused.
+        """Note how far the run is.
 
         Raises
         ------
@@ -112,7 +112,11 @@ class LiveRun:
                     stats = partition.stats()
                     self._busy[name] = Occupancy(stats.busy, stats.slots)
         self.painter.ask()
-        self.control.obey()
+        self.control.check()
+
+    def wants_pause(self) -> bool:
+        """Whether the run is to stand still."""
+        return self.control.paused
 
     def finish(self) -> None:
         """Say that the run is over, and show all of it."""
@@ -155,7 +159,8 @@ class LiveRun:
         words = self._words
         if not self._over:
             words = "stopping" if self.control.stopped else words
-            words = "paused" if self.control.paused else words
+            if self.control.paused and self._progress is not None:
+                words = "paused" if self._progress.paused else "pausing"
         frames = self._scene.frames
         state = RunState(
             words, dict(self._busy), self._scene.displayed, frames.taken, frames.dropped

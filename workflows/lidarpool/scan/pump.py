@@ -126,6 +126,7 @@ class SurveyPump:
             on_deaths=lambda names: self._handover.note_deaths([n.split("-")[0] for n in names]),
             where=self._where,
         )
+        self.paused = False  # whether no more scans are taken; what is under way arrives
         self._empty: list[str] = []  # pipes in which nothing came while this waited
         self._moved_at = time.monotonic()  # when something was last handed on or delivered
         self._closed_at: float | None = None  # when all had arrived and the pipes were closed
@@ -151,6 +152,11 @@ class SurveyPump:
     def complete(self) -> bool:
         """Whether every frame and every point has arrived."""
         return self.frames.complete and self.cloud.ledger.complete
+
+    @property
+    def idle(self) -> bool:
+        """Whether no scan is under way."""
+        return not self._under_way
 
     @property
     def finished(self) -> bool:
@@ -262,7 +268,7 @@ class SurveyPump:
     @property
     def _has_room(self) -> bool:
         """Whether more may be submitted now."""
-        if self._under_way.condemned or len(self._under_way) >= self._most:
+        if self.paused or self._under_way.condemned or len(self._under_way) >= self._most:
             return False
         return self._caster.room > 0
 
