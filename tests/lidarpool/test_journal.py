@@ -17,6 +17,7 @@ from lidarpool.deliveries import Deliveries
 from lidarpool.job import Job
 from lidarpool.journal import COMMAND_TERMS, Journal, open_journal
 from lidarpool.journal_folder import FRAMES, RECORDS
+from lidarpool.journal_format import TRIAL
 from lidarpool.mesh import Mesh
 from lidarpool.plan import Trial
 from lidarpool.records import HEAD_BYTES
@@ -216,6 +217,31 @@ def test_an_interrupt_while_the_journal_is_made_leaves_nothing(path, monkeypatch
     journal = reopen(path)
     with pytest.raises(KeyboardInterrupt) as caught, journal.kept_on_error():
         deliver(journal)
+    assert not path.exists()
+    assert not getattr(caught.value, "__notes__", [])
+
+
+def test_an_interrupt_before_the_first_delivery_is_kept_leaves_nothing(path, monkeypatch):
+    def interrupt(self, *delivery):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("lidarpool.records.RecordFile.sync_if_due", interrupt)
+    journal = reopen(path)
+    with pytest.raises(KeyboardInterrupt) as caught, journal.kept_on_error():
+        journal.backend = "numpy"
+        journal._store.append_record(TRIAL, b"")  # not entered: the interrupt came before that
+        assert path.exists()
+        journal.look()
+    assert not path.exists()
+    assert not getattr(caught.value, "__notes__", [])
+
+
+def test_an_interrupt_after_the_journal_was_removed_says_nothing_of_it(path):
+    journal = reopen(path)
+    with pytest.raises(KeyboardInterrupt) as caught, journal.kept_on_error():
+        deliver(journal)
+        journal.remove()
+        raise KeyboardInterrupt
     assert not path.exists()
     assert not getattr(caught.value, "__notes__", [])
 

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 from lidarpool.log_file import LOG
+from lidarpool.output import FILES
 
 pytestmark = pytest.mark.skipif(
     not Path("/proc/self/environ").exists(), reason="finds the processes of a run through /proc"
@@ -118,6 +119,38 @@ def test_ctrl_c_while_pictures_are_written(start, untouched):
     check_interrupted(run, run.signal(signal.SIGINT, group=True))
     assert "stopped. 108 of 108 scans are kept in out/journal" in run.said
     assert untouched(journal=True)
+
+
+INTERRUPT_AT = """
+import os
+from pathlib import Path
+import lidarpool.run_command
+def interrupt_in(owner, name, when):
+    function = getattr(owner, name)
+    def interrupted(*arguments):
+        if when(*arguments):
+            os.kill(os.getpid(), 2)
+        return function(*arguments)
+    setattr(owner, name, interrupted)
+"""
+MOMENTS = {
+    "moved in": "interrupt_in(Path, 'replace', lambda path, to: to.name == 'cloud.ply')",
+    "journal": "interrupt_in(Path, 'rmdir', lambda path: path.name == 'journal')",
+    "told": "interrupt_in(lidarpool.run_command, '_tell', lambda *_: True)",
+}
+
+
+@pytest.mark.parametrize("moment", MOMENTS)
+def test_ctrl_c_when_the_result_is_whole(moment, start_command, cluster, tmp_path):
+    """It is not said that nothing has happened, and there is nothing to resume."""
+    options = ("--scheduler", cluster, "-q", "--no-plan")
+    run = start_command(SHORT, *options, prelude=INTERRUPT_AT + MOMENTS[moment] + "\n")
+    assert run.process.wait(60) == 130, run.said
+    assert run.said.splitlines()[-1] == (
+        "lidarpool: interrupted; everything was stopped. The result in out is complete."
+    )
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert names == {*FILES} - {"path.png"}
 
 
 def test_a_second_ctrl_c_ends_it_at_once():

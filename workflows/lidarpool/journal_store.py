@@ -58,6 +58,15 @@ class JournalStore:
         assert self.file is not None  # or nobody could know of an offset
         self.file.read_into(offset, buffer)
 
+    def discard(self) -> None:
+        """Remove what there is of the journal: there is a header, and nothing was delivered."""
+        if self.file is not None:
+            self.file.close()
+            self.file = None
+            with self.explained():
+                remove_files(self.folder)
+                remove_folder(self.folder)
+
     def close(self) -> None:
         """Let go of the file; afterwards the points cannot be read any more."""
         if self.file is not None:

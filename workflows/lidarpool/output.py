@@ -79,12 +79,14 @@ def write_result(
     survey: Survey,
     planning: Planning | None,
     recipe: Recipe | None = None,
+    then: Callable[[], object] = lambda: None,
 ) -> dict[str, Any]:
     """Write cloud, pictures and report, and return the report.
 
     They are made in a temporary folder within `folder` and moved into place together once
     all are there and on the disk, so that an earlier result stays whole if one cannot be
-    written. A picture that an earlier run made and this one does not is removed.
+    written. A picture that an earlier run made and this one does not is removed. `then` is
+    called when all are in place, before an interrupt that came meanwhile is let through.
 
     Raises
     ------
@@ -107,6 +109,7 @@ def write_result(
             with deferred_interrupts():
                 whole = staged.rename(folder / f"{_COMPLETE}{secrets.token_hex(4)}")
                 _publish(whole, folder)
+                then()
         finally:
             shutil.rmtree(staged, ignore_errors=True)  # it is gone already if all went well
     except LidarpoolError as error:  # names the file; its temporary folder is nobody's business
