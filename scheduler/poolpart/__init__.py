@@ -5,6 +5,7 @@ from .awaiting import await_news
 from .backoff import Backoff
 from .current_client import own_client
 from .departure import WorkerLeft, telling_departure
+from .devices import assign_devices, own_device
 from .errors import PipeClosed, PipeFailed, PoolError
 from .fence import lower_fence, raise_fence
 from .fetch import fetch_available
@@ -28,7 +29,7 @@ from .slots import Slots, look_at_slots
 from .stats import PartitionStats, StageStats
 from .tracing import trace, trace_to
 from .whereabouts import TaskPlace, Whereabouts, look_for_tasks
-from .worker_info import WorkerInfo, assign_devices
+from .worker_info import WorkerInfo
 
 __all__ = [
     "Backoff",
@@ -63,6 +64,7 @@ __all__ = [
     "n_workers",
     "named",
     "own_client",
+    "own_device",
     "partitions_page",
     "per_gpu",
     "per_host",

@@ -30,14 +30,21 @@ if cuda.cuInit(0) == 0 and cuda.cuDeviceGetCount(ctypes.byref(count)) == 0:
 """
 
 
+def has_driver() -> bool:
+    """Whether this machine has a CUDA driver; whether it works is another question."""
+    try:
+        ctypes.CDLL(_DRIVER)
+    except OSError:
+        return False
+    return True
+
+
 def visible_gpus() -> tuple[str, ...]:
     """UUIDs of the CUDA devices this process may use, by ordinal; empty without a driver.
 
     A driver that is there and cannot be asked counts as none, with a warning in the log.
     """
-    try:
-        ctypes.CDLL(_DRIVER)
-    except OSError:
+    if not has_driver():
         return ()
     try:
         listing = subprocess.run(

@@ -59,33 +59,3 @@ class WorkerInfo:
             gpus=gpus,
             resources=dict(identity["resources"]),
         )
-
-
-def assign_devices(workers: Iterable[WorkerInfo]) -> dict[str, int]:
-    """Which CUDA device each worker should use, by the worker's own numbering.
-
-    Workers of one host spread over its devices. Each takes the first device in its own list
-    that the fewest others have: dask-cuda rotates `CUDA_VISIBLE_DEVICES` from worker to
-    worker so that number 0 is another device in each, whereas workers from a plain
-    `dask worker` all list the same devices in the same order. Those with the fewest to
-    choose from choose first.
-
-    Returns
-    -------
-    dict
-        Worker name to ordinal, for the workers that see any device.
-
-    Examples
-    --------
-    >>> one, two = (WorkerInfo(n, "", "host", 1, gpus=("a", "b")) for n in ("one", "two"))
-    >>> assign_devices([one, two])
-    {'one': 0, 'two': 1}
-    """
-    users: dict[str, int] = {}  # {device UUID: workers that have it}; UUIDs differ between hosts
-    chosen: dict[str, int] = {}
-    for worker in sorted(workers, key=lambda worker: len(worker.gpus)):
-        if worker.gpus:
-            ordinal = min(range(len(worker.gpus)), key=lambda i: users.get(worker.gpus[i], 0))
-            chosen[worker.name] = ordinal
-            users[worker.gpus[ordinal]] = users.get(worker.gpus[ordinal], 0) + 1
-    return chosen

@@ -75,8 +75,8 @@ class Run:
                 f"no GPU in partition GPU: {len(casting)} CPU worker{'s' * (len(casting) > 1)} "
                 f"cast{'s' * (len(casting) == 1)} the rays with {kept.backend}"
             )
-        devices = assign_devices(casting)
-        self.setup = SurveySetup(job.scene, job.survey.sensor, kept.backend, devices)
+        assign_devices(client, casting)  # all at once: those that see few of them choose first
+        self.setup = SurveySetup(job.scene, job.survey.sensor, kept.backend)
         self.callers_error: BaseException | None = None  # raised by a callback
         self.standstill = Standstill(wants_pause, kept.sync)
 

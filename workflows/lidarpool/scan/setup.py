@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from distributed import get_worker
 from numpy.typing import NDArray
 
+from poolpart import own_device
 from raybeam import Pattern, RayCaster, Returns
 
 from ..scene import Scene
@@ -32,14 +33,11 @@ class SurveySetup:
         The lidar.
     backend
         Name of the ray-casting backend, the same on all workers.
-    devices
-        CUDA device of each worker that has one, by worker name.
     """
 
     scene: Scene
     sensor: Sensor
     backend: str
-    devices: dict[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._lock = threading.Lock()
@@ -47,19 +45,18 @@ class SurveySetup:
         self._pattern: Pattern | None = None
 
     def __reduce__(self) -> tuple[type[SurveySetup], tuple[object, ...]]:
-        return SurveySetup, (self.scene, self.sensor, self.backend, self.devices)
+        return SurveySetup, (self.scene, self.sensor, self.backend)
 
     def _ready(self) -> tuple[RayCaster, Pattern]:
         with self._lock:
             if self._caster is None or self._pattern is None:
-                worker = get_worker()
                 self._pattern = Pattern(self.sensor.directions.reshape(-1, 3))
                 self._caster = RayCaster(
                     self.scene.vertices,
                     self.scene.faces,
                     backend=self.backend,
-                    threads=worker.state.nthreads,
-                    device=self.devices.get(str(worker.name), 0),
+                    threads=get_worker().state.nthreads,
+                    device=own_device(),
                 )
             return self._caster, self._pattern
 
