@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from .checks import AUTO_TAKES
 from .job import Job
 from .plan import Trial
+from .progress import Progress
 from .scan import CloudBuilder
 from .scan.point_store import PointStore
 from .totals import FrameTotals
@@ -46,6 +47,21 @@ class Deliveries:
     def advice(self) -> str:
         """What to do where the backend is not to be had, for the end of a message."""
         return AUTO_TAKES
+
+    def progress(self) -> Progress:
+        """How far a run is that goes on from here, before it does."""
+        both_ways = sum(scan in self.cloud.ledger for scan in range(self.totals.frames))
+        return Progress(
+            scans=self.job.survey.scan_count,
+            generated=min(self.totals.frames, self.cloud.ledger.first_missing),
+            cast=both_ways,
+            framed=self.totals.frames,
+            collected=self.cloud.ledger.delivered,
+            points=self.cloud.point_count,
+            trials=self.job.trials,
+            trials_done=len(self.trials),
+            seconds=0.0,
+        )
 
     def add_trial(self, trial: Trial) -> None:
         """Enter a planning trial."""

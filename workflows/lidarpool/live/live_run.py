@@ -73,6 +73,9 @@ class LiveRun:
             for points in kept.cloud.stored_points():
                 self._scene.points.take(points)
         kept.cloud.on_points = self._scene.points.take
+        if kept.resumed or kept.trials:
+            self._progress = kept.progress()
+        self.painter.ask()
 
     def with_progress(self, show: Show, partitions: Mapping[str, Partition]) -> Show:
         """Return a function to call with the progress: it calls `show` and tells the page.
