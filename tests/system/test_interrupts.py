@@ -134,7 +134,7 @@ def interrupt_in(owner, name, when):
     setattr(owner, name, interrupted)
 """
 MOMENTS = {
-    "moved in": "interrupt_in(Path, 'replace', lambda path, to: to.name == 'cloud.ply')",
+    "moved in": "interrupt_in(Path, 'replace', lambda path, to: to == Path('out/cloud.ply'))",
     "journal": "interrupt_in(Path, 'rmdir', lambda path: path.name == 'journal')",
     "told": "interrupt_in(lidarpool.run_command, '_tell', lambda *_: True)",
 }
