@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn, TypeVar
 
 import click
 
@@ -37,22 +38,38 @@ _out = click.option(
     show_default=True,
     help="Folder for the results; made if it is not there.",
 )
-_quiet = click.option("--quiet", "-q", is_flag=True, help="No progress, only the result.")
-_verbose = click.option(
-    "--verbose", "-v", is_flag=True, help=f"Keep more messages in {LOG}, in the folder of --out."
-)
-_json = click.option(
-    "--json", "as_json", is_flag=True, help="Print the main figures as one JSON document."
+# What `demo` and `run` have in common; each is a field of RunOptions.
+_SHOWN = (
+    click.option("--tls", is_flag=True, help="Encrypt the traffic of the local cluster."),
+    click.option(
+        "--live", is_flag=True, help="Show the run in the browser; the page stays until Ctrl-C."
+    ),
+    click.option(
+        "--no-stay", "stay", flag_value=False, default=True, help="With --live: end with the run."
+    ),
+    click.option(
+        "--page", is_flag=True, help="Add a page of partitions to Dask's dashboard, and say where."
+    ),
+    click.option("--quiet", "-q", is_flag=True, help="No progress, only the result."),
+    click.option(
+        "--verbose",
+        "-v",
+        is_flag=True,
+        help=f"Keep more messages in {LOG}, in the folder of --out.",
+    ),
+    click.option(
+        "--json", "as_json", is_flag=True, help="Print the main figures as one JSON document."
+    ),
 )
 
-_live = click.option(
-    "--live", is_flag=True, help="Show the run in the browser; the page stays until Ctrl-C."
-)
-_no_stay = click.option("--no-stay", is_flag=True, help="With --live: end with the run.")
-_page = click.option(
-    "--page", is_flag=True, help="Add a page of partitions to Dask's dashboard, and say where."
-)
-_tls = click.option("--tls", is_flag=True, help="Encrypt the traffic of the local cluster.")
+Command = TypeVar("Command", bound=Callable[..., None])
+
+
+def _shown(command: Command) -> Command:
+    """Give a command the options of `_SHOWN`, in their order."""
+    for option in reversed(_SHOWN):
+        command = option(command)
+    return command
 
 
 @click.group(cls=CommandGroup, context_settings={"max_content_width": 100})
@@ -67,23 +84,8 @@ for _command in (init, check, schema, scene, completion, view, plot):
 
 @cli.command()
 @_out
-@_tls
-@_live
-@_no_stay
-@_page
-@_quiet
-@_verbose
-@_json
-def demo(
-    out: Path,
-    tls: bool,
-    live: bool,
-    no_stay: bool,
-    page: bool,
-    quiet: bool,
-    verbose: bool,
-    as_json: bool,
-) -> None:
+@_shown
+def demo(out: Path, **shown: Any) -> None:
     """Run the default survey and path planning on a cluster on this machine.
 
     \b
@@ -91,18 +93,7 @@ def demo(
       lidarpool demo --live
       lidarpool demo --out /tmp/demo
     """  # noqa: D301 - click wants the character, not its name
-    options = RunOptions(
-        out,
-        tls=tls,
-        journal=False,
-        quiet=quiet,
-        verbose=verbose,
-        as_json=as_json,
-        live=live,
-        stay=not no_stay,
-        page=page,
-    )
-    run_scenario(Scenario(), options)
+    run_scenario(Scenario(), RunOptions(out, journal=False, **shown))
 
 
 @cli.command()
@@ -110,7 +101,6 @@ def demo(
 @_out
 @click.option("--scheduler", metavar="ADDRESS", help="Use this Dask cluster, tcp://host:8786.")
 @tls_file_options
-@_tls
 @click.option(
     "--backend",
     metavar="[auto|cuda|embree|numpy]",
@@ -120,12 +110,7 @@ def demo(
 @click.option("--no-plan", is_flag=True, help="Leave the path planning out.")
 @click.option("--resume", is_flag=True, help="Go on with an unfinished run, if there is one.")
 @click.option("--fresh", is_flag=True, help="Drop an unfinished run.")
-@_live
-@_no_stay
-@_page
-@_quiet
-@_verbose
-@_json
+@_shown
 def run(
     scenario: Path,
     out: Path,
@@ -134,16 +119,10 @@ def run(
     no_plan: bool,
     resume: bool,
     fresh: bool,
-    live: bool,
-    no_stay: bool,
-    page: bool,
-    quiet: bool,
-    verbose: bool,
-    as_json: bool,
-    tls: bool,
     tls_ca: Path | None,
     tls_cert: Path | None,
     tls_key: Path | None,
+    **shown: Any,
 ) -> None:
     """Run a survey from a scenario file, or of a mesh file from its middle.
 
@@ -153,7 +132,7 @@ def run(
       lidarpool run hall.glb --no-plan --resume --scheduler tcp://127.0.0.1:8786
     """  # noqa: D301 - click wants the character, not its name
     files = tls_files_for(scheduler, tls_ca, tls_cert, tls_key)
-    if tls and scheduler is not None:
+    if shown["tls"] and scheduler is not None:
         raise click.UsageError(
             "--tls is for a cluster of this machine; that of --scheduler is encrypted if its "
             "address begins with tls://."
@@ -161,20 +140,7 @@ def run(
     if resume and fresh:
         raise click.UsageError("--resume goes on with what --fresh drops: give one of them.")
     options = RunOptions(
-        out,
-        scheduler,
-        files,
-        tls,
-        backend,
-        no_plan,
-        resume=resume,
-        fresh=fresh,
-        quiet=quiet,
-        verbose=verbose,
-        as_json=as_json,
-        live=live,
-        stay=not no_stay,
-        page=page,
+        out, scheduler, files, backend=backend, no_plan=no_plan, resume=resume, fresh=fresh, **shown
     )
     run_scenario(Scenario.load(scenario), options)
 
