@@ -9,11 +9,13 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 import pytest
 import yaml
 
 from lidarpool import Cloud, Planning, Result, Scene, Survey
+from lidarpool.cli import cli
 from lidarpool.mesh import Mesh
 from lidarpool.plan import best
 from lidarpool.plan.trial import run_trial
@@ -455,3 +457,15 @@ def test_a_million_poses_are_cut_short():
     recipe = make_recipe(scenario, None)
     assert recipe.remark == "Only the first 500 of its 5,000 poses are written here."
     assert len(yaml.safe_load(recipe.scenario)["poses"]) == 500
+
+
+def test_a_recipe_holds_the_command_as_it_was_given(monkeypatch):
+    commands = []
+
+    def note(scenario, options):
+        commands.append(make_recipe(scenario, click.get_current_context()).command)
+
+    monkeypatch.setattr("lidarpool.cli.run_scenario", note)
+    for words in (["demo"], ["demo", "--live", "--no-stay", "--out", "my result"]):
+        cli.main(words, prog_name="lidarpool", standalone_mode=False)
+    assert commands == ["lidarpool demo", "lidarpool demo --out 'my result' --live --no-stay"]

@@ -75,7 +75,8 @@ def _words(context: click.Context) -> list[str]:
         if isinstance(parameter, click.Argument):
             words.append(str(value))
         else:
-            named += [max(parameter.opts, key=len)] + [str(value)] * (value is not True)
+            flag = isinstance(parameter, click.Option) and parameter.is_flag
+            named += [max(parameter.opts, key=len)] + [str(value)] * (not flag)
     return words + named
 
 
