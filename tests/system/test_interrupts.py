@@ -75,8 +75,13 @@ def said_besides_progress(run: Any) -> list[str]:
 
 @pytest.mark.parametrize(
     ("number", "group"),
-    [(signal.SIGINT, False), (signal.SIGINT, True), (signal.SIGTERM, True)],
-    ids=["INT", "Ctrl-C", "TERM"],
+    [
+        (signal.SIGINT, False),
+        (signal.SIGINT, True),
+        (signal.SIGTERM, True),
+        (signal.SIGHUP, True),  # the terminal was closed
+    ],
+    ids=["INT", "Ctrl-C", "TERM", "HUP"],
 )
 def test_an_interrupted_survey_ends_cleanly(number, group, start, untouched):
     run = start(LONG).wait_for(SURVEYING)
@@ -112,6 +117,21 @@ def test_ctrl_c_while_the_workers_start(start, untouched):
     time.sleep(0.5)  # their Python has started, lidarpool is not yet imported
     check_interrupted(run, run.signal(signal.SIGINT, group=True))
     assert untouched()
+
+
+@pytest.mark.parametrize("when", ["end_on_signals", "interrupt_on_signals"])
+def test_nohup_is_obeyed(when):
+    script = (
+        "import signal\n"
+        f"from lidarpool.interrupts import {when}, deferred_interrupts\n"
+        "signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
+        f"{when}()\n"
+        "signal.raise_signal(signal.SIGHUP)\n"
+        "with deferred_interrupts(): signal.raise_signal(signal.SIGHUP)\n"
+        "print('still here')\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, check=False)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (0, b"still here\n", b"")
 
 
 def test_ctrl_c_while_pictures_are_written(start, untouched):

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: once stops cleanly, twice stops now, and neither hits a worker."""
+"""Ctrl-C, SIGTERM, SIGHUP: once stops cleanly, twice stops now, and none hits a worker."""
 
 from __future__ import annotations
 
@@ -6,16 +6,19 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
 from types import FrameType
+from typing import NoReturn
 
 INTERRUPTED = 130  # exit code, as shells give it to whatever Ctrl-C ended
 STOPPED = "interrupted; everything was stopped"
 UNTOUCHED = f"{STOPPED}, and the output folder is as it was."
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)  # from the keyboard, and from a job manager
+# From the keyboard, from a job manager, and from a terminal that is closed (not on Windows).
+_NAMES = ("SIGINT", "SIGTERM", "SIGHUP")
+_SIGNALS = tuple(getattr(signal, name) for name in _NAMES if hasattr(signal, name))
 _IMPATIENT_S = 1.0  # a second signal sooner than this is the first one's twin
 
 
@@ -30,26 +33,30 @@ class _Interrupt:
             self.first_at = time.monotonic()
             raise KeyboardInterrupt
         if time.monotonic() - self.first_at > _IMPATIENT_S:
-            os.write(2, b"lidarpool: stopped at once; workers of this machine end by themselves.\n")
-            os._exit(INTERRUPTED)
+            _exit(b"lidarpool: stopped at once; workers of this machine end by themselves.\n")
 
 
 def end_on_signals() -> None:
-    """Let SIGINT and SIGTERM end the process at once: as long as nothing has been started."""
-
-    def end(number: int, frame: FrameType | None) -> None:
-        os.write(2, f"lidarpool: {UNTOUCHED}\n".encode())
-        os._exit(INTERRUPTED)
-
-    for number in _SIGNALS:
-        signal.signal(number, end)
+    """Let these signals end the process at once: as long as nothing has been started."""
+    _on_signals(lambda number, frame: _exit(f"lidarpool: {UNTOUCHED}\n".encode()))
 
 
 def interrupt_on_signals() -> None:
-    """Turn SIGINT and SIGTERM into KeyboardInterrupt; a second one ends the process at once."""
-    interrupt = _Interrupt()
+    """Turn these signals into KeyboardInterrupt; a second one ends the process at once."""
+    _on_signals(_Interrupt())
+
+
+def _on_signals(handler: Callable[[int, FrameType | None], object]) -> None:
     for number in _SIGNALS:
-        signal.signal(number, interrupt)
+        # `nohup` has a run go on when its terminal is closed.
+        if signal.getsignal(number) is not signal.SIG_IGN or number == signal.SIGINT:
+            signal.signal(number, handler)
+
+
+def _exit(message: bytes) -> NoReturn:
+    with suppress(OSError):  # the terminal may be gone
+        os.write(2, message)
+    os._exit(INTERRUPTED)
 
 
 @contextmanager
@@ -66,7 +73,11 @@ def deferred_interrupts() -> Iterator[None]:
     seen: list[int] = []
     before = {n: signal.getsignal(n) for n in _SIGNALS}
     # What raises nothing any more cannot break the body, and somebody is impatient.
-    held = [n for n in before if getattr(before[n], "first_at", None) is None]
+    held = [
+        number
+        for number, handler in before.items()
+        if handler is not signal.SIG_IGN and getattr(handler, "first_at", None) is None
+    ]
     for number in held:
         signal.signal(number, lambda number, _: seen.append(number))
     try:
@@ -82,18 +93,20 @@ def deferred_interrupts() -> Iterator[None]:
 def children_spared() -> Iterator[None]:
     """Start processes in the body, and threads that start some later, which Ctrl-C spares.
 
-    A terminal sends SIGINT to the whole process group. Workers that it hits die with a
-    traceback each, before whoever started them can stop them in good order. A blocked signal
+    A terminal sends SIGINT to the whole process group, and SIGHUP when it is closed. Workers
+    that are hit die, with a traceback each, before whoever started them can stop them in good
+    order; and what is to clear up behind them would die as well. A blocked signal
     stays blocked in threads and processes that come after, also in a worker that a nanny
     starts again.
     """
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
-    # It is started with the first process, and whoever starts it has SIGINT unblocked after.
-    resource_tracker.ensure_running()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP})
     try:
+        # It is started with the first process, and whoever starts it has SIGINT unblocked after.
+        resource_tracker.ensure_running()
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
