@@ -39,8 +39,11 @@ class MapOptions:
     window: int | None = None
     chunk: int | None = None
     priority: int = 0
+    retries: int = 0
 
     def __post_init__(self) -> None:
+        if not isinstance(self.retries, int) or self.retries < 0:
+            raise ValueError(f"retries is {self.retries!r}; give a whole number, 0 or more.")
         for name in ("window", "chunk"):
             value = getattr(self, name)
             if value is not None and (not isinstance(value, int) or value < 1):
@@ -166,6 +169,7 @@ class Results(Iterator[Any]):
             [chunk.calls for chunk in chunks],
             key=f"map-{funcname(self._function)}",
             priority=self._options.priority,
+            retries=self._options.retries,
             wait=wait,
         )
         for future, chunk in zip(futures, chunks, strict=False):
@@ -247,7 +251,8 @@ class Results(Iterator[Any]):
             count = len(answer.results)
             self._ready.extend(answer.results)
             self._next_item += count
-            if answer.failure is not None:
+            # The item that failed is the first of a task then, which Dask runs again itself.
+            if answer.failure is not None and not self._options.retries:
                 self._failed = chunk, answer
             elif count < len(chunk.calls):
                 heapq.heappush(self._again, (first + count, chunk.calls[count:]))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
+from typing import Any
 
 from distributed import Client
 
@@ -29,17 +30,31 @@ class Partition(Submitter):
     name
         Name of the partition and of the resource.
     client
-        Client of the cluster.
+        Client of the cluster. By default, in a task, that of its worker.
     note
         Something a user should know of it, such as that it had to do without GPUs.
     priority
         Priority of its tasks where none is given: of tasks that wait for the same worker,
         those of a higher one run first. It can be changed.
+
+    Notes
+    -----
+    It can be given to a task, which submits with the client of its worker then.
     """
 
-    def __init__(self, name: str, client: Client, note: str = "", priority: int = 0) -> None:
+    def __init__(
+        self, name: str, client: Client | None = None, note: str = "", priority: int = 0
+    ) -> None:
         super().__init__(name, client, priority)
         self.note = note
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        if self._quota is not None:
+            raise TypeError(
+                f"A handle on {self.name!r} with a quota cannot be sent to a task, since it counts "
+                "what is submitted where it was made: send the partition, and limit it there."
+            )
+        return Partition, (self.name, None, self.note, self.priority)
 
     @property
     def workers(self) -> tuple[WorkerInfo, ...]:

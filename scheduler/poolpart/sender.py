@@ -47,12 +47,14 @@ class Sender:
         key: str | None,
         priority: int,
         worker: str | None,
+        retries: int,
     ) -> Future:
         """Submit one task; waits until the quota allows it."""
         if taken := sorted(_OPTIONS_OF_SUBMIT & kwargs.keys()):
             raise TypeError(
                 f"{', '.join(taken)}: Client.submit has options of this name, so that "
-                f"{function} would not get it; bind it with functools.partial."
+                f"{function} would not get it: bind it with functools.partial. To give Dask the "
+                f"option, use Client.submit(…, resources={{{self.resource!r}: 1}})."
             )
         if self.quota is not None:
             self.quota.take(1, wait=True)
@@ -63,6 +65,7 @@ class Sender:
                 key=key,
                 pure=False,
                 priority=priority,
+                retries=retries or None,
                 resources={self.resource: 1},
                 workers=None if worker is None else [worker],
                 **kwargs,
@@ -77,6 +80,7 @@ class Sender:
         *columns: Sequence[Any],
         key: str,
         priority: int,
+        retries: int,
         wait: bool,
     ) -> list[Future]:
         """Submit a task for each row of arguments, in one message, as far as the quota allows.
@@ -91,6 +95,8 @@ class Sender:
             What the tasks' keys start with.
         priority
             Higher runs first.
+        retries
+            How often a task that fails runs again.
         wait
             Whether to wait until the quota allows at least one.
 
@@ -111,6 +117,7 @@ class Sender:
                 key=key,
                 pure=False,
                 priority=priority,
+                retries=retries or None,
                 resources={self.resource: 1},
             )
         if self.quota is not None:

@@ -10,6 +10,7 @@ from typing import Any, Self
 from dask.utils import funcname
 from distributed import Client, Future
 
+from .current_client import own_client
 from .mapping import MapOptions, Results
 from .quota import Quota
 from .sender import Sender
@@ -23,14 +24,27 @@ class Submitter(abc.ABC):
     name
         Name of the resource.
     client
-        Client of the cluster.
+        Client of the cluster. By default, in a task, that of its worker.
     priority
         Priority of tasks where none is given.
     """
 
-    def __init__(self, name: str, client: Client, priority: int = 0) -> None:
-        self.name, self.client, self.priority = name, client, priority
-        self._sender = Sender(client, name)
+    def __init__(self, name: str, client: Client | None = None, priority: int = 0) -> None:
+        self.name, self.priority = name, priority
+        self._client = client
+        self._quota: Quota | None = None
+
+    @property
+    def client(self) -> Client:
+        """The client that is used."""
+        # Not where it is unpickled: that happens in the event loops of scheduler and worker.
+        if self._client is None:
+            self._client = own_client()
+        return self._client
+
+    @property
+    def _sender(self) -> Sender:
+        return Sender(self.client, self.name, self._quota)
 
     @property
     @abc.abstractmethod
@@ -44,6 +58,7 @@ class Submitter(abc.ABC):
         *args: Any,
         key: str | None = None,
         priority: int | None = None,
+        retries: int = 0,
         worker: str | None = None,
         **kwargs: Any,
     ) -> Future:
@@ -52,13 +67,15 @@ class Submitter(abc.ABC):
         Parameters
         ----------
         function, args, kwargs
-            What to call. Arguments named `key`, `priority` or like another option of
-            `Client.submit` are not passed on by name: give them by position, or bind them
-            with `functools.partial`.
+            What to call. Arguments named like an option of `Client.submit`, such as `key` or
+            `workers`, are not passed on by name: give them by position, or bind them with
+            `functools.partial`.
         key
             The task's key; by default a new one, so that equal calls run each by itself.
         priority
             Higher runs first; the partition's by default.
+        retries
+            How often the task runs again if it fails.
         worker
             Address of the one member to run on; if it leaves, the task waits for ever.
 
@@ -69,10 +86,16 @@ class Submitter(abc.ABC):
         Raises
         ------
         TypeError
-            If a keyword is an option of `Client.submit`.
+            If a keyword is another option of `Client.submit`.
         """
         return self._sender.send(
-            function, args, kwargs, key=key, priority=self._default(priority), worker=worker
+            function,
+            args,
+            kwargs,
+            key=key,
+            priority=self._default(priority),
+            worker=worker,
+            retries=retries,
         )
 
     def submit_many(
@@ -81,6 +104,7 @@ class Submitter(abc.ABC):
         /,
         *iterables: Iterable[Any],
         priority: int | None = None,
+        retries: int = 0,
     ) -> list[Future]:
         """Submit one task for each item, in one message; see `map` for many or endless items.
 
@@ -94,13 +118,15 @@ class Submitter(abc.ABC):
         """
         columns = list(zip(*zip(*iterables, strict=False), strict=True))
         count = len(columns[0]) if columns else 0
+        sender = self._sender
         futures: list[Future] = []
         while (start := len(futures)) < count:
-            futures += self._sender.send_many(
+            futures += sender.send_many(
                 function,
-                *(column[start : start + self._sender.most] for column in columns),
+                *(column[start : start + sender.most] for column in columns),
                 key=funcname(function),
                 priority=self._default(priority),
+                retries=retries,
                 wait=True,
             )
         return futures
@@ -114,6 +140,7 @@ class Submitter(abc.ABC):
         window: int | None = None,
         chunk: int | None = None,
         priority: int | None = None,
+        retries: int = 0,
     ) -> Results:
         """Call a function for each item; an iterator gives the results.
 
@@ -136,20 +163,22 @@ class Submitter(abc.ABC):
             there are many slots. Give 1 where items differ much, or must not wait for others.
         priority
             Higher runs first; the partition's by default.
+        retries
+            How often an item that fails is tried again, at least.
 
         Returns
         -------
         Results
             An iterator. It raises what `function` raises, after the results before; a note
-            names the item. To stop early, close it or let go of it: tasks that have not
-            started never do.
+            names the item. To go on after such an item, have `function` catch and return the
+            error. To stop early, close it or let go of it: tasks that have not started never do.
 
         Raises
         ------
         ValueError
-            If the window or the chunk is below 1.
+            If the window or the chunk is below 1, or retries below 0.
         """
-        options = MapOptions(ordered, window, chunk, self._default(priority))
+        options = MapOptions(ordered, window, chunk, self._default(priority), retries)
         sized = [len(iterable) for iterable in iterables if isinstance(iterable, Sized)]
         calls = zip(*iterables, strict=False)
         total = min(sized, default=None)
@@ -176,10 +205,16 @@ class Submitter(abc.ABC):
             If `slots` is below 1.
         """
         handle = copy.copy(self)
-        handle._sender = Sender(self.client, self.name, Quota(slots))
+        handle._quota = Quota(slots)
         if priority is not None:
             handle.priority = priority
         return handle
+
+    def __copy__(self) -> Self:
+        # By itself `copy` would do what pickle does.
+        twin = object.__new__(type(self))
+        twin.__dict__.update(self.__dict__)
+        return twin
 
     def _default(self, priority: int | None) -> int:
         return self.priority if priority is None else priority

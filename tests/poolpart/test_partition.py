@@ -1,13 +1,14 @@
 """Tasks of a partition: where they run, in which order, and how many at a time."""
 
+import pickle
 import time
 import uuid
 from functools import partial
 
 import pytest
-from distributed import Client, Event, get_worker, wait
+from distributed import Client, Event, Variable, get_worker, secede, wait
 
-from poolpart import Partition, PoolError
+from poolpart import Partition, Pool, PoolError, own_client
 
 
 def here(_=None):
@@ -82,7 +83,7 @@ def test_futures_are_arguments_across_partitions(a, b):
     assert b.submit(twice, a.submit(twice, 5)).result() == 20
 
 
-@pytest.mark.parametrize("option", ["workers", "resources", "retries", "pure", "actor"])
+@pytest.mark.parametrize("option", ["workers", "resources", "pure", "actor"])
 def test_options_of_dask_do_not_swallow_arguments(a, option):
     with pytest.raises(TypeError, match=f"{option}: Client.submit has options of this name"):
         a.submit(options, **{option: 1})
@@ -144,3 +145,95 @@ def test_wait_returns_when_the_workers_are_there(a):
 def test_wait_names_what_is_missing(client):
     with pytest.raises(PoolError, match=r"'C' has 0 of 2 workers after 0.05 s: .*C=1"):
         Partition("C", client).wait(2, timeout_s=0.05)
+
+
+# -- from inside tasks, again, and by clients that cannot ------------------------------
+
+
+def submit_to(part, number):
+    secede()
+    return part.submit(here).result(), sum(part.map(twice, range(number))), part.priority
+
+
+def test_a_partition_can_be_given_to_a_task_of_another(a, b):
+    b.priority = 7
+    ran, total, priority = a.submit(submit_to, b, 100).result()
+    assert (ran, total, priority) == ("B-0", 9900, 7)
+    handle = a.limited(2)
+    assert handle.client is a.client
+    with pytest.raises(TypeError, match="handle on 'A' with a quota cannot be sent to a task"):
+        pickle.dumps(handle)
+
+
+def fail_at_first(name, item):
+    """Fail until it was called for the third time with an item; a `Variable` counts."""
+    count = Variable(f"{name}-{item}", client=own_client())
+    tries = count.get() + 1 if item % 3 == 0 else 3
+    count.set(tries)
+    if tries < 3:
+        raise ValueError(f"item {item}, try {tries}")
+    return item
+
+
+@pytest.fixture
+def counted(client):
+    """Name of counters for `fail_at_first`, one for each of twelve items."""
+    name = uuid.uuid4().hex
+    counters = [Variable(f"{name}-{item}", client=client) for item in range(12)]
+    for counter in counters:
+        counter.set(0)
+    yield name
+    for counter in counters:
+        counter.delete()
+
+
+def test_tasks_that_fail_run_again(a, counted):
+    assert a.submit(fail_at_first, counted, 0, retries=2).result() == 0
+    again = a.submit_many(fail_at_first, [counted] * 2, [3, 6], retries=2)
+    assert [future.result() for future in again] == [3, 6]
+    with pytest.raises(ValueError, match="item 9, try 2"):
+        a.submit(fail_at_first, counted, 9, retries=1).result()
+
+
+@pytest.mark.parametrize("chunk", [None, 1, 5])
+def test_items_that_fail_are_tried_again(a, counted, chunk):
+    call = partial(fail_at_first, counted)
+    assert list(a.map(call, range(12), retries=2, chunk=chunk)) == list(range(12))
+
+
+def refuse_three(item):
+    if item == 3:
+        raise ValueError("three")
+    return item
+
+
+def test_an_item_that_goes_on_failing_is_named(a):
+    results = a.map(refuse_three, range(1, 12), retries=2, chunk=4)
+    assert [next(results), next(results)] == [1, 2]
+    with pytest.raises(ValueError, match="three") as error:
+        next(results)
+    assert "this was item 2 of a map: 3" in error.value.__notes__[-1]
+    with pytest.raises(ValueError, match="retries is -1; give a whole number, 0 or more"):
+        a.map(twice, [1], retries=-1)
+
+
+def test_a_client_that_cannot_be_asked(_threads):
+    with Client(_threads, set_as_default=False) as client:
+        part = Partition("A", client)
+        assert len(part) == 2
+    for ask in (part.stats, part.grow, lambda: len(part), lambda: part.map(twice, [1])):
+        with pytest.raises(PoolError, match="The client is closed: make another one"):
+            ask()
+    with pytest.raises(PoolError, match="The client is closed"):
+        Pool.from_client(client)
+
+
+def test_an_asynchronous_client_is_refused(_threads):
+    async def ask():
+        async with Client(_threads, asynchronous=True, set_as_default=False) as client:
+            with pytest.raises(PoolError, match="needs a client that is not asynchronous"):
+                Pool.from_client(client)
+            with pytest.raises(PoolError, match="needs a client that is not asynchronous"):
+                Partition("A", client).stats()
+
+    _threads.sync(ask)
