@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .colouring import colours_of
+from .glb import coloured_triangles
+from .mesh_node import MeshNode
 from .page import LivePage
+from .walls import facing_triangles
 
 # Size of a point as a share of the scene's diagonal: that they can be seen where there are few,
 # and told apart where there are many.
 MOST_SHARE, SHARE_OF_MANY = 0.0035, 0.6
+MOST_ON_WALLS = 150_000  # points on walls, which take 48 bytes each
 
 
 class CloudLayer:
@@ -44,6 +48,7 @@ class CloudLayer:
         self._page, self._names, self._size_m = page, names, size_m
         self._share = MOST_SHARE
         self._node: Any = None  # viser shows no cloud without points
+        self._walls = MeshNode(page, "/cloud-on-walls")
         with page.gui.add_folder("cloud"):
             self._shown = page.gui.add_checkbox("show", initial_value=True)
             self._colour = page.gui.add_dropdown("colour", tuple(quantities))
@@ -53,7 +58,7 @@ class CloudLayer:
 
         @self._shown.on_update
         def _show(_: Any) -> None:
-            self._legend.visible = self._shown.value
+            self._legend.visible = self._walls.visible = self._shown.value
             if self._node is not None:
                 self._node.visible = self._shown.value
 
@@ -61,24 +66,50 @@ class CloudLayer:
         def _resize(_: Any) -> None:
             if self._node is not None:
                 self._node.point_size = self._point_size
+            on_change(None)
 
     @property
-    def quantity(self) -> str:
-        """Quantity that the colours are to be taken from."""
-        return self._colour.value
+    def state(self) -> Hashable:
+        """What `draw` depends on, beside the points."""
+        return self._colour.value, self._size.value
 
-    def draw(self, rows: NDArray[np.void]) -> None:
-        """Show these points (DISPLAY) instead of those before."""
+    def draw(
+        self, rows: NDArray[np.void], facing: NDArray[np.float32] | None = None, key: Hashable = 0
+    ) -> None:
+        """Show these points (DISPLAY) instead of those before.
+
+        Parameters
+        ----------
+        facing
+            (n, 3): which way the wall faces that a point is on, to be shown from there alone; 0
+            where it is on none.
+        key
+            What differs where these are other points, and not some more.
+        """
         colours, legend = colours_of(rows, self._colour.value, self._names)
         self._legend.content = legend.html
-        if not len(rows):
+        self._share = min(MOST_SHARE, SHARE_OF_MANY / max(1, len(rows)) ** 0.5)
+        positions = np.ascontiguousarray(rows["position"])
+        on_wall = np.zeros(len(rows), np.bool_) if facing is None else facing.any(axis=1)
+        self._draw_free(positions[~on_wall], colours[~on_wall])
+        if facing is None or not on_wall.any():
+            self._walls.clear()
+            return
+        some = np.flatnonzero(on_wall)
+        some = some[:: len(some) // MOST_ON_WALLS + 1]
+        corners = facing_triangles(positions[some], facing[some], self._point_size)
+        self._walls.show(coloured_triangles(corners, colours[some], 0, lit=False), key)
+
+    def settle(self) -> bool:
+        """Clear up after `draw`; returns whether there is more to be cleared up later."""
+        return self._walls.settle()
+
+    def _draw_free(self, positions: NDArray[np.float32], colours: NDArray[np.uint8]) -> None:
+        if not len(positions):
             if self._node is not None:
                 self._node.remove()
                 self._node = None
-            return
-        self._share = min(MOST_SHARE, SHARE_OF_MANY / len(rows) ** 0.5)
-        positions = np.ascontiguousarray(rows["position"])
-        if self._node is None:
+        elif self._node is None:
             self._node = self._page.scene.add_point_cloud(
                 "/cloud",
                 positions,
@@ -89,12 +120,11 @@ class CloudLayer:
                 precision="float32",
                 visible=self._shown.value,
             )
-            return
-        with self._page.atomic():  # else there would be points without colours for a moment
-            self._node.points = positions
-            self._node.colors = colours
-            self._node.point_size = self._point_size
-            self._node.visible = self._shown.value
+        else:
+            with self._page.atomic():  # else there would be points without colours for a moment
+                self._node.points = positions
+                self._node.colors = colours
+                self._node.point_size = self._point_size
 
     @property
     def _point_size(self) -> float:

@@ -50,7 +50,7 @@ class DueParts:
         """
         left = False
         for part in parts:
-            if self._drawn.get(part.name) == part.state:
+            if part.name in self._drawn and self._drawn[part.name] == part.state:
                 continue
             now = time.monotonic()
             if now < self._due_at.get(part.name, now) and not final:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 _FLOAT, _BYTE = 5126, 5121
 _HEAD = struct.Struct("<4sII")
 _CHUNK = struct.Struct("<II")
+_UNLIT = "KHR_materials_unlit"
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942
 
 # glTF's colours are linear in light, those on a screen are not (IEC 61966-2-1).
@@ -22,7 +23,11 @@ _LINEAR = np.round(
 
 
 def coloured_triangles(
-    corners: NDArray[np.float32], colours: NDArray[np.uint8], two_sided: int | None = None
+    corners: NDArray[np.float32],
+    colours: NDArray[np.uint8],
+    two_sided: int | None = None,
+    *,
+    lit: bool = True,
 ) -> bytes:
     """Write triangles, each of one colour, as a binary glTF file (glTF 2.0, Khronos 2017).
 
@@ -35,6 +40,8 @@ def coloured_triangles(
     two_sided
         How many of them, from the first, are seen from both sides; the others are seen from
         where their corners run anticlockwise. All by default.
+    lit
+        Whether light falls on them; else they have the same colour from everywhere.
     """
     count = 3 * len(corners)
     flat = corners.reshape(-1, 3)
@@ -45,6 +52,7 @@ def coloured_triangles(
     places, paints = np.ascontiguousarray(flat, "<f4").tobytes(), rgba.tobytes()
     described = {
         "asset": {"version": "2.0"},
+        "extensionsUsed": [] if lit else [_UNLIT],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
@@ -63,6 +71,7 @@ def coloured_triangles(
             {
                 "doubleSided": first < split,
                 "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.9},
+                "extensions": {} if lit else {_UNLIT: {}},
             }
             for first, _ in parts
         ],

@@ -52,9 +52,15 @@ class InsideView:
         shell = Shell.around(scene, sensors).holds(middles, np.arange(len(middles)))
         if ceiling is not None:  # else the houses along a street were taken for walls
             shell |= _outermost(surface, middles, sensors)
+        flat = np.abs(surface.face_normals[:, 2]) > 0.7
+        shell &= ~(flat & (middles[:, 2] < sensors[:, 2].min()))  # the floor always stays
         height = (surface.face_normals * middles).sum(axis=1)
         behind = surface.face_normals @ sensors.T < height[:, None]
         return cls(shell, shell & (behind.mean(axis=1) > 0.5), ceiling)
+
+    def wound(self, corners: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Corners (f, 3, 3) of the triangles; anticlockwise from the sensors in the shell."""
+        return np.where(self.turned[:, None, None], corners[:, ::-1], corners)
 
 
 def _ceiling(surface: Surface, sensors: Floats) -> float | None:
@@ -75,16 +81,14 @@ def _ceiling(surface: Surface, sensors: Floats) -> float | None:
 def _outermost(surface: Surface, middles: Floats, sensors: Floats) -> Flags:
     """Which triangles, with these middles (f, 3), have nothing behind them for the sensors.
 
-    These are the walls and roofs of a closed building, however it is divided into objects. The
-    floor is not among them: it may always be seen.
+    These are the shell of a closed building, however it is divided into objects.
     """
     apart = np.linalg.norm(middles[:, None] - sensors, axis=2)
     nearest = sensors[apart.argmin(axis=1)]
     onward = middles - nearest
     low, high = surface.scene.bounds
     wall = WALL * float(np.linalg.norm(high - low))
-    floor = (np.abs(surface.face_normals[:, 2]) > 0.7) & (middles[:, 2] < sensors[:, 2].min())
-    ask = np.flatnonzero(~floor & (apart.min(axis=1) > 0))
+    ask = np.flatnonzero(apart.min(axis=1) > 0)
     rays = unit(onward[ask])
     behind = surface.caster.cast(middles[ask] + wall * rays, rays).distance
     out = np.zeros(len(middles), np.bool_)

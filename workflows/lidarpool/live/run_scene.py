@@ -79,7 +79,7 @@ class RunScene:
         parts = (
             Part(
                 "cloud",
-                (self.points.seen, self._cloud.quantity, cut),
+                (self.points.seen, self._cloud.state, self._scene.state),
                 CLOUD_EVERY_S,
                 self._draw_cloud,
             ),
@@ -98,12 +98,13 @@ class RunScene:
             Part("path", self._planned(kept), 0.0, lambda: self._draw_path(kept)),
         )
         left = self._parts.draw(parts, final)
-        return self._scene.settle() or left
+        settling = self._scene.settle(), self._cloud.settle()
+        return left or any(settling)
 
     def _draw_cloud(self) -> None:
         rows = self._cut.below(self.points.rows)
         self.displayed = len(rows)
-        self._cloud.draw(rows)
+        self._cloud.draw(rows, self._scene.facing(rows["position"]))
 
     def _planned(self, kept: Deliveries) -> bool:
         return self._job.trials > 0 and len(kept.trials) == self._job.trials

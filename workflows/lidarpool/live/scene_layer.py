@@ -19,6 +19,7 @@ from .inside import InsideView
 from .mesh_node import MeshNode
 from .page import LivePage
 from .surface import DisplaySurface
+from .walls import Walls
 
 TITLE = "hits per square metre; grey: none"
 _UNSEEN = np.array([186, 190, 196], np.float64)
@@ -72,7 +73,9 @@ class SceneLayer:
 
         # Of millions of triangles it takes seconds, which the rest of the page need not wait for.
         executor = ThreadPoolExecutor(1, thread_name_prefix="lidarpool-live")
-        self._prepared: Future[tuple[DisplaySurface, InsideView]] = executor.submit(self._prepare)
+        self._prepared: Future[tuple[DisplaySurface, InsideView, Walls | None]] = executor.submit(
+            self._prepare
+        )
         self._prepared.add_done_callback(on_change)
         executor.shutdown(wait=False)
 
@@ -91,7 +94,7 @@ class SceneLayer:
         """
         if not self._prepared.done():
             return
-        surface, _ = self._prepared.result()
+        surface = self._prepared.result()[0]
         density, hit = surface.density(hit_counts)
         limits = density_range(density)
         key, corners, source, two_sided = self._shape_now()
@@ -107,13 +110,24 @@ class SceneLayer:
         """Clear up after `draw`; returns whether there is more to be cleared up later."""
         return self._node.settle()
 
-    def _prepare(self) -> tuple[DisplaySurface, InsideView]:
+    def facing(self, positions: Corners) -> Corners | None:
+        """Which way walls face that are shown from one side, at positions (n, 3).
+
+        See `Walls.facing_at`; None where all is shown from both sides.
+        """
+        if not self._prepared.done() or self._near.value:
+            return None
+        walls = self._prepared.result()[2]
+        return None if walls is None else walls.facing_at(positions)
+
+    def _prepare(self) -> tuple[DisplaySurface, InsideView, Walls | None]:
         surface = DisplaySurface(self._scene)
         inside = InsideView.of(surface.coarse, self._poses)
         if inside.ceiling is not None:
             self._cut.propose(inside.ceiling)
         self._near.visible = bool(inside.shell.any())
-        return surface, inside
+        walls = Walls.of(inside.wound(surface.corners)[inside.shell])
+        return surface, inside, walls
 
     def _shape_now(self) -> tuple[Hashable, Corners, Ints, int]:
         """Triangles to show.
@@ -133,19 +147,14 @@ class SceneLayer:
         key = height, self._near.value
         if self._shape is not None and self._shape[0] == key:
             return self._shape
-        surface, inside = self._prepared.result()
-        corners, source = surface.corners, np.arange(len(surface.corners))
-        shell = inside.shell & (not self._near.value)
-        turned = shell & inside.turned
-        corners = np.where(turned[:, None, None], corners[:, ::-1], corners)
-        order = np.argsort(shell, kind="stable")
-        corners, source = corners[order], source[order]
+        surface, inside, _ = self._prepared.result()
+        corners, source = inside.wound(surface.corners), np.arange(len(surface.corners))
         if height is not None:
-            corners, kept = triangles_below(corners, height)
-            kept_order = np.argsort(kept, kind="stable")
-            corners, source = corners[kept_order], source[kept[kept_order]]
-        two_sided = int((~shell[source]).sum())
-        self._shape = key, corners, source, two_sided
+            corners, source = triangles_below(corners, height)
+        one_sided = inside.shell[source] & (not self._near.value)
+        order = np.argsort(one_sided, kind="stable")
+        two_sided = int((~one_sided).sum())
+        self._shape = key, corners[order], source[order], two_sided
         return self._shape
 
 

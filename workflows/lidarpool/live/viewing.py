@@ -82,9 +82,10 @@ class ResultView:
     def _draw(self) -> bool:
         """Draw what has changed; returns whether something was left for later."""
         scans = self._scans.value if self._scans else self._file.scans
-        cut, quantity = self._cut.height, self._cloud.quantity
-        parts = [Part("cloud", (scans, cut, quantity), 0.0, lambda: self._draw_cloud(*scans))]
         scene, sensor, pictured = self._scene, self._sensor, self._file.pictured
+        cut = self._cut.height
+        shown = (scans, cut, self._cloud.state, scene.state if scene else None)
+        parts = [Part("cloud", shown, 0.0, lambda: self._draw_cloud(*scans))]
         if scene is not None and sensor is not None and pictured is not None:
             rays, hits = pictured.sample_rays, pictured.hit_counts
             parts += [
@@ -93,11 +94,14 @@ class ResultView:
                 Part("scene", scene.state, 0.0, lambda: scene.draw(hits)),
             ]
         self._parts.draw(parts)
-        return scene is not None and scene.settle()
+        settling = self._cloud.settle(), scene is not None and scene.settle()
+        return any(settling)
 
     def _draw_cloud(self, first: int, last: int) -> None:
         rows, count = self._file.choose(first, last, self._most)
-        self._cloud.draw(self._cut.below(rows))
+        seen = self._cut.below(rows)
+        facing = None if self._scene is None else self._scene.facing(seen["position"])
+        self._cloud.draw(seen, facing, (first, last, self._cut.height))
         shown = "all shown" if len(rows) == count else f"{len(rows):,} shown"
         lines = [f"{count:,} of {len(self._file):,} points, {shown}"]
         if (away := self._file.origin).any():
