@@ -159,23 +159,47 @@ def test_a_path_that_there_is_not(run, no_pictures):
     assert "no path free of collisions was found; none is possible" in outcome.out
 
 
-def test_nobody_reads_the_output(tmp_path, cluster):
+@pytest.mark.parametrize("deaf", ["stdout", "stderr"])
+def test_nobody_reads_the_output(deaf, tmp_path, cluster):
+    """As under `| head -1`, or when a terminal is closed: the result is there, nothing failed."""
     (tmp_path / "s.yaml").write_text(SHORT)
     arguments = ["run", "s.yaml", "--scheduler", cluster, "--no-plan", "--out", "out"]
     env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     reader, writer = os.pipe()
     os.close(reader)
-    ended = subprocess.run(
-        [*COMMAND, *arguments, "-q"],
-        cwd=tmp_path,
-        stdout=writer,
-        stderr=subprocess.PIPE,
-        env=env,
-        check=False,
-    )
+    heard = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | {deaf: writer}
+    ended = subprocess.run([*COMMAND, *arguments], cwd=tmp_path, env=env, check=False, **heard)
     os.close(writer)
-    assert ended.stderr == b""
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {*FILES} - {"path.png"}
+    assert ended.returncode == 0
+    said = ended.stderr if deaf == "stdout" else ended.stdout
+    assert (b"survey  done" if deaf == "stdout" else b"results in out") in said
+    assert b"Traceback" not in said
+    assert b"BrokenPipe" not in said
+    left = {path.name for path in (tmp_path / "out").iterdir()}
+    assert left - {"lidarpool.log"} == {*FILES} - {"path.png"}
+
+
+def test_what_is_wanted_and_cannot_be_written_is_an_error(tmp_path, cluster):
+    (tmp_path / "s.yaml").write_text(SHORT)
+    arguments = ["run", "s.yaml", "--scheduler", cluster, "--no-plan", "--json", "-q"]
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    with Path("/dev/full").open("w") as full:
+        ended = subprocess.run(
+            [*COMMAND, *arguments],
+            cwd=tmp_path,
+            env=env,
+            check=False,
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+    assert ended.returncode == 2
+    assert re.fullmatch(
+        "lidarpool: What the command prints cannot be written: No space left on device. "
+        "The result in lidarpool-out is complete.\n",
+        ended.stderr,
+    )
+    assert (tmp_path / "lidarpool-out" / "report.json").exists()
 
 
 @pytest.mark.parametrize("name", ["demo", "run", "info"])

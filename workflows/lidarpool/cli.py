@@ -20,6 +20,7 @@ from .completion import PROGRAM, complete_backend, completion
 from .connection import connected
 from .errors import LidarpoolError
 from .interrupts import INTERRUPTED, STOPPED, UNTOUCHED, interrupt_on_signals
+from .listeners import leaving_listeners
 from .log_file import LOG
 from .plot_command import plot
 from .quiet import silence_logs
@@ -188,6 +189,12 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     """Run the command and exit: 0 done, 2 for what the user can put right, 130 interrupted."""
     interrupt_on_signals()
     silence_logs()
+    with leaving_listeners():
+        _run(arguments)
+    sys.exit(0)
+
+
+def _run(arguments: list[str] | None) -> None:
     try:
         cli.main(args=arguments, prog_name=PROGRAM, standalone_mode=False)
     except (LidarpoolError, PoolError) as error:
@@ -202,7 +209,6 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     except MemoryError as error:
         advice = "not enough memory: take a smaller scene, fewer scans or a larger keep_every."
         _die(" ".join([advice, *_notes(error)]), 2)
-    sys.exit(0)
 
 
 def _notes(error: BaseException) -> list[str]:
