@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 
-BUSY_SHARE = 0.1  # of the time may go into drawing
+BUSY_SHARE = 0.1  # of the time may go into drawing while a run needs the machine
 
 
 class Painter:
@@ -20,10 +20,14 @@ class Painter:
         What to call; if it returns True, it is called again after its rest.
     every_s
         Seconds from one call to the next, at least.
+    busy_share
+        Share of the time that may go into drawing.
     """
 
-    def __init__(self, draw: Callable[[], object], every_s: float) -> None:
-        self._draw, self._every_s = draw, every_s
+    def __init__(
+        self, draw: Callable[[], object], every_s: float, busy_share: float = BUSY_SHARE
+    ) -> None:
+        self._draw, self._every_s, self._busy_share = draw, every_s, busy_share
         self._asked = threading.Event()
         self._ended = threading.Event()
         self.error: BaseException | None = None  # that ended it
@@ -57,7 +61,7 @@ class Painter:
             if last:
                 return
             took = time.monotonic() - started
-            self._ended.wait(max(self._every_s - took, took * (1 / BUSY_SHARE - 1)))
+            self._ended.wait(max(self._every_s - took, took * (1 / self._busy_share - 1)))
             if self._ended.is_set():
                 self._asked.set()
 

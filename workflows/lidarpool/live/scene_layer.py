@@ -16,6 +16,7 @@ from .colouring import TURBO, ColourBar
 from .glb import coloured_triangles
 from .height_cut import HeightCut
 from .inside import InsideView
+from .light import light_evenly
 from .mesh_node import MeshNode
 from .page import LivePage
 from .surface import DisplaySurface
@@ -54,6 +55,7 @@ class SceneLayer:
         on_change: Callable[[Any], None],
     ) -> None:
         self._scene, self._poses, self._cut = scene, poses, cut
+        light_evenly(page)
         self._node = MeshNode(page, "/scene")
         self._shape: tuple[Hashable, Corners, Ints, int] | None = None
         with page.gui.add_folder("scene"):

@@ -24,7 +24,7 @@ from .scene_layer import SceneLayer
 from .sensor_layer import SensorLayer
 
 VIEW_POINTS = 500_000  # in the browser at a time
-DRAW_EVERY_S = 0.1
+DRAW_EVERY_S, BUSY_SHARE = 0.1, 0.7  # nothing else is to be done
 
 
 class ResultView:
@@ -42,7 +42,7 @@ class ResultView:
 
     def __init__(self, page: LivePage, file: ResultFile, most: int = VIEW_POINTS) -> None:
         self._page, self._file, self._most = page, file, most
-        self.painter = Painter(self._draw, DRAW_EVERY_S)
+        self.painter = Painter(self._draw, DRAW_EVERY_S, BUSY_SHARE)
         self._parts = DueParts()
         bounds = _bounds(file)
         self._level = float(bounds[0, 2])
