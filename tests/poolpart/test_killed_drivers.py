@@ -1,0 +1,186 @@
+"""Drivers that are killed in the middle of what they ask: it is done whole, and can be undone."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from distributed import Client, Scheduler, SpecCluster, Worker
+
+from poolpart import Partition, Pool, n_workers, raise_fence, rest, trace_to
+
+LONG_S = 60.0
+QUIET = 50
+
+# Says that it is ready, does one thing when it is told to, and stays.
+DRIVER = """
+import sys
+from distributed import Client
+from poolpart import Partition, Pool, n_workers, raise_fence, rest
+with Client(sys.argv[1]) as client:
+    pool = Pool.from_client(client)
+    print("ready", flush=True)
+    sys.stdin.readline()
+    exec(sys.argv[2])
+    print("done", flush=True)
+    sys.stdin.readline()
+"""
+RULES = '{"A": n_workers(2, exclusive=True), "B": rest(exclusive=True)}'
+
+
+@pytest.fixture
+def cluster():
+    """Client of a cluster of four workers in this process, which others can reach."""
+    options = {"host": "127.0.0.1", "dashboard": False}
+    workers = {n: {"cls": Worker, "options": {"nthreads": 1, **options}} for n in "abcd"}
+    scheduler = {"cls": Scheduler, "options": {"dashboard_address": "127.0.0.1:0", **options}}
+    with (
+        SpecCluster(workers=workers, scheduler=scheduler, silence_logs=QUIET) as cluster,
+        Client(cluster) as client,
+    ):
+        yield client
+
+
+@pytest.fixture
+def driver(cluster):
+    """Start a driver that does what is given once it is told to."""
+    drivers = []
+
+    def start(what):
+        command = [sys.executable, "-c", DRIVER, cluster.cluster.scheduler_address, what]
+        drivers.append(
+            subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        )
+        assert drivers[-1].stdout.readline() == "ready\n"
+        return drivers[-1]
+
+    yield start
+    trace_to(None)
+    for process in drivers:
+        process.kill()
+        process.communicate()
+
+
+def tell(process):
+    process.stdin.write("\n")
+    process.stdin.flush()
+
+
+def known(client):
+    """All that the scheduler and the workers know of partitions."""
+    scheduler = client.cluster.scheduler
+    return {
+        "workers": {w.name: dict(w.resources) for w in scheduler.workers.values()},
+        "by resource": {name: set(workers) for name, workers in scheduler.resources.items()},
+        "plugins": set(scheduler.plugins),
+        "overridden": {name for name in vars(scheduler) if hasattr(type(scheduler), name)},
+        "themselves": client.run(lambda dask_worker: dict(dask_worker.state.total_resources)),
+    }
+
+
+def sizes(client):
+    """Workers of each partition, as the scheduler knows them; with those on their way."""
+    workers = client.cluster.scheduler.workers.values()
+    return sorted("".join(name for name, slots in w.resources.items() if slots) for w in workers)
+
+
+def kill_at(point, process):
+    """Kill the driver when the scheduler, which is in this process, passes a point."""
+    killed = []
+
+    def sink(name, fields):
+        if name == f"partition.{point}" and not killed:
+            killed.append(name)
+            os.kill(process.pid, signal.SIGKILL)
+            process.wait(LONG_S)
+
+    trace_to(sink)
+    return killed
+
+
+def await_that_it_is_gone(client, wait_until):
+    clients = client.cluster.scheduler.clients
+    wait_until(lambda: [name for name in clients if name.startswith("Client-")] == [client.id])
+
+
+@pytest.mark.parametrize(
+    ("what", "point", "after"),
+    [
+        (f"pool.divide({RULES})", "nanny_told", ["A", "A", "B", "B"]),
+        (f"pool.divide({RULES})", "worker_told", ["A", "A", "B", "B"]),
+        ("Partition('A', client).grow(1, source='B')", "drained", ["A", "A", "A", "B"]),
+        ("Partition('A', client).shrink(1)", "worker_told", ["A", "B", "B", "B"]),
+        ("Partition('A', client).dissolve()", "drained", ["", "", "B", "B"]),
+        ("pool.dissolve()", "worker_told", ["", "", "", ""]),
+    ],
+)
+def test_what_was_asked_is_done_whole(cluster, driver, wait_until, what, point, after):
+    before = known(cluster)
+    if "divide" not in what:
+        Pool.from_client(cluster).divide(
+            {"A": n_workers(2, exclusive=True), "B": rest(exclusive=True)}
+        )
+    process = driver(what)
+    killed = kill_at(point, process)
+    tell(process)
+    wait_until(lambda: killed)
+    await_that_it_is_gone(cluster, wait_until)
+    wait_until(lambda: sizes(cluster) == after)
+    for name in "AB":
+        assert Partition(name, cluster).stats().exclusive == (name in after)
+    # The next client goes on with it, and can undo all of it.
+    pool = Pool.from_client(cluster)
+    if {"A", "B"} <= set(after):
+        assert {Partition(n, cluster).submit(pow, 2, 5).result() for n in "AB"} == {32}
+        wait_until(lambda: not cluster.cluster.scheduler.tasks)
+    pool.dissolve()
+    assert known(cluster) == before
+
+
+@pytest.mark.parametrize("what", ["raise_fence(client, 'A')", "pool.rebalance('B', helps='A')"])
+def test_what_it_left_can_be_undone(cluster, driver, wait_until, what):
+    before = known(cluster)
+    Pool.from_client(cluster).divide({"A": n_workers(2), "B": rest()})
+    process = driver(what)
+    tell(process)
+    assert process.stdout.readline() == "done\n"
+    process.kill()
+    await_that_it_is_gone(cluster, wait_until)
+    assert Partition("A", cluster).stats().exclusive == ("fence" in what)
+    assert Pool.from_client(cluster).dissolve() == ["A", "B"]
+    assert known(cluster) == before
+
+
+def test_a_fence_of_workers_that_were_started_with_a_resource_can_be_undone(start):
+    client = start({"a": {"resources": {"A": 1}}, "b": {}})
+    before = set(client.cluster.scheduler.plugins)
+    raise_fence(client, "A")
+    with Client(client.cluster) as other:
+        assert Pool.from_client(other).dissolve() == []
+    assert set(client.cluster.scheduler.plugins) == before
+    assert not Partition("A", client).stats().exclusive
+
+
+def test_a_driver_that_is_killed_at_any_time(cluster, driver, wait_until):
+    """Between two of many operations, or within one: each worker is in one partition, or none."""
+    before = known(cluster)
+    what = f"""
+while True:
+    parts = pool.divide({RULES})
+    parts["A"].grow(1, source="B")
+    parts["A"].map(pow, range(50), range(50))
+    parts["A"].shrink(2)
+    pool.rebalance("B", helps="A", idle_s=0)
+    pool.dissolve()
+"""
+    for delay_s in (0.03, 0.11, 0.23, 0.37):
+        process = driver(what)
+        tell(process)
+        time.sleep(delay_s)
+        process.kill()
+        await_that_it_is_gone(cluster, wait_until)
+        assert all(len(names) <= 1 for names in sizes(cluster))
+        Pool.from_client(cluster).dissolve()
+        assert known(cluster) == before
