@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import os
 import re
 import socket
@@ -65,9 +66,13 @@ MESHES: dict[str, tuple[str, bytes | None, str]] = {
     "unsupported": ("hall.step", b"ISO-10303-21;\n", "hall.step"),
     "relative obj": (
         "hall.obj",
-        b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf -1 -2 -3\nv 5 5 5\n",
-        "absolute numbers",
+        b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf -1 -2 -4\n",
+        "a vertex that is not there",
     ),
+    "packed": ("hall.stl", gzip.compress(exported("stl")), "is packed with gzip: unpack it first"),
+    "another kind": ("hall.obj", exported("glb"), "is a .glb file by its content"),
+    "web page": ("hall.glb", b"<!DOCTYPE html><html></html>", "is a page of the web"),
+    "far away": ("hall.obj", b"v 0 0 1e30\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "reaches 1e+30 m"),
     "compressed": (
         "hall.gltf",
         b'{"asset": {"version": "2.0"}, "extensionsRequired": ["KHR_draco_mesh_compression"]}',

@@ -9,8 +9,7 @@ XML again, in double precision.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import collada  # type: ignore[import-untyped]
 import numpy as np
@@ -25,7 +24,7 @@ _HARMLESS = ("image", "surface", "material", "effect", "shading", "profile", "li
 MOST_NODES = 100_000  # of a scene, each counted in each place where it stands
 
 
-def read_dae(path: Path) -> tuple[list[Mesh], float | None, str | None]:
+def read_dae(file: IO[bytes]) -> tuple[list[Mesh], float | None, str | None]:
     """Read the default scene of a COLLADA file.
 
     Returns
@@ -43,7 +42,7 @@ def read_dae(path: Path) -> tuple[list[Mesh], float | None, str | None]:
         What pycollada raises on a broken file; ValueError for missing or unknown geometry.
     """
     document = collada.Collada(
-        str(path),
+        file,
         ignore=[collada.common.DaeUnsupportedError, collada.common.DaeBrokenRefError],
         aux_file_loader=lambda name: None,  # no picture is read, wherever it is
     )

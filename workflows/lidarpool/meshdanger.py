@@ -2,17 +2,16 @@
 
 Mesh files come from anywhere. Some formats name further files, by paths or by addresses on the
 net; some pack much into little. Each function here looks for one such thing before a reader
-sees the file, and returns a clause that says what is wrong, or None.
+sees the file, and returns a clause that says what is wrong, or None. The files that a .gltf
+names are read by `gltf_buffers`.
 """
 
 from __future__ import annotations
 
 import io
 import math
-import re
 import zipfile
 from collections.abc import Iterator
-from pathlib import Path
 from typing import IO, Any
 
 from lxml import etree  # type: ignore[import-untyped]
@@ -46,41 +45,17 @@ def threemf_danger(data: bytes) -> str | None:
     return None
 
 
-def gltf_danger(header: dict[str, Any], path: Path, size: int) -> str | None:
-    """Find buffers that are elsewhere, and more numbers than the file can hold.
+def gltf_danger(header: dict[str, Any], size: int) -> str | None:
+    """Find more numbers than the file can hold.
 
     Parameters
     ----------
     header
         The JSON object.
-    path
-        The file: what stands beside it and below may be read.
     size
-        Its length in bytes.
+        Bytes of the file and of those that it takes data from.
     """
-    folder = path.parent.resolve()
-    for uri in _buffer_uris(header):
-        target = folder / uri
-        if re.match(r"[A-Za-z][A-Za-z0-9+.-]*:", uri) or not target.resolve().is_relative_to(
-            folder
-        ):
-            return (
-                f"takes data from {uri[:80]!r}, but only files in its own folder are read: "
-                "export it as .glb, in one file"
-            )
-        if target.exists():
-            if not target.is_file():
-                return f"takes data from {uri[:80]!r}, which is not a file"
-            size += target.stat().st_size
     return _growth_danger(sum(_accessor_bytes(header)), size)
-
-
-def _buffer_uris(header: dict[str, Any]) -> Iterator[str]:
-    """Names of further files that hold vertices; those of pictures are not read."""
-    for buffer in header.get("buffers", ()):
-        uri = buffer.get("uri")
-        if uri is not None and "base64," not in uri:  # this is what the reader goes by
-            yield uri.strip()
 
 
 def _accessor_bytes(header: dict[str, Any]) -> Iterator[int]:

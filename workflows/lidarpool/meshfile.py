@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import codecs
+import io
+import json
+import logging
 import re
 from pathlib import Path
 from typing import Any
@@ -11,13 +15,28 @@ import trimesh
 
 from .dae import read_dae
 from .errors import LidarpoolError
+from .gltf_buffers import buffers_beside
 from .mesh import Mesh
-from .meshguard import find_fault
+from .meshfault import MeshFileError
+from .meshguard import binary_stl_size, find_fault, gltf_fault, gltf_header
+from .objfile import read_obj
+from .offfile import read_off
+from .plymesh import read_ply_mesh
 from .threemf import placed_objects
 from .transform import UNITS_M, UP_AXES, Transform
 
 SUFFIXES = (".glb", ".gltf", ".obj", ".stl", ".ply", ".off", ".dae", ".3mf")
 UNITLESS = (".obj", ".stl", ".ply", ".off")  # that cannot say in which unit their numbers are
+
+# Nothing on Earth is farther from the origin of its map; see also `sections.Coordinate`.
+FARTHEST_M = 1e8
+_LETTERS = 200  # of a name, or of what a reader says
+
+# What trimesh logs of files goes to those who listen, instead of to the terminal with a traceback.
+logging.getLogger("trimesh").addHandler(logging.NullHandler())
+
+# {ending: reader} of the formats whose faces are polygons.
+_POLYGONS = {".obj": read_obj, ".ply": read_ply_mesh, ".off": read_off}
 
 # By the 3MF core specification, 3.4.
 _3MF_UNITS_M = {
@@ -71,30 +90,40 @@ def load_meshes(
     if up_axis is not None and up_axis not in UP_AXES:
         raise LidarpoolError(f"up_axis is {up_axis!r}; it must be x, y or z.")
     data = _bytes_of(path)
+    with np.errstate(all="ignore"):  # of broken numbers in files; what is not finite is refused
+        meshes, own_unit_m, own_axis = _read_whole(path, data)
+        unit_m = UNITS_M[unit] if unit else own_unit_m or 1.0
+        upright = Transform(UP_AXES[up_axis or own_axis or "z"] * unit_m, np.zeros(3))
+        try:
+            return tuple(_placed(mesh, path.stem, upright, transform) for mesh in meshes)
+        except LidarpoolError as error:
+            raise LidarpoolError(f"{path}: {error}") from error
+
+
+def _read_whole(path: Path, data: bytes) -> tuple[list[Mesh], float | None, str | None]:
+    """As `_read`, whatever the file is: at least one mesh, or LidarpoolError."""
     try:
-        fault = find_fault(path, data)
-        meshes, own_unit_m, own_axis = ([], None, None) if fault else _read(path, data)
+        if fault := find_fault(path, data):
+            raise MeshFileError(fault)
+        meshes, own_unit_m, own_axis = _read(path, data)
     except MemoryError:
         raise
+    except MeshFileError as refused:
+        raise LidarpoolError(f"{path} {refused}.") from refused
     except LidarpoolError as error:
         raise LidarpoolError(f"{path}: {error}") from error
     except Exception as error:
         # The readers raise whatever they stumble over: ValueError, IndexError, KeyError,
         # AssertionError, BadZipFile, XMLSyntaxError, DaeError, NotImplementedError, …
-        reason = re.sub(r"\s+", " ", str(error)).strip()[:200] or type(error).__name__
+        reason = _printable(str(error)) or type(error).__name__
         raise LidarpoolError(
             f"{path} is broken or cut short ({reason}): export it again."
         ) from error
-    if fault:
-        raise LidarpoolError(f"{path} {fault}.")
     if not meshes:
         raise LidarpoolError(
             f"{path} holds no triangles: it is empty, cut short, or not a {path.suffix} file."
         )
-    unit_m = UNITS_M[unit] if unit else own_unit_m or 1.0
-    upright = Transform(UP_AXES[up_axis or own_axis or "z"] * unit_m, np.zeros(3))
-    placed = [_moved(mesh, upright) for mesh in meshes]
-    return tuple(_moved(mesh, transform) for mesh in placed) if transform else tuple(placed)
+    return meshes, own_unit_m, own_axis
 
 
 def _bytes_of(path: Path) -> bytes:
@@ -114,33 +143,52 @@ def _bytes_of(path: Path) -> bytes:
         raise LidarpoolError(f"{path} cannot be read: {error.strerror}.") from error
     if not data:
         raise LidarpoolError(f"{path} is empty (0 bytes): export the mesh again.")
-    return data
+    return data.removeprefix(codecs.BOM_UTF8)  # which editors put before text
 
 
 def _read(path: Path, data: bytes) -> tuple[list[Mesh], float | None, str | None]:
     """Meshes in the file's own unit and axes; metres in its unit and its up axis, if stated."""
     suffix = path.suffix.lower()
+    if suffix in _POLYGONS:
+        return _POLYGONS[suffix](data, path.stem), None, None
     if suffix == ".dae":
-        return read_dae(path)
-    options: dict[str, Any] = {}
-    if suffix in (".glb", ".gltf", ".obj", ".ply"):
-        options["skip_materials"] = True  # nor are their pictures looked for
-    if suffix == ".obj":
-        # Objects are split by name ('o', or 'g' where there is no 'o'), never by material.
-        named = re.search(rb"^o\s", data, re.MULTILINE) is not None
-        options |= {"split_objects": True, "split_groups": not named, "group_material": False}
-    scene = trimesh.load_scene(str(path), file_type=suffix[1:], process=False, **options)
-    meshes = _objects(scene, path)
+        return read_dae(io.BytesIO(data))
     if suffix in (".glb", ".gltf"):
-        return meshes, 1.0, "y"
+        return _read_gltf(path, data), 1.0, "y"
     if suffix == ".3mf":
-        _check_complete(scene, placed_objects(data))
-        stated = {mesh.metadata.get("units") for mesh in scene.geometry.values()}
-        unknown = stated - set(_3MF_UNITS_M)
-        if unknown:
-            raise ValueError(f"unknown unit {', '.join(map(repr, unknown))}")
-        return meshes, _3MF_UNITS_M[stated.pop()] if stated else None, "z"
-    return meshes, None, None
+        return _read_3mf(path, data)
+    # A few bytes behind the last triangle are more than trimesh expects.
+    scene = _trimesh_scene(data[: binary_stl_size(data)], suffix)
+    return _objects(scene, path), None, None
+
+
+def _trimesh_scene(data: bytes, suffix: str, **options: Any) -> trimesh.Scene:
+    return trimesh.load_scene(io.BytesIO(data), file_type=suffix[1:], process=False, **options)
+
+
+def _read_gltf(path: Path, data: bytes) -> list[Mesh]:
+    """Meshes of a .glb or .gltf file."""
+    suffix = path.suffix.lower()
+    header = gltf_header(path, data)
+    buffers = buffers_beside(header, path)
+    if fault := gltf_fault(header, len(data) + sum(map(len, buffers.values()))):
+        raise MeshFileError(fault)
+    if suffix == ".gltf":
+        data = json.dumps(header).encode()
+    # Neither materials nor their pictures are looked for, and no other file is opened.
+    scene = _trimesh_scene(data, suffix, resolver=buffers, skip_materials=True)
+    return _objects(scene, path)
+
+
+def _read_3mf(path: Path, data: bytes) -> tuple[list[Mesh], float | None, str | None]:
+    """As `_read`, for .3mf files."""
+    scene = _trimesh_scene(data, ".3mf")
+    _check_complete(scene, placed_objects(data))
+    stated = {mesh.metadata.get("units") for mesh in scene.geometry.values()}
+    unknown = stated - set(_3MF_UNITS_M)
+    if unknown:
+        raise ValueError(f"unknown unit {', '.join(map(repr, unknown))}")
+    return _objects(scene, path), _3MF_UNITS_M[stated.pop()] if stated else None, "z"
 
 
 def _check_complete(scene: trimesh.Scene, placed: int | None) -> None:
@@ -169,20 +217,19 @@ def _objects(scene: trimesh.Scene, path: Path) -> list[Mesh]:
         name = _object_name(owner, str(key), geometry, path)
         mesh = Mesh(name, geometry.vertices, faces)
         parts.setdefault(owner, []).append(_moved(mesh, Transform.from_matrix(matrix)))
-    # The readers of .glb, .gltf and .obj give the last object first.
+    # The reader of .glb and .gltf gives the last object first.
     owners = list(parts)
-    if path.suffix.lower() in (".glb", ".gltf", ".obj"):
+    if path.suffix.lower() in (".glb", ".gltf"):
         owners.reverse()
     return [_joined(parts[owner]) for owner in owners]
 
 
 def _object_name(owner: str, key: str, geometry: Any, path: Path) -> str:
     """Name of the object that belongs to node `owner`, `key` being its geometry's name."""
-    suffix = path.suffix.lower()
-    if suffix in (".stl", ".ply", ".off"):
-        return str(geometry.metadata.get("name") or path.stem)
-    if suffix == ".obj" and key == path.name:
-        return path.stem
+    if path.suffix.lower() == ".stl":
+        name = str(geometry.metadata.get("name") or path.stem)
+        # What trimesh calls a solid without a name.
+        return path.stem if re.fullmatch(r"geometry_\d+", name) else name
     # A number is what the glTF reader calls a node without a name.
     return key if owner.isdigit() else owner
 
@@ -197,6 +244,26 @@ def _joined(parts: list[Mesh]) -> Mesh:
         np.concatenate([part.vertices for part in parts]),
         np.concatenate([part.faces + at for part, at in zip(parts, first, strict=True)]),
     )
+
+
+def _placed(mesh: Mesh, stem: str, upright: Transform, transform: Transform | None) -> Mesh:
+    """Mesh in the world, its name fit for terminals and files."""
+    mesh = _moved(mesh, upright)
+    if transform is not None:
+        mesh = _moved(mesh, transform)
+    reach = np.abs(mesh.vertices).max()
+    if reach > FARTHEST_M:
+        raise LidarpoolError(
+            f"Object {mesh.name!r} reaches {reach:.3g} m from the origin, farther than anything "
+            "on Earth: check its unit and where it is placed."
+        )
+    return Mesh(_printable(mesh.name) or _printable(stem), mesh.vertices, mesh.faces)
+
+
+def _printable(text: str) -> str:
+    """Text from a file on one line of bounded length, without codes that a terminal obeys."""
+    kept = "".join(c if c.isprintable() else " " for c in text)
+    return " ".join(kept.split())[:_LETTERS]
 
 
 def _moved(mesh: Mesh, transform: Transform) -> Mesh:

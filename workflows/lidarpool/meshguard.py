@@ -1,4 +1,4 @@
-"""What trimesh reads without complaint although it would read it wrong.
+"""What a reader would take without complaint although it would read it wrong.
 
 Each function here looks at the bytes of one format and returns what is wrong with them, so
 that a cut or exotic file is refused instead of scanned with parts missing. What would be
@@ -13,7 +13,9 @@ import struct
 from pathlib import Path
 from typing import Any
 
+from .meshcontent import foreign_content
 from .meshdanger import dae_danger, gltf_danger, threemf_danger
+from .meshfault import MeshFileError
 
 # glTF extensions that change looks, not shapes.
 _LOOKS = re.compile(r"KHR_materials_|\w+_texture_|KHR_texture|KHR_lights|KHR_mesh_quantization")
@@ -39,16 +41,10 @@ def find_fault(path: Path, data: bytes) -> str | None:
         What one stumbles over in a file that is broken.
     """
     suffix = path.suffix.lower()
-    if suffix == ".obj":
-        return _obj_fault(data)
-    if suffix == ".off":
-        return _off_fault(data)
-    if suffix == ".ply":
-        return _ply_fault(data)
+    if foreign := foreign_content(suffix, data):
+        return foreign
     if suffix == ".stl":
         return _stl_fault(data)
-    if suffix in (".gltf", ".glb"):
-        return _gltf_fault(path, data)
     if suffix == ".dae":
         return dae_danger(data)
     if suffix == ".3mf":
@@ -56,89 +52,101 @@ def find_fault(path: Path, data: bytes) -> str | None:
     return None
 
 
-def _obj_fault(data: bytes) -> str | None:
-    """Find relative vertex numbers, which the reader counts from the end of the whole file."""
-    relative = re.search(rb"^f[^\n]*\s-\d", data, re.MULTILINE)
-    if relative and re.search(rb"^v\s", data[relative.end() :], re.MULTILINE):
-        return "numbers its vertices backwards (f -1 -2 -3): export it with absolute numbers"
-    return None
-
-
-def _off_fault(data: bytes) -> str | None:
-    """Find fewer vertices and faces than the header announces."""
-    text = re.sub(r"#[^\n]*", "", data.decode("utf-8", errors="replace"))
-    _, found, rest = text.partition("OFF")
-    lines = [line for line in rest.splitlines() if line.strip()]
-    counts = lines[0].split() if found and lines else []
-    if len(counts) < 2 or not all(count.isdigit() for count in counts[:2]):
-        return "has no OFF header with the numbers of vertices and faces"
-    announced = int(counts[0]) + int(counts[1])
-    if len(lines) - 1 < announced:
-        return f"is cut short: {announced} vertices and faces announced, {len(lines) - 1} there"
-    last = lines[announced].split()
-    if not last[0].isdigit() or len(last) <= int(last[0]):
-        return f"is cut short: its last face is '{lines[announced]}'"
-    return None
-
-
-def _ply_fault(data: bytes) -> str | None:
-    """Find a header without end, which hangs the reader, no faces, or fewer rows than announced."""
-    head, found, body = data.partition(b"end_header")
-    if not head.startswith(b"ply") or not found:
-        return "has no PLY header, or is cut within it"
-    counts = re.findall(rb"^element\s+(\w+)\s+(\d+)", head, re.MULTILINE)
-    if not sum(int(count) for name, count in counts if name == b"face"):
-        return "is a point cloud, it has no faces: make a mesh of it first"
-    if b"format ascii" not in head:
-        return None
-    rows = [line for line in body.splitlines() if line.strip()]
-    announced = sum(int(count) for _, count in counts)
-    if len(rows) < announced:
-        return f"is cut short: {announced} rows announced, {len(rows)} there"
-    last = rows[announced - 1].split()
-    if counts[-1][0] == b"face" and (not last[0].isdigit() or len(last) <= int(last[0])):
-        return f"is cut short: its last face is {b' '.join(last).decode(errors='replace')!r}"
-    return None
-
-
 def _stl_fault(data: bytes) -> str | None:
-    """Find a text file that is cut: the reader drops the solid that is not ended."""
-    if data[:5].lower() != b"solid" or b"\0" in data[:1000]:
-        return None
-    text = data.lower()
-    if text.count(b"endsolid") < len(re.findall(rb"^[ \t]*solid\b", text, re.MULTILINE)):
-        return "is cut short: it does not end with 'endsolid'"
+    """Find a file that is cut: of text, the reader drops the solid that is not ended."""
+    if binary_stl_size(data) is None:
+        text = data.lower()
+        solids = re.findall(rb"^[ \t]*solid\b", text, re.MULTILINE)
+        if text.count(b"endsolid") < len(solids):
+            return "is cut short: it does not end with 'endsolid'"
+        if solids or len(data) < 84:
+            return None
+        return (
+            f"announces {int.from_bytes(data[80:84], 'little'):,} triangles and has "
+            f"{max(0, len(data) - 84) // 50:,}: it is cut short, or not an .stl file"
+        )
     return None
 
 
-def _gltf_fault(path: Path, data: bytes) -> str | None:
-    """Find compressed, sparse or normalised positions: read as zeros or on another scale."""
-    whole = len(data)
+def binary_stl_size(data: bytes) -> int | None:
+    """Bytes that a binary .stl takes by the number of triangles in it, if it is one.
+
+    A few more bytes may follow; less than a triangle, or the number is not to be trusted. A
+    file of text gives a number that does not fit.
+    """
+    if len(data) < 84:
+        return None
+    size = 84 + 50 * int.from_bytes(data[80:84], "little")
+    return size if size <= len(data) < size + 50 else None
+
+
+def gltf_header(path: Path, data: bytes) -> dict[str, Any]:
+    """Take the JSON object from a glTF file.
+
+    Raises
+    ------
+    MeshFileError
+        If there is none, or the file is cut short.
+    """
     if path.suffix.lower() == ".glb":
         if data[:4] != b"glTF" or len(data) < 20:
-            return "is not a binary glTF file"
+            raise MeshFileError("is not a binary glTF file")
         total, size = struct.unpack_from("<II", data, 8)
         if len(data) < total:
-            return f"is cut short: {total} bytes announced, {len(data)} there"
+            raise MeshFileError(f"is cut short: {total} bytes announced, {len(data)} there")
         data = data[20 : 20 + size]
     try:
         header = json.loads(data)
     except (ValueError, RecursionError) as error:
-        return f"holds no valid JSON ({error})"
+        raise MeshFileError(f"holds no valid JSON ({error})") from error
     if not isinstance(header, dict):
-        return "holds no glTF object"
+        raise MeshFileError("holds no glTF object")
+    return header
+
+
+def gltf_fault(header: dict[str, Any], size: int) -> str | None:
+    """Find what would be read wrong, and more numbers than the files hold.
+
+    Parameters
+    ----------
+    header
+        The JSON object.
+    size
+        Bytes of the file and of those that it takes data from.
+    """
     foreign = [name for name in header.get("extensionsRequired", ()) if not _LOOKS.match(str(name))]
     if foreign:
         return f"needs {', '.join(map(str, foreign))}, which cannot be read: export without it"
     if not header.get("scenes"):
         return "has no scene: export it with one"
-    return gltf_danger(header, path, whole) or _accessor_fault(header)
+    return gltf_danger(header, size) or _node_fault(header) or _accessor_fault(header)
+
+
+def _node_fault(header: dict[str, Any]) -> str | None:
+    """Look for what moves vertices besides the places of their nodes."""
+    for node in header.get("nodes", ()):
+        if "EXT_mesh_gpu_instancing" in node.get("extensions", {}):
+            return (
+                "places copies by EXT_mesh_gpu_instancing, which cannot be read: export them as "
+                "objects of their own"
+            )
+        if "skin" in node and "mesh" in node:
+            return (
+                "moves vertices by a skeleton, which is not followed: apply the pose, then export"
+            )
+    for mesh in header.get("meshes", ()):
+        if any(mesh.get("weights", ())):
+            return "has morph targets in effect, which are not followed: apply them, then export"
+    return None
 
 
 def _accessor_fault(header: dict[str, Any]) -> str | None:
     """Look for exotic storage of positions and vertex numbers."""
     for mesh in header.get("meshes", ()):
         for primitive in mesh.get("primitives", ()):
+            packed = [name for name in primitive.get("extensions", ()) if "compression" in name]
+            if packed:
+                return f"is packed with {packed[0]}, which cannot be read: export without it"
             if primitive.get("mode", 4) == 6:
                 return "draws triangles as fans, which cannot be read: export as triangles"
             used = (primitive.get("attributes", {}).get("POSITION"), primitive.get("indices"))

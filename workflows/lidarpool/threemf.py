@@ -34,8 +34,10 @@ def placed_objects(data: bytes) -> int | None:
     """
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         # The reader takes the first of such a name, too.
-        name = next(n for n in archive.namelist() if "3d/3dmodel.model" in n.lower())
-        model = archive.read(name)
+        names = [name for name in archive.namelist() if "3d/3dmodel.model" in name.lower()]
+        if not names:
+            raise ValueError("a ZIP archive without 3D/3dmodel.model")
+        model = archive.read(names[0])
     if b"component" not in model and b"partnumber" not in model:
         return None
     parts = defaultdict(list)  # {object: the objects that it consists of}

@@ -1,0 +1,102 @@
+"""Polygons are filled exactly: as large as their outline, with the same outside."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lidarpool.polygons import MOST_CORNERS, triangulated
+
+# A wall with a door in it, an arrow, a comb and a spiral, anticlockwise.
+SHAPES = {
+    "triangle": [(0, 0), (2, 0), (0, 1)],
+    "square": [(0, 0), (1, 0), (1, 1), (0, 1)],
+    "arrow": [(0, 0), (2, -1), (0, 3), (-2, -1)],
+    "hexagon": [(2, 0), (1, 2), (-1, 2), (-2, 0), (-1, -2), (1, -2)],
+    "wall": [(0, 0), (2, 0), (2, 2), (3, 2), (3, 0), (5, 0), (5, 3), (0, 3)],
+    "comb": [(0, 0), (9, 0), (9, 5), (8, 1), (7, 5), (6, 1), (5, 5), (4, 1), (3, 5), (2, 1),
+             (0, 5)],
+    "spiral": [(0, 0), (6, 0), (6, 6), (1, 6), (1, 2), (4, 2), (4, 4), (3, 4), (3, 3), (2, 3),
+               (2, 5), (5, 5), (5, 1), (0, 1)],
+    "corner on an edge": [(0, 0), (1, 0), (2, 0), (2, 2), (1, 1), (0, 2)],
+}  # fmt: skip
+
+
+def area_vector(points):
+    """Area with the direction of the outside (Newell)."""
+    points = np.asarray(points, dtype=float) - points[0]
+    return np.cross(points, np.roll(points, -1, axis=0)).sum(axis=0) / 2
+
+
+def placed(shape, turn=0, shift=(0.0, 0.0, 0.0)):
+    """A shape in space, standing upright and turned."""
+    x, y = np.array(shape, dtype=float).T
+    return np.stack([x * np.cos(turn), x * np.sin(turn), y], axis=1) + shift
+
+
+def cut(vertices, *sizes):
+    sizes = sizes or (len(vertices),)
+    return triangulated(vertices, np.arange(sum(sizes)), np.array(sizes))
+
+
+def area_vectors(vertices, faces):
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    return np.cross(b - a, c - a) / 2
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+@pytest.mark.parametrize("begin", [0, 1, 2, 3])
+@pytest.mark.parametrize("name", SHAPES)
+def test_a_shape_is_filled(name, begin, backwards):
+    shape = SHAPES[name][begin:] + SHAPES[name][:begin]
+    vertices = placed(shape[::-1] if backwards else shape, turn=0.3)
+    faces = cut(vertices)
+    assert len(faces) == len(shape) - 2
+    whole, parts = area_vector(vertices), area_vectors(vertices, faces)
+    np.testing.assert_allclose(parts.sum(axis=0), whole, atol=1e-12)
+    # No triangle faces the other way, so that none lies outside of the outline.
+    assert (parts @ whole > -1e-12).all()
+
+
+def test_map_coordinates_lose_nothing():
+    vertices = placed(SHAPES["wall"], shift=(500_000.25, 4_000_000.5, 100.0))
+    parts = area_vectors(vertices - vertices[0], cut(vertices))
+    np.testing.assert_allclose(np.linalg.norm(parts, axis=1).sum(), 13, rtol=1e-9)
+
+
+def test_polygons_of_all_sizes_keep_their_order():
+    shapes = [SHAPES["wall"], SHAPES["triangle"], SHAPES["arrow"], [(0, 0), (1, 1)], [(7, 7)]]
+    vertices = np.concatenate(
+        [placed(shape, shift=(0, 10 * i, 0)) for i, shape in enumerate(shapes)]
+    )
+    faces = cut(vertices, *map(len, shapes))
+    assert len(faces) == 6 + 1 + 2
+    np.testing.assert_array_equal(np.diff(vertices[faces][:, 0, 1]) >= 0, True)
+
+
+@given(
+    st.lists(st.tuples(*[st.integers(-3, 3)] * 3), min_size=3, max_size=9),
+    st.sampled_from([1.0, 1e-9, 1e8, float("nan")]),
+)
+def test_whatever_it_is_each_polygon_gives_its_triangles(points, scale):
+    faces = cut(np.array(points, dtype=float) * scale)
+    assert faces.shape == (len(points) - 2, 3)
+    assert all(len(set(face)) == 3 for face in faces.tolist())
+
+
+def test_corners_that_are_not_there():
+    with pytest.raises(ValueError, match="vertices 0 to 3, counted from 0, of 3"):
+        triangulated(np.zeros((3, 3)), np.array([0, 1, 3]), np.array([3]))
+
+
+def test_nothing():
+    none = np.empty(0, dtype=np.int64)
+    assert triangulated(np.empty((0, 3)), none, none).shape == (0, 3)
+
+
+def test_an_outline_without_end_is_refused_unless_it_is_convex():
+    angles = np.linspace(0, 2 * np.pi, MOST_CORNERS + 1, endpoint=False)
+    circle = np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
+    assert len(cut(circle)) == MOST_CORNERS - 1
+    with pytest.raises(ValueError, match="is not convex: triangulate it"):
+        cut(circle * (1 + 0.5 * (np.arange(len(angles)) % 2))[:, None])
