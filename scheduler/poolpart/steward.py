@@ -17,6 +17,7 @@ from typing import Any
 from distributed.diagnostics.plugin import SchedulerPlugin
 from tornado.ioloop import PeriodicCallback
 
+from .adapting import Adapting
 from .book import Book, Resources, Seat, seat_key
 from .calls import call
 from .placing import hand_off, held_by, recount, show, wake
@@ -50,6 +51,8 @@ class Steward(SchedulerPlugin):
         self.book = Book()
         self.asked = 0  # questions of clients that are being answered
         self.rebalancing = Rebalancing(scheduler, self.book, self.settle, self.settled)
+        self.adapting = Adapting(scheduler, self.book)
+        self.adapting.install()
         self._looked_at: Any = None  # rules and members when nobody wanted those without a place
         self._resources_before = set(scheduler.resources)
         self._declared: dict[str, Resources] = {}  # {address: what the worker itself declares}
@@ -108,6 +111,10 @@ class Steward(SchedulerPlugin):
             if seat.info.address == worker and seat.absent_since is None:
                 seat.absent_since = time.monotonic()
 
+    def valid_workers_downscaling(self, scheduler: Any, workers: list[Any]) -> list[Any]:
+        """Choose those that an adaptive cluster may stop."""
+        return self.adapting.spare(workers)
+
     async def close(self) -> None:
         """Stop with the scheduler."""
         self.stop()
@@ -115,6 +122,7 @@ class Steward(SchedulerPlugin):
     def stop(self) -> None:
         """Do nothing more."""
         self._ticker.stop()
+        self.adapting.uninstall()
         for task in self._tasks.values():
             task.cancel()
         self._tasks.clear()
