@@ -52,8 +52,10 @@ class InsideView:
         shell = Shell.around(scene, sensors).holds(middles, np.arange(len(middles)))
         if ceiling is not None:  # else the houses along a street were taken for walls
             shell |= _outermost(surface, middles, sensors)
+        lowest = sensors[:, 2].min()
         flat = np.abs(surface.face_normals[:, 2]) > 0.7
-        shell &= ~(flat & (middles[:, 2] < sensors[:, 2].min()))  # the floor always stays
+        shell &= ~(flat & (middles[:, 2] < lowest))  # the floor always stays
+        shell &= scene.object_bounds[scene.face_object, 1, 2] > lowest  # and so do kerbs
         height = (surface.face_normals * middles).sum(axis=1)
         behind = surface.face_normals @ sensors.T < height[:, None]
         return cls(shell, shell & (behind.mean(axis=1) > 0.5), ceiling)

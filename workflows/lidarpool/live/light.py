@@ -6,8 +6,8 @@ from .page import LivePage
 
 # Together pi at most: more than that is paler than the colour itself. viser's own are three times
 # as bright from above, where a floor of any colour is nearly white.
-_AROUND, _SUN = 1.7, 1.5
-_FROM = (0.35, -0.55, 1.0)  # right of the camera's first place, so that no two sides look alike
+_AROUND, _SUN = 0.9, 2.4
+_FROM = (0.15, -0.75, 1.2)  # left of the camera's first place, so that no two sides look alike
 
 
 def light_evenly(page: LivePage) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 import sys
@@ -20,8 +21,14 @@ HOST = "127.0.0.1"
 PORT = 8080  # or the next that is free
 
 _FOV = math.radians(45)
-_FROM = np.array([0.55, -1.0, 0.62])  # direction from the scene's middle to the camera
-_ASIDE = 0.13  # that the scene is left of the panel, as a share of its diagonal
+_AWAY = np.array([0.55, -1.0, 0.62])  # from the scene's middle to the camera
+_AWAY /= np.linalg.norm(_AWAY)
+_RIGHT = np.cross([0.0, 0.0, 1.0], _AWAY)
+_RIGHT /= np.linalg.norm(_RIGHT)
+_UP = np.cross(_AWAY, _RIGHT)
+# Of a window, by half its height: what the scene may fill left of the panel, and how far the
+# middle of that is from the middle of the window.
+_WIDE, _HIGH, _ASIDE = 1.15, 0.88, 0.42
 _GRID = (128, 134, 142)  # lines that are seen on a light page and on a dark one
 
 
@@ -59,14 +66,11 @@ class LivePage(viser.ViserServer):
         """
         low, high = np.asarray(bounds, np.float64)
         size = float(np.linalg.norm(high - low)) or 1.0
-        middle = (low + high) / 2
-        away = _FROM / np.linalg.norm(_FROM)
-        right = np.cross([0.0, 0.0, 1.0], away)
-        middle += _ASIDE * size * right / np.linalg.norm(right)
+        middle, distance = place_camera(low, high)
         camera = self.initial_camera
         camera.fov = _FOV
         camera.look_at = middle
-        camera.position = middle + away * 0.5 * size / math.tan(_FOV / 2)
+        camera.position = middle + distance * _AWAY
         camera.up = np.array([0.0, 0.0, 1.0])
         camera.near, camera.far = size / 500, size * 50
         self._add_grid(low, high, size)
@@ -94,6 +98,18 @@ class LivePage(viser.ViserServer):
             dark = self.gui.add_checkbox("dark", initial_value=False)
             self.gui.add_markdown(f"Metres, Z up; the grid's lines are {step_m:g} m apart.")
         dark.on_update(lambda _: self.show_theme(dark.value))
+
+
+def place_camera(
+    low: NDArray[np.float64], high: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], float]:
+    """Find where a camera looks, (3,), and from how far, to see all corners of a box."""
+    middle = (low + high) / 2
+    corners = np.array(list(itertools.product(*np.stack([low, high]).T))) - middle
+    wide, tall = np.abs(corners @ _RIGHT), np.abs(corners @ _UP)
+    reach = np.maximum(wide / _WIDE, tall / _HIGH) / math.tan(_FOV / 2)
+    distance = float((corners @ _AWAY + reach).max()) or 1.0
+    return middle + _ASIDE * math.tan(_FOV / 2) * distance * _RIGHT, distance
 
 
 def grid_step(size: float) -> float:

@@ -15,6 +15,7 @@ _RED = (224, 24, 45)
 _EARLIER = (232, 140, 150)
 _RADIUS = 0.009  # of the ball, as a share of the scene's diagonal
 _SMALL = 0.6  # of that have the balls where the sensor stands at other times
+MOST_EARLIER = 150  # rays; more of them hide what they hit
 MOST_POSES = 1000  # that have a ball
 
 
@@ -74,7 +75,8 @@ class SensorLayer:
         self._draw_rays("latest", np.stack([starts, ends], axis=1), cut, _RED, 1.6)
 
     def draw_earlier(self, rays: NDArray[np.float32], cut: float | None) -> None:
-        """Show rays (n, 2, 3) of other times, below the height `cut`, metres."""
+        """Show some of the rays (n, 2, 3) of other times, below the height `cut`, metres."""
+        rays = rays[:: len(rays) // MOST_EARLIER + 1]
         self._draw_rays("earlier", rays, cut, _EARLIER, 1.0)
 
     def _draw_rays(
