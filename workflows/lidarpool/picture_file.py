@@ -9,6 +9,7 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -134,15 +135,17 @@ class Pictured:
             If the file cannot be read, is damaged, or of another version.
         """
         try:
-            with np.load(path, allow_pickle=False) as archive:
+            # NumPy leaves a file open that it opened itself and cannot read.
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
                 made = int(archive["format"])
                 if made == _FORMAT:
                     return cls._from_arrays(archive)
         except OSError as error:
             raise LidarpoolError(f"{path} cannot be read: {error.strerror or error}.") from error
         except (
-            LidarpoolError, AttributeError, EOFError, KeyError, NotImplementedError, TypeError,
-            ValueError, zipfile.BadZipFile, zlib.error,
+            LidarpoolError, AttributeError, EOFError, KeyError, MemoryError, OverflowError,
+            RuntimeError, SyntaxError, TokenError, TypeError, ValueError, zipfile.BadZipFile,
+            zlib.error,
         ) as error:  # fmt: skip
             raise LidarpoolError(
                 f"{path} is damaged or not of lidarpool ({error}): run the survey again."
@@ -170,6 +173,12 @@ class Pictured:
             plan = Plan(path=arrays["path"], **numbers)
             trials = tuple(TrialPath(waypoints) for waypoints in arrays["waypoints"])
         counts = arrays["hit_counts"]
-        if counts.shape != (len(scene.faces),):
+        if counts.shape != (len(scene.faces),) or counts.dtype.kind not in "iu":
             raise ValueError(f"hit_counts of {counts.shape} for {len(scene.faces)} triangles")
-        return cls(scene, arrays["poses"], counts, arrays["sample_rays"], planning, plan, trials)
+        poses, rays = arrays["poses"], arrays["sample_rays"]
+        for name, array, shape in (("poses", poses, (3,)), ("sample_rays", rays, (2, 3))):
+            if array.shape[1:] != shape or not np.isfinite(array).all():
+                raise ValueError(f"{name} of {array.shape}, or not finite")
+        if not len(poses):
+            raise ValueError("no poses")
+        return cls(scene, poses, counts, rays, planning, plan, trials)
