@@ -83,7 +83,9 @@ async def _dissolve(steward: Steward, names: list[str] | None, timeout_s: float)
         book.put(seat, None)
     _lift_restrictions(scheduler, gone)
     late = await steward.arrive(seats, max(timeout_s, 10.0))
-    await steward.restore_nannies(seat for seat in seats if not seat.holds)
+    for seat in seats:
+        if not seat.holds:
+            await steward.nannies.restore(seat)
     if late:
         raise PoolError(
             f"{names_of(late)} did not answer while {' and '.join(gone)} were dissolved; they "

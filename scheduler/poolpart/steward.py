@@ -20,10 +20,11 @@ from tornado.ioloop import PeriodicCallback
 from .adapting import Adapting
 from .book import Book, Resources, Seat, seat_key
 from .calls import call
+from .nannies import Nannies, has_gone
 from .placing import hand_off, held_by, recount, show, wake
 from .probe import probe_worker
 from .rebalancing import Rebalancing
-from .restarts import declare_on_worker, keep_on_nanny, restore_on_nanny
+from .restarts import declare_on_worker
 from .rules import PerGpu, partition_for
 from .tracing import trace
 from .worker_info import WorkerInfo
@@ -56,9 +57,9 @@ class Steward(SchedulerPlugin):
         self._looked_at: Any = None  # rules and members when nobody wanted those without a place
         self._resources_before = set(scheduler.resources)
         self._declared: dict[str, Resources] = {}  # {address: what the worker itself declares}
-        # {address of a nanny: what it was told; None where its answer has not come, or never will}
-        self._nannies: dict[str, Resources | None] = {}
+        self.nannies = Nannies(scheduler)
         self._tasks: dict[str, asyncio.Task[None]] = {}  # {address: settling of that worker}
+        self._missed: set[asyncio.Task[None]] = set()  # looks whether workers come back
         for worker in scheduler.workers.values():
             self._seat(worker)
         self._ticker = PeriodicCallback(self._tick, 1000 * TICK_S)
@@ -86,7 +87,7 @@ class Steward(SchedulerPlugin):
             # Somebody has started another worker under this name.
             seat.found = dict(worker.resources)
             if seat.nanny is not None:
-                self._nannies.pop(seat.nanny, None)
+                self.nannies.forget(seat.nanny)
         seat.info, seat.nanny, seat.absent_since = info, worker.nanny, None
         return seat
 
@@ -110,6 +111,18 @@ class Steward(SchedulerPlugin):
         for seat in self.book.seats.values():
             if seat.info.address == worker and seat.absent_since is None:
                 seat.absent_since = time.monotonic()
+                missed = asyncio.ensure_future(self._miss(seat))
+                self._missed.add(missed)
+                missed.add_done_callback(self._missed.discard)
+
+    async def _miss(self, seat: Seat) -> None:
+        """Give up the place of a worker whose nanny is gone as well, so that another has it."""
+        absent_since = seat.absent_since
+        while seat.absent_since == absent_since and seat.holds and seat.nanny is not None:
+            await asyncio.sleep(10 * TICK_S)
+            if await has_gone(nanny := seat.nanny) and seat.absent_since == absent_since:
+                self.nannies.forget(nanny)
+                seat.nanny = None
 
     def valid_workers_downscaling(self, scheduler: Any, workers: list[Any]) -> list[Any]:
         """Choose those that an adaptive cluster may stop."""
@@ -123,7 +136,7 @@ class Steward(SchedulerPlugin):
         """Do nothing more."""
         self._ticker.stop()
         self.adapting.uninstall()
-        for task in self._tasks.values():
+        for task in (*self._tasks.values(), *self._missed):
             task.cancel()
         self._tasks.clear()
 
@@ -134,9 +147,7 @@ class Steward(SchedulerPlugin):
         self.rebalancing.look(time.monotonic())
         if any(seat.absent_since is not None for seat in self.book.seats.values()):
             self.book.forget(time.monotonic())
-            known = {seat.nanny for seat in self.book.seats.values()}
-            for nanny in self._nannies.keys() - known:
-                del self._nannies[nanny]
+            self.nannies.forget_others({seat.nanny for seat in self.book.seats.values()})
         waiting = [s for s in self.book.seats.values() if s.unplaced and s.absent_since is None]
         if waiting:
             self._look_for_places(waiting)
@@ -172,7 +183,7 @@ class Steward(SchedulerPlugin):
         wanted = self.book.wanted(seat)
         return bool(
             worker.resources == wanted == self._declared[worker.address]
-            and self._nannies.get(seat.nanny or "", wanted) == wanted
+            and self.nannies.agrees(seat, wanted)
         )
 
     def _spawn(self, address: str) -> None:
@@ -218,7 +229,7 @@ class Steward(SchedulerPlugin):
                 return
             trace("partition.drained", worker=worker.address, leaves=sorted(leaving))
         # First the nanny: a worker that dies right after would come back as it was.
-        await self._tell_nanny(seat, wanted)
+        await self.nannies.tell(seat, wanted)
         trace("partition.nanny_told", worker=worker.address, declares=dict(wanted))
         if not await call(self.scheduler, worker.address, declare_on_worker, resources=wanted):
             return
@@ -235,19 +246,6 @@ class Steward(SchedulerPlugin):
         for name in names:
             for address in self.scheduler.resources.get(name, ()):
                 recount(self.scheduler.workers[address])
-
-    async def _tell_nanny(self, seat: Seat, wanted: Resources) -> None:
-        nanny = seat.nanny
-        if nanny is None:
-            return
-        if wanted == seat.found:
-            if nanny in self._nannies:
-                await call(self.scheduler, nanny, restore_on_nanny)
-                self._nannies.pop(nanny, None)
-        elif self._nannies.get(nanny) != wanted:
-            self._nannies[nanny] = None  # its worker may die before it answers, which ends this
-            await call(self.scheduler, nanny, keep_on_nanny, resources=wanted)
-            self._nannies[nanny] = wanted
 
     async def arrive(self, seats: Collection[Seat], timeout_s: float) -> list[Seat]:
         """Wait until workers declare what the book says; returns those that do not in time.
@@ -283,22 +281,11 @@ class Steward(SchedulerPlugin):
 
     # -- the end -----------------------------------------------------------------------
 
-    async def restore_nannies(self, seats: Iterable[Seat]) -> None:
-        """Have nannies start these workers, which are not there, as they were found to."""
-        for seat in seats:
-            if seat.nanny is None or seat.nanny not in self._nannies:
-                continue
-            del self._nannies[seat.nanny]
-            try:
-                await call(self.scheduler, seat.nanny, restore_on_nanny)
-            except OSError as error:
-                logger.info("The nanny at %s is gone: %s", seat.nanny, error)
-
     def _at_rest(self, seat: Seat) -> bool:
         """Whether nothing is left to do for a worker, or its nanny, which may start it again."""
         if seat.absent_since is None:
             return self.settled(seat)
-        return not seat.holds or seat.nanny not in self._nannies
+        return not seat.holds or not self.nannies.was_told(seat)
 
     def remove_if_done(self) -> None:
         """Leave the scheduler, once there are no partitions and all workers are as they were."""

@@ -20,6 +20,7 @@ from poolpart import (
     rest,
     steward,
 )
+from poolpart import nannies as their
 
 LONG_S = 60.0
 
@@ -125,12 +126,12 @@ def test_nannies_are_as_before(nannies, wait_until):
 
 
 def test_a_nanny_whose_worker_dies_before_it_has_answered(nannies, wait_until, monkeypatch):
-    before, answered = known(nannies), steward.call
+    before, answered = known(nannies), their.call
     pids, killed = nannies.run(os.getpid), []
 
     async def call(scheduler, address, function, **arguments):
         answer = await answered(scheduler, address, function, **arguments)
-        if function is steward.keep_on_nanny and not killed:
+        if function is their.keep_on_nanny and not killed:
             killed.extend(w for w, state in scheduler.workers.items() if state.nanny == address)
             os.kill(pids[killed[0]], signal.SIGKILL)
             while killed[0] in scheduler.workers:
@@ -138,7 +139,7 @@ def test_a_nanny_whose_worker_dies_before_it_has_answered(nannies, wait_until, m
             await asyncio.sleep(0)  # the steward does not get to read the answer
         return answer
 
-    monkeypatch.setattr(steward, "call", call)
+    monkeypatch.setattr(their, "call", call)
     [part] = Pool.from_client(nannies).divide({"A": rest()}).values()
     wait_until(lambda: declared(nannies) == {"0": {"A": 1}, "1": {"A": 1}}, LONG_S)
     part.dissolve()
