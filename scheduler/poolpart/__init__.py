@@ -3,6 +3,7 @@
 from .asking import ask_workers
 from .awaiting import await_news
 from .backoff import Backoff
+from .claims import Claim, claim_slots, drop_claim
 from .current_client import own_client
 from .departure import WorkerLeft, telling_departure
 from .devices import assign_devices, own_device
@@ -33,6 +34,7 @@ from .worker_info import WorkerInfo
 
 __all__ = [
     "Backoff",
+    "Claim",
     "Ledger",
     "Partition",
     "PartitionStats",
@@ -54,6 +56,8 @@ __all__ = [
     "ask_workers",
     "assign_devices",
     "await_news",
+    "claim_slots",
+    "drop_claim",
     "fetch_available",
     "forget_pipes",
     "has_partitions_page",

@@ -56,17 +56,30 @@ def _look(
 ) -> tuple[Any, ...]:
     silent = silent_workers(dask_scheduler, patience_s)
     members = [ws for ws in dask_scheduler.workers.values() if ws.resources.get(resource)]
-    free = {
-        ws.address: int(ws.resources[resource] - _in_use(ws, resource))
-        for ws in members
-        if ws.status.name == "running" and ws.address not in silent
-    }
+    free = free_slots(dask_scheduler, resource, patience_s)
     running = []
     for key in keys:
         task = dask_scheduler.tasks.get(key)
         if task is not None and task.processing_on and task in task.processing_on.long_running:
             running.append(key)
     return free, [ws.address for ws in members], running, list(silent)
+
+
+def usable_members(scheduler: Any, resource: str, patience_s: float | None = None) -> list[Any]:
+    """Workers of a partition that take tasks and are heard of; runs on the scheduler."""
+    patience_s = whereabouts.SILENT_S if patience_s is None else patience_s
+    silent = silent_workers(scheduler, patience_s)
+    return [
+        ws
+        for ws in scheduler.workers.values()
+        if ws.resources.get(resource) and ws.status.name == "running" and ws.address not in silent
+    ]
+
+
+def free_slots(scheduler: Any, resource: str, patience_s: float | None = None) -> dict[str, int]:
+    """Slots of a partition that are free, by address of the worker; runs on the scheduler."""
+    members = usable_members(scheduler, resource, patience_s)
+    return {ws.address: int(ws.resources[resource] - _in_use(ws, resource)) for ws in members}
 
 
 def _in_use(worker: Any, resource: str) -> float:

@@ -102,6 +102,7 @@ class Run:
             times = self._loop(pumps, survey, trials, on_progress, started)
             for pump in pumps:
                 pump.finish()
+            self.notes += survey.notes
         except BaseException as error:
             # A client that loses its scheduler cancels all futures: tasks seem to be cancelled.
             # After some seconds it gives up and closes, and any call of it makes any error.

@@ -190,6 +190,11 @@ class SurveyPump:
         ledgers = (self.generated, self.frames, self.cloud.ledger)
         return sum(ledger.duplicates for ledger in ledgers)
 
+    @property
+    def notes(self) -> list[str]:
+        """What a user should know of how it went."""
+        return self._stages.notes
+
     def _where(self, stage: str) -> str:
         """Say for a message how far a stage had come."""
         ledgers = {GENERATE: self.generated, SORT: self.frames}
@@ -378,7 +383,8 @@ class SurveyPump:
             self._take_last_records()
         finally:
             forget_pipes(self.client, [pipe.name for pipe in self._pipes])
-            self.client.cancel([*self._stages.futures.values(), *self._crew.futures])
+            self._stages.finish()
+            self.client.cancel(self._crew.futures)
             self._under_way.clear()
 
     def _take_last_records(self) -> None:

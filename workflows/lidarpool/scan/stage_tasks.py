@@ -10,7 +10,7 @@ from typing import Any
 
 from distributed import Client, Future
 
-from poolpart import Partition, Slots, look_at_slots
+from poolpart import Partition, Slots, claim_slots, drop_claim, look_at_slots
 
 from .. import watch
 from ..errors import LidarpoolError
@@ -45,6 +45,8 @@ class StageTasks:
     Dask would do both, in ways that do not fit tasks as long as the run: it may give two of
     them to one slot, where the second waits until the first has ended, which it never does;
     and it blames a task for the deaths of the workers it ran on, so that the fourth ends it.
+    The stages are started all together, when there are slots for all of them: two runs that
+    each had some of the slots would wait for each other for ever.
 
     Parameters
     ----------
@@ -77,6 +79,8 @@ class StageTasks:
         self._tasks: dict[str, _Task] = {}
         self._submitted = 0
         self._looked_at = 0.0
+        self._begun = self._enough_at = time.monotonic()  # the latter: slots, free or not
+        self.notes: list[str] = []  # what a user should know
 
     @property
     def futures(self) -> dict[str, Future]:
@@ -89,10 +93,39 @@ class StageTasks:
         return all(task.future.done() for task in self._tasks.values())
 
     def start(self) -> None:
-        """Start every stage, each on a free slot as far as there are any."""
-        free = dict(look_at_slots(self.client, self.partition.name).free)
-        for name in self._commands:
-            self._submit(name, free)
+        """Start every stage, each on a free slot; if there are too few, `look` does it later.
+
+        Raises
+        ------
+        LidarpoolError
+            If the partition has too few slots, and goes on having too few.
+        """
+        names = enumerate(self._commands)
+        keys = [f"{self._key(name)}-{number}" for number, name in names]
+        claim = claim_slots(self.client, self.partition.name, keys)
+        now = time.monotonic()
+        if claim.granted:
+            free = dict(claim.free)
+            if (waited := now - self._begun) > LOOK_EVERY_S:
+                self.notes.append(
+                    f"the survey waited {waited:.1f} s for partition {self.partition.name}, "
+                    f"until other runs had left it {len(keys)} slots"
+                )
+            for name in self._commands:
+                self._submit(name, free)
+        elif claim.slots >= len(keys):
+            self._enough_at = now  # others hold them, and are waited for
+        elif now - self._enough_at > watch.PATIENCE_S:
+            raise LidarpoolError(
+                f"Partition {self.partition.name!r} has had {claim.slots} of the {len(keys)} "
+                f"slots needed for {watch.PATIENCE_S:.0f} s: start another worker with "
+                f'--resources "{self.partition.name}=1" and run it again.'
+            )
+
+    def finish(self) -> None:
+        """Let go of everything on the scheduler."""
+        self.client.cancel(list(self.futures.values()))
+        drop_claim(self.client, self.partition.name)
 
     def look(self, progress: int) -> None:
         """See, once in a while, to stages that died or wait behind another.
@@ -111,6 +144,9 @@ class StageTasks:
         if now - self._looked_at < LOOK_EVERY_S:
             return
         self._looked_at = now
+        if not self._tasks:
+            self.start()
+            return
         slots = look_at_slots(
             self.client, self.partition.name, [task.future.key for task in self._tasks.values()]
         )
