@@ -352,6 +352,19 @@ def test_a_missing_folder_is_named(path):
         reopen(path.parent / "nowhere" / "journal")
 
 
+def test_a_journal_that_cannot_be_looked_at_says_so(path, monkeypatch):
+    interrupted(path, 9)
+
+    def refuse(*_, **__):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "iterdir", refuse)
+    message = "journal cannot be read: Permission denied"
+    for action in (lambda: reopen(path), lambda: remove_journal(path)):
+        with pytest.raises(LidarpoolError, match=message):
+            action()
+
+
 def test_a_journal_that_cannot_be_made_says_so(path, monkeypatch):
     journal = Journal(path, make_job())
 

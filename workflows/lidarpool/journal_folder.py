@@ -32,22 +32,36 @@ def remove_journal(path: str | Path) -> None:
 
 
 def check_ours(path: Path) -> None:
-    """Refuse what is in the place of a journal and is none, since it would be written over."""
+    """Refuse what is in the place of a journal and is none, since it would be written over.
+
+    Raises
+    ------
+    LidarpoolError
+        If it is that, or cannot be looked at.
+    """
+    try:
+        ours = _is_ours(path)
+    except OSError as error:
+        raise LidarpoolError(
+            f"The journal {path} cannot be read: {error.strerror or error}."
+        ) from error
+    if not ours:
+        raise LidarpoolError(
+            f"{path} is in the place of the journal and is none of lidarpool: move it, or give "
+            "another folder."
+        )
+
+
+def _is_ours(path: Path) -> bool:
     records = path / RECORDS
     if not path.exists() or (path.is_dir() and not any(path.iterdir())):
-        return
+        return True
     if records.is_file():
         with records.open("rb") as file:
             begin = file.read(len(MAGIC))
         # A crash in the first moment leaves nothing, zeros, or a part of it.
-        if MAGIC.startswith(begin) or not any(begin):
-            return
-    elif path.is_dir() and {entry.name for entry in path.iterdir()} <= {FRAMES, FRESH}:
-        return
-    raise LidarpoolError(
-        f"{path} is in the place of the journal and is none of lidarpool: move it, or give "
-        "another folder."
-    )
+        return MAGIC.startswith(begin) or not any(begin)
+    return path.is_dir() and {entry.name for entry in path.iterdir()} <= {FRAMES, FRESH}
 
 
 def remove_files(path: Path) -> None:
