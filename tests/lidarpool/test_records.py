@@ -4,6 +4,7 @@ import errno
 import os
 import subprocess
 import sys
+import tracemalloc
 import zlib
 
 import pytest
@@ -128,6 +129,30 @@ def test_a_length_that_was_changed_does_not_lead_astray(path):
     data[8:16] = (2**63).to_bytes(8, "little")
     path.write_bytes(data)
     assert read(path) == ([], 0)
+
+
+def test_a_length_that_was_changed_takes_no_memory(path):
+    write(path, [b"one", b"two"])
+    second = HEAD_BYTES + 3
+    size = 200 << 20
+    with path.open("r+b") as file:
+        file.truncate(size)  # with a hole, that takes no room on the disk
+        file.seek(second + 8)
+        file.write((size - second - HEAD_BYTES).to_bytes(8, "little"))
+    tracemalloc.start()
+    try:
+        assert read(path) == ([b"one"], second)
+        assert tracemalloc.get_traced_memory()[1] < 30 << 20
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("large", [0, 2000, 1 << 30])
+def test_large_payloads_come_back(path, monkeypatch, large):
+    monkeypatch.setattr(records, "_LARGE", large)
+    monkeypatch.setattr(records, "_WINDOW", 700)
+    write(path, PAYLOADS)
+    assert read(path) == (PAYLOADS, path.stat().st_size)
 
 
 def test_a_head_is_part_of_the_checksum(path):

@@ -36,6 +36,7 @@ SYNC_EVERY_S = 1.0
 SYNC_SHARE = 20  # a disk on which a sync takes long is synced so many times less often
 
 _WINDOW = 1 << 20  # bytes looked through at a time
+_LARGE = 16 << 20  # bytes of a payload that is not believed in before it was looked through
 
 Buffer = bytes | bytearray | memoryview
 
@@ -186,12 +187,24 @@ class RecordFile:
         magic, kind, length, _ = _HEAD.unpack_from(head)
         if magic != MAGIC or length > size - at - HEAD_BYTES:
             return None
-        payload = bytearray(length)
-        self.read_into(at + HEAD_BYTES, memoryview(payload))
-        crc = zlib.crc32(payload, zlib.crc32(memoryview(head)[: _HEAD.size]))
-        if crc != _CRC.unpack_from(head, _HEAD.size)[0]:
+        begin, crc = at + HEAD_BYTES, zlib.crc32(memoryview(head)[: _HEAD.size])
+        (expected,) = _CRC.unpack_from(head, _HEAD.size)
+        # A length that is damaged may be that of all the rest of the file.
+        if length > _LARGE and self._checksum(begin, length, crc) != expected:
             return None
-        return Record(kind, at + HEAD_BYTES, payload)
+        payload = bytearray(length)
+        self.read_into(begin, memoryview(payload))
+        return Record(kind, begin, payload) if zlib.crc32(payload, crc) == expected else None
+
+    def _checksum(self, at: int, length: int, crc: int) -> int:
+        """Continue a checksum over so many bytes of the file, of which few are in memory."""
+        window = memoryview(bytearray(_WINDOW))
+        while length:
+            view = window[: min(_WINDOW, length)]
+            self.read_into(at, view)
+            crc = zlib.crc32(view, crc)
+            at, length = at + len(view), length - len(view)
+        return crc
 
     def _find_later(self, bad: int, size: int) -> int | None:
         """Whole record after byte `bad` that was written when `bad` had been synced."""
