@@ -86,7 +86,14 @@ SCENARIOS: dict[str, tuple[str | bytes, str]] = {
     "empty": ("", "is empty"),
     "comments only": ("# nothing\n", "is empty"),
     "not YAML": ("scene: [seed\n", "line 2"),
-    "tabs": ("scene:\n\tpreset: seed\n", "line 2"),
+    "tabs": ("scene:\n\tpreset: seed\n", "line 2: there is a tab: indent"),
+    "a tab after a name": ("sensor:\t{layers: 2}\n", "line 1: there is a tab"),
+    "indented otherwise": ("sensor:\n   layers: 2\n  steps: 3\n", "line 3: this line is indented"),
+    "a path with backslashes": ('scene: {files: ["C:\\mesh\\a.stl"]}\n', "write paths with /"),
+    "a file with fields on two lines": ("scene:\n  - a.stl\n    unit: mm\n", "{file: part.stl"),
+    "three dots": ("steps: 3\n...\nsteps: 4\n", "a scenario is one document"),
+    "a section in itself": ("scene: &a {files: *a}\n", "scene.files[0].file is missing"),
+    "a list in itself": ("poses: &a [*a]\n", "poses[0].position[0] is [[[[...]]]]"),
     "a list": ("- seed\n", "holds a list"),
     "a word": ("seed\n", "holds only 'seed'"),
     "two documents": ("steps: 3\n---\nsteps: 4\n", "line 2"),
@@ -118,6 +125,8 @@ SCENARIOS: dict[str, tuple[str | bytes, str]] = {
     "section as list": ("sensor: [1]\n", "sensor is [1]; it must be a section"),
     "section as number": ("cloud: 5\n", "cloud is 5; it must be a section"),
     "no poses": ("poses: []\n", "poses is []; it must be a list of at least 1"),
+    "one pose without its list": ("poses: [0, 0, 1]\n", "must be in a list: [[x, y, z]]"),
+    "one pose as a section": ("poses: {position: [0, 0, 1]}\n", "must be in a list"),
     "flat pose": ("poses: [[0, 0]]\n", "poses[0].position is [0, 0]; it must be a list of 3"),
     "pose of words": ("poses: [[a, b, c]]\n", "poses[0].position[0] is 'a'"),
     "pose beyond floats": ("poses: [[1.0e+999, 0, 0]]\n", "poses[0].position[0] is inf"),
@@ -131,6 +140,8 @@ SCENARIOS: dict[str, tuple[str | bytes, str]] = {
     "nothing to scan": ("scene: {preset: none}\n", "nothing to scan"),
     "unknown preset": ("scene: {preset: sed}\n", "scene.preset is 'sed'; it must be one of"),
     "mesh is missing": ("scene: {files: [nowhere.glb]}\n", "nowhere.glb does not exist"),
+    "mesh is misspelt": ("scene: {files: [b.stl]}\n", "Did you mean 'a.stl'?"),
+    "mesh beyond the Earth": ("scene: [{file: a.stl, scale: 1.0e+9}]\n", "reaches 3e+09 m"),
     "mesh is a folder": ("scene: {files: [.]}\n", "is not a file"),
     "mesh without name": ("scene: {files: [{unit: m}]}\n", "scene.files[0].file is missing"),
     "unknown unit": ("scene: {files: [{file: a.stl, unit: ells}]}\n", "files[0].unit is 'ells'"),
@@ -146,6 +157,14 @@ SCENARIOS: dict[str, tuple[str | bytes, str]] = {
     "planning without ends": (
         "scene: [a.stl]\nplanning: {enabled: true}\n",
         "give planning.start and planning.target",
+    ),
+    "planning with one end": (
+        "scene: [a.stl]\nplanning: {start: [9, 9]}\n",
+        "give both planning.start and planning.target, or neither",
+    ),
+    "planning from and to one place": (
+        "planning: {target: [25, 25]}\n",
+        "start and target of the path are both (25.0, 25.0)",
     ),
     "too fine for the scene": (
         "scene: {ground: {margin_m: 1000000}}\ncloud: {precision_m: 0.000001}\n",
@@ -254,6 +273,32 @@ def test_cuda_without_a_gpu(refused):
     if not available_backends()["cuda"]:
         pytest.skip("there is a GPU")
     refused(["run", "good.yaml", "--backend", "cuda"], "Backend 'cuda' cannot be used here")
+
+
+TOO_LONG = "x" * 300
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["run", TOO_LONG],
+        ["run", f"{TOO_LONG}.stl"],
+        ["run", "a.stl", "--out", TOO_LONG],
+        ["check", "good.yaml", "--out", TOO_LONG],
+        ["init", TOO_LONG],
+        ["init", "new", "--mesh", f"{TOO_LONG}.stl"],
+        ["plot", TOO_LONG],
+        ["view", f"{TOO_LONG}.ply", "--no-browser"],
+        ["scene", "city", f"{TOO_LONG}.glb"],
+    ],
+    ids=lambda arguments: " ".join(arguments)[:40],
+)
+def test_a_name_that_no_file_can_have(arguments, place, lidarpool):
+    before = content(place)
+    outcome = lidarpool(*arguments)
+    assert (outcome.code, outcome.err.count("Traceback")) == (2, 0)
+    assert "File name too long" in outcome.err
+    assert content(place) == before
 
 
 # -- where the result goes ----------------------------------------------------------------------

@@ -237,3 +237,10 @@ def test_a_scene_that_is_not_hit_says_where_it_is(check, tmp_path):
     box(tmp_path, (8, 6, 3))
     outcome = check(text="scene: [my box.stl]\nposes: [[900, 0, 90]]\nsensor: {layers: 1}\n")
     assert "the scene reaches from (-4, -3, -1.5) to (4, 3, 1.5)" in outcome.out
+
+
+def test_the_memory_of_swarms_is_counted(check):
+    outcome = check(text="planning: {particles: 10000000, waypoints: 100}")
+    assert outcome.code == 2
+    assert "of memory and the run needs about" in outcome.err
+    assert "particles" in outcome.err

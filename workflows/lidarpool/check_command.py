@@ -100,7 +100,8 @@ def told(made: Forecast) -> Iterator[str]:
         for axis, a, b in zip("xyz", low, high, strict=True)
     )
     yield (
-        f"survey      {survey.scan_count:,} scans from {len(survey.poses):,} poses, "
+        f"survey      {survey.scan_count:,} scan{'s' * (survey.scan_count != 1)} from "
+        f"{len(survey.poses):,} pose{'s' * (len(survey.poses) != 1)}, "
         f"{survey.ray_count:,} rays ({sensor.rays_per_revolution:,} x {sensor.layers:,} a turn)"
     )
     if sample is not None:

@@ -206,6 +206,13 @@ def _run(arguments: list[str] | None) -> None:
             " ".join([f"{STOPPED}.", *notes]) if (notes := _notes(error)) else UNTOUCHED,
             INTERRUPTED,
         )
+    except OSError as error:
+        # Of a name that no file can have, or that lies in a folder which may not be looked into;
+        # anything else is a defect, and shown whole.
+        if error.filename is None:
+            raise
+        told = f"{error.filename}: {error.strerror}: give another name or folder."
+        _die(" ".join([told, *_notes(error)]), 2)
     except MemoryError as error:
         advice = "not enough memory: take a smaller scene, fewer scans or a larger keep_every."
         _die(" ".join([advice, *_notes(error)]), 2)

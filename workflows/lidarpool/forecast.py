@@ -221,8 +221,8 @@ def _compare(made: Forecast, needs: Needs) -> None:
     if made.memory and made.memory < made.memory_needed:
         made.reasons.append(
             f"There are {in_bytes(made.memory)} of memory and the run needs about "
-            f"{in_bytes(made.memory_needed)}: take a smaller scene, fewer workers (pool.gpu) or "
-            "rays_per_revolution, or a machine with more."
+            f"{in_bytes(made.memory_needed)}: take a smaller scene, fewer workers (pool.gpu), "
+            "rays_per_revolution or planning.particles, or a machine with more."
         )
 
 

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import codecs
+import errno
 import io
 import json
 import logging
 import re
+import stat
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import trimesh
 
+from .complaints import did_you_mean
 from .dae import read_dae
 from .errors import LidarpoolError
 from .gltf_buffers import buffers_beside
@@ -128,9 +131,17 @@ def _read_whole(path: Path, data: bytes) -> tuple[list[Mesh], float | None, str 
 
 def _bytes_of(path: Path) -> bytes:
     """Check that `path` is a readable file of a known kind, and read it."""
-    if not path.exists():
-        raise LidarpoolError(f"{path} does not exist: check the name and the folder.")
-    if not path.is_file():
+    try:
+        kind = path.stat().st_mode
+    except OSError as error:
+        if error.errno in (errno.ENOENT, errno.ENOTDIR):
+            raise LidarpoolError(
+                f"{path} does not exist: check the name and the folder.{_like(path)}"
+            ) from error
+        raise LidarpoolError(f"{path} cannot be read: {error.strerror}.") from error
+    except ValueError as error:  # a zero in the name
+        raise LidarpoolError(f"{path} is not the name of a file: {error}.") from error
+    if not stat.S_ISREG(kind):
         raise LidarpoolError(f"{path} is not a file: give a mesh file ({' '.join(SUFFIXES)}).")
     if path.suffix.lower() not in SUFFIXES:
         raise LidarpoolError(
@@ -144,6 +155,15 @@ def _bytes_of(path: Path) -> bytes:
     if not data:
         raise LidarpoolError(f"{path} is empty (0 bytes): export the mesh again.")
     return data.removeprefix(codecs.BOM_UTF8)  # which editors put before text
+
+
+def _like(path: Path) -> str:
+    """Mesh file beside a name that is not there, whose name is much the same."""
+    try:
+        beside = [other.name for other in path.parent.iterdir()]
+    except OSError:
+        return ""
+    return did_you_mean(path.name, [name for name in beside if name.lower().endswith(SUFFIXES)])
 
 
 def _read(path: Path, data: bytes) -> tuple[list[Mesh], float | None, str | None]:

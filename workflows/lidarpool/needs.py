@@ -10,6 +10,7 @@ from .cloud import CHUNK_POINTS
 from .job import Job
 from .output import ROOM_BYTES
 from .picture_file import TRIANGLE_BYTES as PICTURED_BYTES
+from .plan import Planning
 from .ply import real_type
 from .ply_format import row_type
 from .records import HEAD_BYTES
@@ -23,6 +24,10 @@ TRIANGLE_BYTES = 360
 SCENE_BYTES = 80
 # Directions of a revolution, and the pattern made of them.
 RAY_BYTES = 48
+# What a particle of a swarm has for each corner of its path, and what is left of a trial; the
+# history of a trial is a number for each iteration.
+PARTICLE_BYTES = 140
+TRIAL_BYTES = 1000
 # Places and counts, and entries of the ledgers, in the driver.
 SCAN_BYTES = 32
 
@@ -73,16 +78,29 @@ def needs_of(job: Job, points: int) -> Needs:
     totals = 2 * 8 * faces
     # A scan is a record of its own where they come one by one.
     records = (HEAD_BYTES + 12) * survey.scan_count + POINT.itemsize * points
+    swarm, trials, written = _planning_bytes(job.planning)
     return Needs(
         gpu_worker=PROCESS_BYTES + scene + TRIANGLE_BYTES * faces + sensor,
         lidar_worker=PROCESS_BYTES + sensor,
-        other_worker=PROCESS_BYTES,
+        other_worker=PROCESS_BYTES + swarm,
         driver=PROCESS_BYTES
         + 2 * scene
         + SCAN_BYTES * survey.scan_count
+        + trials
         # A piece of the cloud as it is merged, written and read back.
         + 4 * POINT.itemsize * min(points, CHUNK_POINTS),
-        journal=records + totals,
+        journal=records + totals + written,
         cloud=row * (points + min(points, CHUNK_POINTS)),
         pictures=ROOM_BYTES + PICTURED_BYTES * faces,
     )
+
+
+def _planning_bytes(planning: Planning | None) -> tuple[int, int, int]:
+    """Bytes of the swarm of a trial, and of all trials in memory and in the journal."""
+    if planning is None:
+        return 0, 0, 0
+    swarm = PARTICLE_BYTES * planning.particles * planning.waypoints
+    held = TRIAL_BYTES + 4 * planning.iterations + 16 * planning.waypoints
+    # As text.
+    written = HEAD_BYTES + 200 + 20 * planning.iterations + 40 * planning.waypoints
+    return swarm, planning.trials * held, planning.trials * written

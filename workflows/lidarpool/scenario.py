@@ -93,14 +93,28 @@ class Scenario(Section):
         """Take a section of which all fields are commented out as one of defaults."""
         return {} if value is None else value
 
+    @field_validator("poses", mode="before")
+    @classmethod
+    def _not_one_pose(cls, value: Any) -> Any:
+        """Answer the slip of giving a pose instead of a list of them in words of its own."""
+        if isinstance(value, dict) or (
+            isinstance(value, list) and value and all(type(n) in (int, float) for n in value)
+        ):
+            raise ValueError("a single pose is given, and must be in a list: [[x, y, z]].")
+        return value
+
     @model_validator(mode="after")
     def _bounded(self) -> Scenario:
         scans = len(self.poses or _HEIGHTS_M) * self.steps
         if scans > SCAN_LIMIT:
             raise ValueError(f"poses times steps makes {scans:,} scans; at most {SCAN_LIMIT:,}.")
-        needs_ends = self.planning.enabled and not self.scene.has_seed
-        if needs_ends and None in (self.planning.start, self.planning.target):
+        missing = [self.planning.start, self.planning.target].count(None)
+        if self.planning.enabled and not self.scene.has_seed and missing:
             raise ValueError("planning is enabled: give planning.start and planning.target.")
+        if self.planning.enabled is None and not self.scene.has_seed and missing == 1:
+            raise ValueError(
+                "planning has one end: give both planning.start and planning.target, or neither."
+            )
         return self
 
     @classmethod

@@ -28,7 +28,7 @@ _SHORT_SECTIONS: dict[type[BaseModel], list[dict[str, Any]]] = {
 # The same of fields. {(section, field): its short forms}
 _SHORT_FIELDS: dict[tuple[type[BaseModel], str], list[dict[str, Any]]] = {
     (MeshFile, "scale"): [{"type": "number"}],
-    (SceneSection, "files"): [_TEXT],
+    (SceneSection, "files"): [{"$ref": "#/$defs/MeshFile"}],
     (PlanningSection, "obstacles"): [{"const": "auto"}],
 }
 

@@ -135,7 +135,7 @@ class SceneSection(Section):
     def _short_forms(cls, value: Any) -> Any:
         if isinstance(value, str):
             return {"preset": value} if value in ("seed", "none") else {"files": [value]}
-        if isinstance(value, dict) and isinstance(value.get("files"), str):
+        if isinstance(value, dict) and isinstance(value.get("files"), (str, dict)):
             return value | {"files": [value["files"]]}
         return {"files": value} if isinstance(value, list) else value
 

@@ -13,6 +13,22 @@ from .errors import LidarpoolError
 SIZE_LIMIT = 4 * 2**20  # bytes; a million poses are better made in Python
 
 
+# {part of what PyYAML says: what it means to whoever wrote the file}
+_WORDS = {
+    "could not determine a constructor": "tags such as !name have no meaning here, a scenario is "
+    "plain data",
+    "expected <block end>": "this line is indented otherwise than those it belongs to, or a "
+    "bracket above is not closed",
+    "found character '\\t'": "there is a tab: indent and separate with blanks",
+    "mapping values are not allowed": "a second ':' on one line, or a line that is indented too "
+    "far; a list of files reads: - {file: part.stl, unit: mm}",
+    "found unknown escape character": "between double quotes \\ begins an escape: write paths with "
+    "/, or between single quotes",
+    "expected ',' or": "a bracket is not closed, or a comma is missing",
+    "expected '<document start>'": "a scenario is one document, without --- or ... in it",
+}
+
+
 class _Loader(yaml.SafeLoader):
     """SafeLoader that refuses a key given twice, where PyYAML silently takes the last."""
 
@@ -61,7 +77,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
         )
     content = _parse(path, data)
     if content is None:
-        raise LidarpoolError(f"{path} is empty: see examples/seed.yaml for what a scenario says.")
+        raise LidarpoolError(f"{path} is empty: lidarpool init writes a scenario to begin with.")
     if not isinstance(content, dict):
         kind = "a list" if isinstance(content, list) else f"only {str(content)[:40]!r}"
         raise LidarpoolError(
@@ -84,8 +100,7 @@ def _parse(path: Path, data: bytes) -> Any:
         mark = error.problem_mark or error.context_mark
         where = f", line {mark.line + 1}" if mark else ""
         problem = error.problem or "not valid YAML"
-        if "could not determine a constructor" in problem:
-            problem = "tags such as !name have no meaning here, a scenario is plain data"
+        problem = next((words for sign, words in _WORDS.items() if sign in problem), problem)
         raise LidarpoolError(f"{path}{where}: {problem}.") from error
     except RecursionError as error:
         raise LidarpoolError(f"{path} is nested too deeply to be a scenario.") from error
