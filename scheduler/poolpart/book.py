@@ -42,6 +42,10 @@ class Seat:
         Where it is lent from.
     absent_since
         When it left, by `time.monotonic`; None while it is there.
+    given_up
+        It is not there, and its place is not kept any more.
+    joined
+        When it joined after the cluster was divided, by `time.monotonic`; else 0.
     unplaced
         It joined after the cluster was divided, and no rule has wanted it yet.
     """
@@ -54,6 +58,8 @@ class Seat:
     nanny: str | None = None
     home: str | None = None
     absent_since: float | None = None
+    given_up: bool = False
+    joined: float = 0.0
     unplaced: bool = False
 
     @property

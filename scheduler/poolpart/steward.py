@@ -27,6 +27,7 @@ from .rebalancing import Rebalancing
 from .restarts import declare_on_worker
 from .rules import PerGpu, partition_for
 from .tracing import trace
+from .vacancies import successor, vacated
 from .worker_info import WorkerInfo
 
 logger = logging.getLogger(__name__)
@@ -88,7 +89,8 @@ class Steward(SchedulerPlugin):
             seat.found = dict(worker.resources)
             if seat.nanny is not None:
                 self.nannies.forget(seat.nanny)
-        seat.info, seat.nanny, seat.absent_since = info, worker.nanny, None
+        seat.info, seat.nanny = info, worker.nanny
+        seat.absent_since, seat.given_up = None, False
         return seat
 
     def add_worker(self, scheduler: Any, worker: str) -> None:
@@ -96,6 +98,7 @@ class Steward(SchedulerPlugin):
         known = {s.key for s in self.book.seats.values() if s.holds}
         seat = self._seat(scheduler.workers[worker])
         if seat.key not in known:
+            seat.joined = time.monotonic()
             declared = [name for name in self.book.rules if seat.found.get(name)]
             if declared:
                 self.book.put(seat, declared[0], seat.found[declared[0]])
@@ -146,11 +149,19 @@ class Steward(SchedulerPlugin):
             return
         self.rebalancing.look(time.monotonic())
         if any(seat.absent_since is not None for seat in self.book.seats.values()):
+            for gone in vacated(self.book):
+                self._pass_on(gone)
             self.book.forget(time.monotonic())
             self.nannies.forget_others({seat.nanny for seat in self.book.seats.values()})
         waiting = [s for s in self.book.seats.values() if s.unplaced and s.absent_since is None]
         if waiting:
             self._look_for_places(waiting)
+
+    def _pass_on(self, gone: Seat) -> None:
+        """Give the place of a worker to one that joined while it was kept."""
+        if seat := successor(self.book, gone):
+            self.book.put(seat, gone.partition)
+            self.settle([seat])
 
     def _look_for_places(self, waiting: list[Seat]) -> None:
         """Place workers that nobody wanted: another may have gone for good since.

@@ -3,8 +3,12 @@
 import asyncio
 import socket
 
-from poolpart import Pool, book, n_workers
+import pytest
+
+from poolpart import Pool, WorkerInfo, book, n_workers, per_gpu, rest
+from poolpart.book import Book, Seat
 from poolpart.nannies import has_gone
+from poolpart.vacancies import successor, vacated
 
 
 def declared(client):
@@ -20,9 +24,13 @@ def test_nobody_listens():
     assert not asyncio.run(has_gone("inproc://127.0.0.1/1/2"))
 
 
-def test_the_place_of_a_worker_that_was_stopped_goes_to_the_next(nannies, wait_until, monkeypatch):
+@pytest.mark.parametrize("others", [n_workers(1), rest()])
+def test_the_place_of_a_worker_that_was_stopped_goes_to_the_next(
+    nannies, wait_until, monkeypatch, others
+):
+    """Also if that one has joined before, and was given to what takes the rest."""
     monkeypatch.setattr(book, "HOLD_S", 3600.0)
-    parts = Pool.from_client(nannies).divide({"A": n_workers(1), "B": n_workers(1)})
+    parts = Pool.from_client(nannies).divide({"A": n_workers(1), "B": others})
     (name,) = (name for name, resources in declared(nannies).items() if "A" in resources)
     spec = nannies.cluster.worker_spec.pop(name)
     nannies.sync(nannies.cluster._correct_state)
@@ -31,4 +39,44 @@ def test_the_place_of_a_worker_that_was_stopped_goes_to_the_next(nannies, wait_u
     nannies.cluster.worker_spec["next"] = spec
     nannies.sync(nannies.cluster._correct_state)
     assert waiting.result(30) == 64
-    assert declared(nannies)["next"] == {"A": 1}
+    (stayed,) = declared(nannies).keys() - {"next"}
+    assert declared(nannies) == {"next": {"A": 1}, stayed: {"B": 1}}
+
+
+# -- who inherits a place, by the book alone -------------------------------------------
+
+
+def seat(name, partition, **given):
+    info = WorkerInfo(name, f"tcp://{name}", "h", 1, gpus=given.pop("gpus", ()))
+    return Seat(name, info, {}, partition=partition, nanny="tcp://n", **given)
+
+
+def a_book(*seats, **rules):
+    return Book(rules=rules, seats={seat.key: seat for seat in seats}, names=set(rules))
+
+
+def test_only_whoever_joined_since_inherits(monkeypatch):
+    monkeypatch.setattr(book, "HOLD_S", 0.0)
+    gone = seat("gone", "A", absent_since=10.0)
+    before, after = seat("before", "B", joined=9.0), seat("after", "B", joined=11.0)
+    rules = {"A": n_workers(1), "B": rest(minimum=1)}
+    mine = a_book(gone, before, after, **rules)
+    assert vacated(mine) == [gone]
+    assert vacated(mine) == []
+    assert successor(mine, gone) is after
+    assert successor(a_book(gone, after, **rules), gone) is None  # B has none to spare
+    assert successor(a_book(gone, before, seat("b", "B"), **rules), gone) is None
+    lent = seat("lent", "B", joined=11.0, home="C")
+    assert successor(a_book(gone, before, lent, **rules, C=n_workers(1)), gone) is None
+    filled = a_book(gone, before, after, seat("next", "A", joined=12.0), **rules)
+    assert successor(filled, gone) is None
+
+
+def test_a_place_at_a_gpu_is_not_for_a_worker_without(monkeypatch):
+    monkeypatch.setattr(book, "HOLD_S", 0.0)
+    gone = seat("gone", "GPU", absent_since=10.0, gpus=("x",))
+    there = seat("there", "GPU", gpus=("y",))
+    without, one = seat("without", "B", joined=11.0), seat("one", "B", joined=12.0, gpus=("x",))
+    rules = {"GPU": per_gpu(1), "B": rest()}
+    assert successor(a_book(gone, there, without, one, **rules), gone) is one
+    assert successor(a_book(gone, there, without, **rules), gone) is None
