@@ -16,7 +16,7 @@ from .stats import statistics_of, told
 from .stats_plugin import Ran, running_on, slots_of
 
 PATH = "partitions"
-MOST_RUNNING = 16  # running tasks that are told of a worker
+MOST_RUNNING = 64  # running tasks that are told of a worker
 _FAILURE_LENGTH = 200
 
 
@@ -58,9 +58,10 @@ def _task(ran: Ran) -> list[Any]:
 def _worker(worker: Any) -> dict[str, Any]:
     partition = next((name for name, slots in worker.resources.items() if slots), "")
     slots = slots_of(worker, partition)
-    executing = [  # by the last heartbeat: the scheduler is told of nothing else
+    executing = [  # by the last heartbeat: the scheduler is told of nothing else but ends
         [str(task.key), task.prefix.name, round(worker.last_seen - seconds, 3)]
         for task, seconds in list(worker.executing.items())[:MOST_RUNNING]
+        if task.processing_on is worker
     ]
     return {
         "name": str(worker.name),
@@ -71,6 +72,7 @@ def _worker(worker: Any) -> dict[str, Any]:
         "busy": min(running_on(worker, partition).total(), slots),
         "status": worker.status.name,
         "given": len(worker.processing),
+        "seen": round(worker.last_seen, 3),
         "executing": executing,
     }
 
