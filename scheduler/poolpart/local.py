@@ -7,6 +7,7 @@ import multiprocessing
 import os
 from collections.abc import Mapping
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from distributed import Nanny, Scheduler, Security, SpecCluster, Status
@@ -117,9 +118,20 @@ def local_cluster(
         )
     except RuntimeError as error:
         raise PoolError(
-            f"The workers did not start ({error.__cause__ or error}). Each imports the script "
-            "that starts the cluster: do that under `if __name__ == '__main__':` in it."
+            f"The workers did not start ({error.__cause__ or error}). {_advice()}"
         ) from error
+
+
+def _advice() -> str:
+    """Say what to do where workers do not start, as far as that can be known."""
+    try:
+        Path.home()
+    except RuntimeError:  # a user without an entry in the list of users, as in containers
+        return "Dask's dashboard looks for a home folder: let HOME name one."
+    return (
+        "Each imports the script that starts the cluster: do that under "
+        "`if __name__ == '__main__':` in it."
+    )
 
 
 def _security(wanted: Security | bool) -> Security:

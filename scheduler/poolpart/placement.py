@@ -45,6 +45,9 @@ class Recorder:
     def __init__(self, stage: str, partition: str) -> None:
         self.stage, self.partition = stage, partition
         self.start = time.time()
+        # A clock may be set while the task runs; it must not seem to have taken hours, or less
+        # than nothing.
+        self._begun = time.perf_counter()
 
     def done(self, items: int = 1) -> TaskRecord:
         """Record of the task up to now."""
@@ -55,7 +58,7 @@ class Recorder:
             worker=str(worker.name),
             resources=tuple(sorted(worker.state.total_resources)),
             start=self.start,
-            stop=time.time(),
+            stop=self.start + (time.perf_counter() - self._begun),
             items=items,
         )
 

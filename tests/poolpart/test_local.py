@@ -172,3 +172,15 @@ def test_a_script_without_a_main_guard_is_told_so(tmp_path):
     assert last.startswith("poolpart.errors.PoolError: The workers did not start (")
     assert "under `if __name__ == '__main__':`" in last
     assert "freeze_support" not in errors
+
+
+def test_advice_where_there_is_no_home(monkeypatch):
+    def no_home():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr("poolpart.local._NannyCluster", lambda **_: no_home())
+    with pytest.raises(PoolError, match="under `if __name__"):
+        local_cluster()
+    monkeypatch.setattr("poolpart.local.Path.home", no_home)
+    with pytest.raises(PoolError, match=r"home directory\.\)\. .* let HOME name one"):
+        local_cluster()
