@@ -1,6 +1,6 @@
 """Who is to be in which partition: the scheduler's book, without the scheduler.
 
-The book says what should be; `steward.py` makes it so. Whatever happens to a worker in
+The book says what should be; `settling.py` makes it so. Whatever happens to a worker in
 between, what it should declare can be read here.
 """
 

@@ -96,14 +96,14 @@ async def _declare(
         _check_sole(steward, name, seats[name], seen)
     _begin(steward, rules)
     for address, devices in gpus.items():
-        if devices and (seat := steward.seat_at(address)):
+        if devices and (seat := steward.settling.seat_at(address)):
             seat.info = seat.info.with_gpus(devices)
     for name, rule in rules.items():
         steward.book.enter(name, rule)
         for seat in seats[name]:
             steward.book.put(seat, name, rule.slots_of(seat.info))
     everyone = [seat for group in seats.values() for seat in group]
-    late = await steward.arrive(everyone, PATIENCE_S)
+    late = await steward.settling.arrive(everyone, PATIENCE_S)
     await settle_fences(steward.scheduler)
     if late or not all(seat.holds for seat in everyone):
         away = [seat for seat in everyone if seat in late or not seat.holds]
@@ -133,7 +133,7 @@ def _begin(steward: Steward, rules: Mapping[str, Rule]) -> None:
 
 
 def _seat(steward: Steward, name: str, address: str) -> Seat:
-    seat = steward.seat_at(address)
+    seat = steward.settling.seat_at(address)
     if seat is None:
         raise PoolError(
             f"The worker at {address} could not be put into partition {name!r}: it has left. "

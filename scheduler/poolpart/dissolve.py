@@ -16,8 +16,9 @@ from .fence_plugin import fences_of, lower
 from .inherit import end_inheritance
 from .page_server import close_page
 from .placing import asks_for
+from .settling import LOOK_EVERY_S
 from .stats import forget_statistics
-from .steward import LOOK_EVERY_S, Steward
+from .steward import Steward
 
 _UNFINISHED = ("waiting", "queued", "no-worker", "processing")
 
@@ -82,7 +83,7 @@ async def _dissolve(steward: Steward, names: list[str] | None, timeout_s: float)
     for seat in seats:
         book.put(seat, None)
     _lift_restrictions(scheduler, gone)
-    late = await steward.arrive(seats, max(timeout_s, 10.0))
+    late = await steward.settling.arrive(seats, max(timeout_s, 10.0))
     for seat in seats:
         if not seat.holds:
             await steward.nannies.restore(seat)

@@ -76,7 +76,7 @@ async def _grow(
     if source is not None:
         book.adopt(source)
     lender = source or book.remainder()
-    there = [] if source else [seat for seat in book.free() if steward.settled(seat)]
+    there = [] if source else [seat for seat in book.free() if steward.settling.settled(seat)]
     if lender is not None and lender != name:
         members = _arrived(steward, lender)
         spare = max(0, len(members) - book.rules[lender].minimum)
@@ -117,7 +117,7 @@ async def _follow(steward: Steward, rule: Help) -> None:
 
 async def _unfollow(steward: Steward, lender: str, borrower: str, timeout_s: float) -> list[str]:
     back = steward.rebalancing.drop(lender, borrower)
-    if late := await steward.arrive(back, timeout_s):
+    if late := await steward.settling.arrive(back, timeout_s):
         raise PoolError(
             f"{names_of(late)} not back in partition {lender!r} after {timeout_s:g} s"
             f"{_held(steward, late, [borrower])}; what is left to do there ends first."
@@ -134,7 +134,7 @@ async def _move(
         _resize(steward, seat.partition, -1)
         _resize(steward, target, 1)
         steward.book.put(seat, target)
-    late = await steward.arrive(seats, timeout_s)
+    late = await steward.settling.arrive(seats, timeout_s)
     for seat in late:
         origin, slots, home = before[seat]
         if seat.partition != target or (origin and origin not in steward.book.rules):
@@ -145,7 +145,7 @@ async def _move(
         seat.home = home
     if late:
         leaving = [name for name, *_ in (before[seat] for seat in late) if name]
-        steward.settle(late)
+        steward.settling.settle(late)
         raise PoolError(
             f"{len(late)} of {len(seats)} workers could not be moved within {timeout_s:g} s and "
             f"stay where they are: {names_of(late)}{_held(steward, late, leaving)}."
@@ -160,7 +160,7 @@ async def _move(
 
 def _arrived(steward: Steward, name: str) -> list[Seat]:
     """Members that are not under way: those may turn back, and belong to another's move."""
-    return [s for s in steward.book.members(name, present=True) if steward.settled(s)]
+    return [s for s in steward.book.members(name, present=True) if steward.settling.settled(s)]
 
 
 def _resize(steward: Steward, name: str | None, change: int) -> None:

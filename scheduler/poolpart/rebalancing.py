@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
 from .book import Book, Seat
 from .placing import asks_for
+from .settling import Settling
 
 # Longer than an idle worker waits to be lent: whoever submits may need a moment to notice it,
 # and a worker that goes back and forth is of no use to anybody.
@@ -40,20 +40,12 @@ class Rebalancing:
         The scheduler.
     book
         Who is where; changed here.
-    settle
+    settling
         Has workers follow the book.
-    settled
-        Whether a worker has done so.
     """
 
-    def __init__(
-        self,
-        scheduler: Any,
-        book: Book,
-        settle: Callable[[Iterable[Seat]], None],
-        settled: Callable[[Seat], bool],
-    ) -> None:
-        self.scheduler, self.book, self._settle, self._settled = scheduler, book, settle, settled
+    def __init__(self, scheduler: Any, book: Book, settling: Settling) -> None:
+        self.scheduler, self.book, self.settling = scheduler, book, settling
         self.helps: dict[tuple[str, str], Help] = {}
         self._idle_since: dict[str, float] = {}  # {address: when it was first seen idle}
 
@@ -122,7 +114,9 @@ class Rebalancing:
 
     def _lend(self, rule: Help, most: int, now: float) -> None:
         # Not those on their way: they may turn back.
-        members = [s for s in self.book.members(rule.lender, present=True) if self._settled(s)]
+        members = [
+            s for s in self.book.members(rule.lender, present=True) if self.settling.settled(s)
+        ]
         spare = max(0, len(members) - self.book.rules[rule.lender].minimum)
         # A worker that is itself lent goes home first.
         idle = [s for s in members if s.home is None and self._idle(s, rule.idle_s, now)]
@@ -132,9 +126,9 @@ class Rebalancing:
             seat.home = rule.lender
             # The new member starts with a clean record, else it would be idle at once.
             self._idle_since.pop(seat.info.address, None)
-        self._settle(chosen)
+        self.settling.settle(chosen)
 
     def _give_back(self, seats: list[Seat]) -> None:
         for seat in seats:
             self.book.put(seat, seat.home)
-        self._settle(seats)
+        self.settling.settle(seats)

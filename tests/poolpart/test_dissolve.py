@@ -18,6 +18,7 @@ from poolpart import (
     per_host,
     raise_fence,
     rest,
+    settling,
     steward,
 )
 from poolpart import nannies as their
@@ -175,12 +176,12 @@ def test_nothing_stays_but_of_workers_that_do_not_answer(start, wait_until, monk
     before = known(client)
     pool = Pool.from_client(client)
     pool.divide({"A": n_workers(1, exclusive=True), "B": rest()})
-    arrive = steward.Steward.arrive
+    arrive = settling.Settling.arrive
 
     async def impatient(self, seats, timeout_s):
         return await arrive(self, seats, 0.0)
 
-    monkeypatch.setattr(steward.Steward, "arrive", impatient)
+    monkeypatch.setattr(settling.Settling, "arrive", impatient)
     with pytest.raises(PoolError, match="a, b did not answer while A and B were dissolved"):
         pool.dissolve()
     wait_until(lambda: steward.NAME not in client.cluster.scheduler.plugins)

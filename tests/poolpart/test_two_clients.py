@@ -1,14 +1,13 @@
 """Two clients that divide, move and undo at the same moment: one does, the other is told."""
 
 import threading
-import time
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import pytest
 from distributed import Client, Event
 
-from poolpart import Partition, Pool, PoolError, making, n_workers, rest
+from poolpart import Partition, Pool, PoolError, making, n_workers, rest, trace_to
 
 LONG_S = 60.0
 
@@ -148,13 +147,12 @@ def test_never_below_the_minimum_whoever_moves(start):
     rules = {"A": n_workers(2, minimum=2), "B": n_workers(2, minimum=1), "C": rest(minimum=1)}
     Pool.from_client(client).divide(rules)
     least = {"A": 2, "B": 1, "C": 1}
-    seen, over = [], threading.Event()
+    workers = client.cluster.scheduler.workers
+    seen = []  # what all workers declared, each time that one of them was told
 
-    def watch():
-        while not over.is_set():
-            now = client.sync(_look, client.cluster.scheduler)
-            seen.append(now)
-            time.sleep(0.001)
+    def see(point, fields):
+        now = [{name for name, slots in w.resources.items() if slots} for w in workers.values()]
+        seen.append(now)
 
     def move(number):
         with Client(client.cluster) as mine:
@@ -173,21 +171,15 @@ def test_never_below_the_minimum_whoever_moves(start):
                     assert "cannot" in str(error)
             return done
 
-    watcher = threading.Thread(target=watch)
-    watcher.start()
+    trace_to(see)
     try:
         with ThreadPoolExecutor(2) as threads:
             moved = list(threads.map(move, range(2)))
     finally:
-        over.set()
-        watcher.join()
+        trace_to(None)
     assert min(moved) > 2
-    assert len(seen) > 20
+    assert len(seen) > sum(moved)
     for declares in seen:
         assert all(len(names) <= 1 for names in declares)
         for name, least_of_it in least.items():
             assert sum(name in names for names in declares) >= least_of_it
-
-
-async def _look(scheduler):
-    return [{n for n, q in worker.resources.items() if q} for worker in scheduler.workers.values()]
