@@ -365,6 +365,28 @@ def test_a_journal_that_cannot_be_looked_at_says_so(path, monkeypatch):
             action()
 
 
+def test_a_journal_that_is_removed_while_it_is_written_is_not_promised(path):
+    journal = reopen(path)
+    with (
+        pytest.raises(LidarpoolError, match=r"journal is gone: it was removed") as caught,
+        journal.kept_on_error(),
+    ):
+        deliver(journal, DELIVERIES[:9])
+        path.rename(path.with_name("elsewhere"))
+        journal.save()
+    assert not getattr(caught.value, "__notes__", [])
+
+
+def test_a_journal_in_another_ones_place_is_not_promised(path):
+    journal = reopen(path)
+    with pytest.raises(ZeroDivisionError) as caught, journal.kept_on_error():
+        deliver(journal, DELIVERIES[:9])
+        (path / RECORDS).unlink()
+        (path / RECORDS).write_bytes(b"another's")
+        raise ZeroDivisionError
+    assert not getattr(caught.value, "__notes__", [])
+
+
 def test_a_journal_that_cannot_be_made_says_so(path, monkeypatch):
     journal = Journal(path, make_job())
 

@@ -271,7 +271,7 @@ class Journal(Deliveries):
                 if not self.kept:
                     self._store.discard()
                 self.save()
-            if self.kept:
+            if self.kept and self._store.is_there:
                 error.add_note(
                     f"{self.kept} are kept in {self.path}: continue with {self.terms.resume}."
                 )

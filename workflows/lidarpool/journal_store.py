@@ -58,6 +58,11 @@ class JournalStore:
         assert self.file is not None  # or nobody could know of an offset
         self.file.read_into(offset, buffer)
 
+    @property
+    def is_there(self) -> bool:
+        """Whether the file that is written to is the one that the next run will find."""
+        return self.file is not None and self.file.is_at(self.folder / RECORDS)
+
     def discard(self) -> None:
         """Remove what there is of the journal: there is a header, and nothing was delivered."""
         if self.file is not None:
@@ -78,6 +83,11 @@ class JournalStore:
         try:
             yield
         except OSError as error:
+            if isinstance(error, FileNotFoundError) and not self.is_there:
+                raise LidarpoolError(
+                    f"The journal {self.folder} is gone: it was removed or moved while this run "
+                    "wrote to it, and the run was ended."
+                ) from error
             raise LidarpoolError(
                 f"The journal {self.folder} cannot be written ({error.strerror or error}): make "
                 "room on its disk, or give another folder."

@@ -172,6 +172,13 @@ class RecordFile:
             self.append(MARK)
             self._durable = self.end  # of no use to sync this one as well
 
+    def is_at(self, path: Path) -> bool:
+        """Whether this file, and no other, is to be found there."""
+        try:
+            return os.path.samestat(os.fstat(self._file.fileno()), path.stat())
+        except (OSError, ValueError):  # the latter: it is closed
+            return False
+
     def unlock(self) -> None:
         """Let others open it: nothing more will be written."""
         if sys.platform != "win32":
