@@ -173,6 +173,33 @@ def test_ctrl_c_when_the_result_is_whole(moment, start_command, cluster, tmp_pat
     assert names == {*FILES} - {"path.png"}
 
 
+BLOCKED = """
+import re, subprocess, sys
+from multiprocessing import resource_tracker
+from pathlib import Path
+from signal import SIGHUP, SIGINT, SIGQUIT
+from lidarpool.interrupts import children_spared
+
+def blocked(process):
+    mask = re.search(r"SigBlk:\\s+(\\w+)", Path(f"/proc/{process}/status").read_text())[1]
+    return [number.name for number in (SIGINT, SIGHUP, SIGQUIT) if int(mask, 16) >> number - 1 & 1]
+
+with children_spared():
+    worker = subprocess.Popen(["cat"], stdin=subprocess.PIPE)
+    print(*blocked(worker.pid))
+    worker.communicate()
+print(*blocked(resource_tracker._resource_tracker._pid)[-2:])
+print(*blocked("self"))
+"""
+
+
+def test_a_terminal_spares_workers_and_what_clears_up_behind_them():
+    ended = subprocess.run([sys.executable, "-c", BLOCKED], capture_output=True, check=True)
+    assert ended.stdout.decode().split("\n") == [
+        "SIGINT SIGHUP SIGQUIT", "SIGHUP SIGQUIT", "", "",
+    ]  # fmt: skip
+
+
 def test_a_second_ctrl_c_ends_it_at_once():
     script = (
         "import signal, time\n"

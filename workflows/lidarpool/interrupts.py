@@ -93,16 +93,15 @@ def deferred_interrupts() -> Iterator[None]:
 def children_spared() -> Iterator[None]:
     """Start processes in the body, and threads that start some later, which Ctrl-C spares.
 
-    A terminal sends SIGINT to the whole process group, and SIGHUP when it is closed. Workers
-    that are hit die, with a traceback each, before whoever started them can stop them in good
-    order; and what is to clear up behind them would die as well. A blocked signal
-    stays blocked in threads and processes that come after, also in a worker that a nanny
-    starts again.
+    A terminal sends SIGINT and SIGQUIT to the whole process group, and SIGHUP when it is closed.
+    Workers that are hit die, with a traceback each, before whoever started them can stop them
+    in good order; and what is to clear up behind them would die as well. A blocked signal stays
+    blocked in threads and processes that come after, also in a worker that a nanny starts again.
     """
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP})
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP, signal.SIGQUIT})
     try:
         # It is started with the first process, and whoever starts it has SIGINT unblocked after.
         resource_tracker.ensure_running()
