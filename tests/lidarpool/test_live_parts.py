@@ -85,6 +85,11 @@ def test_heights_go_up_the_colours(rows):
     assert 0 <= legend.low < legend.high <= 10
 
 
+def test_the_middle_of_a_bar_about_zero_is_zero(rows):
+    rows["position"][:, 2] = np.linspace(-8, 7.98, len(rows))
+    assert ">0<" in colours_of(rows, "height", ())[1].html
+
+
 def test_unknown_ranges_are_grey(rows):
     colours, legend = colours_of(rows, "range", ())
     assert (colours[100:] == 128).all()

@@ -87,7 +87,7 @@ class CloudLayer:
             What differs where these are other points, and not some more.
         """
         colours, legend = colours_of(rows, self._colour.value, self._names)
-        self._legend.content = legend.html
+        self._legend.content = legend.html if len(rows) else ""
         self._share = min(MOST_SHARE, SHARE_OF_MANY / max(1, len(rows)) ** 0.5)
         positions = np.ascontiguousarray(rows["position"])
         on_wall = np.zeros(len(rows), np.bool_) if facing is None else facing.any(axis=1)

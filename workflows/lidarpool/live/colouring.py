@@ -140,4 +140,4 @@ def _limits(values: NDArray[np.floating], spread: bool) -> tuple[float, float]:
 def _number(value: float, span: float) -> str:
     """Write a number with the digits that a bar of this span needs."""
     digits = int(np.clip(np.ceil(1 - np.log10(span)), 0, 6)) if span > 0 else 2
-    return f"{value:,.{digits}f}"
+    return f"{round(value, digits) + 0.0:,.{digits}f}"  # never -0
