@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import time
 import uuid
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 
 from distributed import Client
@@ -30,22 +30,21 @@ from poolpart import (
 from ..errors import LidarpoolError
 from ..survey import Survey
 from ..task_book import TaskBook
+from .arrivals import Arrivals
+from .batch_size import wished_scans
 from .builder import CloudBuilder
 from .caster import Caster
 from .crew import Crew
 from .failures import raise_if_failed, was_killed
 from .handover import Handover
 from .long_stages import long_stages
-from .messages import Delivery, Frame, FrameRun, Hello, Part
+from .messages import Delivery, Frame
 from .setup import SurveySetup
-from .stage_names import COLLECT, GENERATE, GPU, INTERSECT, LIDAR, SORT
+from .stage_names import GENERATE, GPU, INTERSECT, LIDAR, SORT
 from .stage_tasks import StageTasks
 from .survey_run import SurveyRun
 from .under_way import UnderWay, Wire
 
-BATCH_SECONDS = 0.05  # casting time that makes a batch worth its overhead
-BATCH_RAYS = 1_000_000  # bounds a batch's memory, at 16 bytes a hit and 24 a direction
-BATCHES_LEAST = 16  # for each slot, so that none idles for long in the end
 STALL_SECONDS = 20.0  # with nothing moving; then what was handed on is sent again
 LAST_WORDS_S = 3.0  # for the stages to end after everything has arrived
 DELIVERY_CAPACITY = 16  # messages of at most `stages.DELIVERY_BYTES` on their way to the driver
@@ -93,7 +92,7 @@ class SurveyPump:
         *,
         scans_per_second: float | None = None,
     ) -> None:
-        self.client, self.survey, self.on_frame = client, survey, on_frame
+        self.client, self.survey = client, survey
         self.run_id = uuid.uuid4().hex[:8]
         self.cloud = CloudBuilder(survey.scan_count) if cloud is None else cloud
         self.frames = Ledger(survey.scan_count)
@@ -107,6 +106,9 @@ class SurveyPump:
         self._crew = Crew(run, setup)
         self._caster = Caster(run, self._crew, self._under_way)
         self._handover = Handover(run, self._under_way, self.frames, queue_capacity)
+        self._arrivals = Arrivals(
+            run, self._under_way, self._handover, self.frames, self.cloud, on_frame, self._learn
+        )
         self._scans = Pipe(f"lidarpool-{self.run_id}-scans", queue_capacity, client)
         self._deliveries = Pipe(f"lidarpool-{self.run_id}-deliveries", DELIVERY_CAPACITY, client)
         self._stages = StageTasks(
@@ -285,7 +287,7 @@ class SurveyPump:
             scan = int(numbers[0])
             (new if self.generated.accept(scan) else known).append(numbers)
         self._run.trace("take", GENERATE, (int(numbers[0]) for numbers in new))
-        self._trace_duplicates(GENERATE, [int(numbers[0]) for numbers in known])
+        self._run.trace_duplicates(GENERATE, [int(numbers[0]) for numbers in known])
         return new
 
     def _end_condemned(self) -> None:
@@ -303,62 +305,21 @@ class SurveyPump:
     def _take_deliveries(self) -> bool:
         deliveries = self._deliveries.poll()
         for data in deliveries:
-            self._take(Delivery.from_wire(data))
+            self._arrivals.take(Delivery.from_wire(data))
         if deliveries:
             self._moved_at = time.monotonic()
             self._release()
         return bool(deliveries)
 
-    def _take(self, delivery: Delivery) -> None:
-        content = delivery.content
-        if self._handover.is_stale(delivery.attempt):
-            frames = content.frames if isinstance(content, FrameRun) else ()
-            self._run.trace("stale", delivery.attempt.stage, (frame.scan for frame in frames))
-        elif isinstance(content, Hello):
-            self._handover.greet(delivery.attempt)
-        elif isinstance(content, FrameRun):
-            self._take_frames(content)
-        else:
-            self._take_points(content)
-
-    def _take_frames(self, run: FrameRun) -> None:
-        for frame in run.frames:
-            if self.frames.accept(frame.scan):
-                self._under_way.arrived(SORT, frame.scan)
-                self._run.trace("frame", SORT, [frame.scan])
-                self.on_frame(frame)
-            else:
-                self._trace_duplicates(SORT, [frame.scan])
-        if run.records:
-            self._caster.learn(record for record in run.records if self.book.add(record))
-            self._advise(run.records[-1])
-
-    def _take_points(self, part: Part) -> None:
-        new = self.cloud.add(part)
-        for scan in new:
-            self._under_way.arrived(COLLECT, scan)
-        self._run.trace("points", COLLECT, new)
-        if len(new) < len(part.scans):
-            self._trace_duplicates(COLLECT, sorted(set(part.scans) - set(new)))
-
-    def _advise(self, record: TaskRecord) -> None:
-        """Tell stage 1 how many scans to put into one item, from how long a batch took."""
-        rays_per_scan = max(1, self.survey.ray_count // self.survey.scan_count)
-        most = min(
-            BATCH_RAYS // rays_per_scan,
-            self.survey.scan_count // (BATCHES_LEAST * self._crew.slots),
-        )
-        per_scan = max(record.seconds, 1e-6) / record.items
-        wished = min(int(BATCH_SECONDS / per_scan), 2 * record.items, most)
-        self._scans.advise(max(1, wished))
+    def _learn(self, records: Iterable[TaskRecord]) -> None:
+        """Enter tasks of stage 2, and tell stage 1 how many scans to put into one item."""
+        *_, last = records = list(records)
+        self._caster.learn(record for record in records if self.book.add(record))
+        self._scans.advise(wished_scans(self.survey, self._crew.slots, last))
 
     def _release(self) -> None:
         for item in self._under_way.release():
             self._run.trace("release", INTERSECT, item.scans)
-
-    def _trace_duplicates(self, stage: str, scans: Sequence[int]) -> None:
-        if scans:
-            self._run.trace("duplicate", stage, scans)
 
     # -- the end -----------------------------------------------------------------------
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import count
 
@@ -42,3 +42,8 @@ class SurveyRun:
     def trace(self, event: str, stage: str, scans: Iterable[int], **fields: object) -> None:
         """Tell of a point that the driver passes."""
         trace(f"driver.{event}", run=self.id, stage=stage, scans=list(scans), **fields)
+
+    def trace_duplicates(self, stage: str, scans: Sequence[int]) -> None:
+        """Tell of scans that came once more, if there are any."""
+        if scans:
+            self.trace("duplicate", stage, scans)
