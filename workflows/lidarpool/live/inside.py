@@ -18,6 +18,7 @@ ROOFED = 0.7  # of the steep rays from a sensor end in the scene: there is a roo
 STEEP_DEG = (60.0, 90.0)
 LOW = 5  # percentile of a ceiling's heights: lamps and beams are not left hanging
 BELOW = 0.04  # of the way from the sensor up to the ceiling, that the cut is below it
+TOUCHES = 1e-3  # of the scene's diagonal: a sensor on a surface does not stand under it
 WALL = 0.02  # of the scene's diagonal: walls are thinner, roofs with what carries them too
 
 
@@ -69,7 +70,9 @@ def _ceiling(surface: Surface, sensors: Floats) -> float | None:
     """Height just below the highest ceiling over sensors (p, 3), if most have one."""
     count = 256
     origins, directions = probes(sensors, count, *STEEP_DEG)
-    distance = surface.caster.cast(origins, directions).distance
+    low, high = surface.scene.bounds
+    near = TOUCHES * float(np.linalg.norm(high - low))
+    distance = surface.caster.cast(origins, directions, t_min=near).distance
     ends = (origins[:, 2] + distance * directions[:, 2]).reshape(-1, count)
     roofed = np.isfinite(ends).mean(axis=1) >= ROOFED
     if roofed.mean() < 0.5:
