@@ -59,7 +59,8 @@ class Pool:
         Raises
         ------
         PoolError
-            If the cluster has no workers, or one cannot import this package.
+            If the cluster has no workers, one cannot import this package, or the client is
+            closed or asynchronous.
         """
         identities = worker_identities(client)
         if not identities:
@@ -153,7 +154,8 @@ class Pool:
         Each rule takes of the workers that those before it have left. The scheduler follows
         them: a worker that joins later gets its partition by them, where one is short of
         workers first, and tasks that waited run. A worker that comes back is in its partition
-        again; while its nanny starts it, its place is kept for half a minute.
+        again; while its nanny starts it, its place is kept for half a minute. An adaptive cluster
+        stops none that a partition needs for its minimum.
 
         Parameters
         ----------
@@ -169,7 +171,8 @@ class Pool:
         Raises
         ------
         PoolError
-            If a partition would have fewer workers than its minimum.
+            If a partition would have fewer workers than its minimum, or somebody else makes
+            one of this name, or takes a worker, at the same moment.
 
         Examples
         --------

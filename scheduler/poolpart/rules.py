@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from .errors import PoolError
-from .selection import NO_GPU, by_gpu, by_host
+from .selection import NO_GPU, by_gpu, by_host, check_name, check_slots
 from .worker_info import WorkerInfo
 
 
@@ -244,8 +244,7 @@ def check_rules(rules: Mapping[str, Rule]) -> None:
     if not rules:
         raise PoolError('There are no rules to divide by; give {"NAME": rest()}, for example.')
     for name, rule in rules.items():
-        if not name:
-            raise PoolError("The name of a partition is empty; give one.")
+        check_name(name)
         if not isinstance(rule, Rule):
             raise PoolError(
                 f"The rule of partition {name!r} is {rule!r}; give one, such as per_host(2)."
@@ -255,10 +254,9 @@ def check_rules(rules: Mapping[str, Rule]) -> None:
 
 def check_rule(name: str, rule: Rule) -> None:
     """Check one rule; PoolError unless it makes sense."""
-    if rule.slots is not None and rule.slots < 1:
-        raise PoolError(f"slots is {rule.slots}; a worker needs at least 1 to take tasks.")
-    if rule.minimum < 0:
-        raise PoolError(f"minimum of {name!r} is {rule.minimum}; give 0 or more.")
+    check_slots(rule.slots)
+    if not isinstance(rule.minimum, int) or rule.minimum < 0:
+        raise PoolError(f"minimum of {name!r} is {rule.minimum!r}; give a whole number, 0 or more.")
     number = getattr(rule, "most", getattr(rule, "workers", 1))
     if not isinstance(number, int) or number < 1:
         raise PoolError(f"The rule of {name!r} is {rule}: give a whole number, 1 or more.")

@@ -16,10 +16,8 @@ Selectors = Mapping[str, int | Sequence[str] | None]
 
 def check_request(partition: str, selectors: Selectors, slots: int | None) -> None:
     """Check what is asked of `Pool.partition`; PoolError unless it makes sense."""
-    if not partition:
-        raise PoolError("The name of the partition is empty; give one.")
-    if slots is not None and slots < 1:
-        raise PoolError(f"slots is {slots}; a worker needs at least 1 to take tasks.")
+    check_name(partition)
+    check_slots(slots)
     given = {key: value for key, value in selectors.items() if value is not None}
     if len(given) != 1:
         raise PoolError(
@@ -34,6 +32,18 @@ def check_request(partition: str, selectors: Selectors, slots: int | None) -> No
                 )
         elif not isinstance(value, int) or value < 1:
             raise PoolError(f"{key} is {value!r}; give a whole number, 1 or more.")
+
+
+def check_name(partition: object) -> None:
+    """Check the name of a partition; PoolError unless it is one."""
+    if not isinstance(partition, str) or not partition:
+        raise PoolError(f"The name of a partition is {partition!r}; give one such as 'GPU'.")
+
+
+def check_slots(slots: object) -> None:
+    """Check how many slots each worker is to have; PoolError unless it can have so many."""
+    if slots is not None and (not isinstance(slots, int) or slots < 1):
+        raise PoolError(f"slots is {slots!r}; give a whole number, 1 or more: tasks take one each.")
 
 
 def choose(

@@ -46,7 +46,7 @@ def test_slots_below_one(slots):
 
 
 def test_a_partition_needs_a_name():
-    with pytest.raises(PoolError, match="name of the partition is empty"):
+    with pytest.raises(PoolError, match="name of a partition is ''"):
         check_request("", NONE | {"n_workers": 1}, None)
 
 
