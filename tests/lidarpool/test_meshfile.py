@@ -360,13 +360,23 @@ def test_off_as_programs_write_it(tmp_path, text, triangles):
     assert len(load_meshes(write(tmp_path / "m.off", text))[0].faces) == triangles
 
 
-@pytest.mark.parametrize("suffix", [".obj", ".off", ".ply"])
+@pytest.mark.parametrize("suffix", [".obj", ".off", ".ply", ".dae"])
 def test_a_wall_keeps_its_door_open(tmp_path, suffix):
     wall = [(0, 0), (2, 0), (2, 2), (3, 2), (3, 0), (5, 0), (5, 3), (0, 3)]
     rows = "".join(f"{x} 0 {z}\n" for x, z in wall)
     face = "0 1 2 3 4 5 6 7"
     text = {
         ".obj": re.sub("(?m)^", "v ", rows).removesuffix("v ") + "f 1 2 3 4 5 6 7 8\n",
+        ".dae": re.sub(
+            "<triangles.*</polylist>",
+            '<polylist count="1"><input semantic="VERTEX" source="#v" offset="0"/>'
+            f"<vcount>8</vcount><p>{face}</p></polylist>",
+            re.sub('<node id="n1".*?</node>', "", dae(numbers=rows.replace("\n", " "))),
+            flags=re.DOTALL,
+        )
+        .replace('count="12"', 'count="24"')
+        .replace('count="4"', 'count="8"')
+        .replace("<scale>2 2 -2</scale>", ""),
         ".off": f"OFF 8 1 0\n{rows}8 {face}\n",
         ".ply": PLY.partition("500000")[0]
         .replace("vertex 4", "vertex 8")

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from distributed import Client
 
 import lidarpool.output
@@ -455,6 +456,17 @@ def test_shelves_of_the_warehouse_stand_upright(lidarpool, cluster, tmp_path, no
             shelves += 1
             assert np.ptp(points[:, 2]) > 1.5  # metres of height, seen from the middle of the hall
     assert shelves >= 3
+
+
+def test_a_run_doubts_a_size_that_speaks_of_another_unit(lidarpool, cluster, tmp_path, no_pictures):
+    (tmp_path / "room.stl").write_bytes(
+        trimesh.creation.box((8000, 6000, 3000)).export(file_type="stl")
+    )
+    options = ["--out", tmp_path / "o", "--scheduler", cluster, "--json"]
+    outcome = lidarpool("run", tmp_path / "room.stl", *options)
+    assert outcome.code == 0, outcome.err
+    assert "room.stl states no unit, and in metres the scene is 8,000 m long" in outcome.err
+    assert json.loads(outcome.out)["rays"] == 120_000
 
 
 # -- drawn again ---------------------------------------------------------------------------------

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .mesh import Mesh
+from .polygons import triangulated
 from .transform import Transform
 
 # What may be missing without changing the shape: textures, materials, lights, cameras.
@@ -94,13 +95,12 @@ def _geometry(geometry: Any, transform: Transform, name: str) -> Iterator[Mesh]:
     faces: list[NDArray[np.int64]] = []
     count = 0
     for primitive in geometry.primitives:
-        triangles = primitive.triangleset() if hasattr(primitive, "triangleset") else primitive
-        index = getattr(triangles, "vertex_index", None)
-        if index is None or index.ndim != 2 or index.shape[1] != 3:
-            continue  # lines and points, which reflect no light
         points = _numbers(primitive.sources["VERTEX"][0][4].xmlnode.find("{*}float_array"))
+        index = _triangles(primitive, points.reshape(-1, 3))
+        if index is None:
+            continue
         vertices.append(points.reshape(-1, 3))
-        faces.append(np.asarray(index, dtype=np.int64) + count)
+        faces.append(index + count)
         count += len(vertices[-1])
     if faces:
         rows = np.concatenate(faces)
@@ -109,6 +109,18 @@ def _geometry(geometry: Any, transform: Transform, name: str) -> Iterator[Mesh]:
             transform.apply(np.concatenate(vertices)),
             rows[:, ::-1] if transform.mirrors else rows,
         )
+
+
+def _triangles(primitive: Any, points: NDArray[np.float64]) -> NDArray[np.int64] | None:
+    """Triangles (t, 3) of a primitive; None of lines and points, which reflect no light."""
+    index = getattr(primitive, "vertex_index", None)
+    if index is not None and isinstance(primitive, collada.polylist.Polylist):
+        # pycollada's own triangles of polygons that are not convex reach beyond their outline.
+        sizes = np.asarray(primitive.vcounts, dtype=np.int64)
+        return triangulated(points, np.asarray(index, dtype=np.int64), sizes)
+    if index is None or index.ndim != 2 or index.shape[1] != 3:
+        return None
+    return np.asarray(index, dtype=np.int64)
 
 
 def _matrix(step: Any) -> NDArray[np.float64]:

@@ -19,7 +19,7 @@ _SHOWN = 3  # names or poses that a note lists
 
 
 def doubts(
-    scene: Scene, survey: Survey, unitless: Sequence[str], sample: Sample | None
+    scene: Scene, survey: Survey, unitless: Sequence[str], sample: Sample | None = None
 ) -> Iterator[str]:
     """Yield notes for whoever wrote the scenario, each with what to do.
 
@@ -30,7 +30,7 @@ def doubts(
     unitless
         Names of mesh files whose unit is neither stated nor given.
     sample
-        Some rays of it; None where none could be cast.
+        Some rays of it; None where none were cast.
     """
     side = float(np.ptp(scene.bounds, axis=0).max())
     if unitless and not SMALL_M <= side <= LARGE_M:

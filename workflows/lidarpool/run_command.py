@@ -16,6 +16,7 @@ from distributed import Client
 from .checks import check_backend_here, check_backend_name
 from .connection import connected, local_client
 from .deliveries import Deliveries
+from .doubts import doubts
 from .job import Job
 from .journal import COMMAND_TERMS, open_journal
 from .journal_folder import remove_journal
@@ -75,6 +76,9 @@ def run_scenario(scenario: Scenario, options: RunOptions) -> None:
     recipe = make_recipe(scenario, click.get_current_context(silent=True))
     _check_backend(options.backend or scenario.pool.backend, options)
     job = make_job(scenario, options.backend, options.no_plan)
+    if not options.quiet:
+        for note in doubts(job.scene, job.survey, scenario.unitless_files):
+            click.echo(f"note: {note}", err=True)
     with _told_when_whole(options.out) as whole, _shown_live(job, options) as live:
 
         def in_place() -> None:
@@ -222,9 +226,10 @@ def _local_client(scenario: Scenario, options: RunOptions) -> Iterator[Client]:
 def _tell(out: Path, result: Result, job: Job, files: list[str]) -> None:
     for note in result.notes:
         click.echo(f"note: {note}")
+    objects = len(job.scene.names)
     click.echo(
         f"{job.survey.scan_count:,} scans, {result.rays:,} rays, {result.hits:,} hits on "
-        f"{len(job.scene.names):,} objects, {len(result.points):,} points in the cloud "
+        f"{objects:,} object{'s' * (objects != 1)}, {len(result.points):,} points in the cloud "
         f"({result.backend}, {result.survey_seconds:.1f} s)"
     )
     if result.plan is not None:
