@@ -425,6 +425,12 @@ def test_tasks_in_the_wrong_place_are_told(write):
     assert "GPU-0: plan path, 1 task, 1 s" in lanes(page)["GPU"]
 
 
+@pytest.mark.parametrize("replayed", [0, 3])
+def test_tasks_of_lost_workers_are_told_to_be_missing(write, replayed):
+    text, _ = write(replayed=replayed)
+    assert ("has left no record" in text) == (replayed > 0)
+
+
 def test_the_same_run_gives_the_same_page(write):
     assert write()[0] == write()[0]
 
