@@ -174,7 +174,7 @@ class Run:
     ) -> dict[type, float]:
         """Step the pumps until all have finished; returns when each did, in seconds."""
         pause = Backoff(least_s=0.001, most_s=0.05)
-        watch = Watch(self.client, {GPU, LIDAR} | ({OTHER} if trials else set()))
+        watch = Watch(self.client, [GPU, OTHER] if trials else [GPU], lasting=[LIDAR])
         times: dict[type, float] = {}
         told = float("-inf")
         while len(times) < len(pumps):
@@ -185,6 +185,7 @@ class Run:
                     moved |= pump.step()
                 elif type(pump) not in times:
                     times[type(pump)] = time.monotonic() - started
+                    watch.forget([OTHER] if pump is trials else [GPU, LIDAR])
             for trial in trials.trials[len(self.kept.trials) :] if trials else ():
                 self.kept.add_trial(trial)
             self.kept.look()

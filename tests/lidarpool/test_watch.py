@@ -1,0 +1,56 @@
+"""Partitions whose workers stay away, or take no tasks."""
+
+import pytest
+
+from lidarpool import LidarpoolError, watch
+from lidarpool.watch import Watch
+
+
+@pytest.fixture
+def look(monkeypatch):
+    """Looks at workers, given as partition and status, so many seconds after the first look."""
+    monkeypatch.setattr("time.monotonic", lambda: 1000.0)
+    watching = Watch(None, ["GPU", "OTHER"], lasting=["LIDAR"])
+
+    def look(seconds, *workers):
+        identities = {
+            str(number): {"resources": {name: 1.0}, "status": status}
+            for number, (name, status) in enumerate(workers)
+        }
+        monkeypatch.setattr(watch, "worker_identities", lambda client: identities)
+        watching.look(1000.0 + seconds)
+
+    look.watching = watching
+    return look
+
+
+ALL = [("GPU", "running"), ("OTHER", "running"), ("LIDAR", "running")]
+
+
+def test_a_partition_may_be_empty_for_a_while(look):
+    look(2, *ALL)
+    look(60, *ALL[:2])
+    look(63, *ALL)
+    look(120, *ALL[1:])
+    with pytest.raises(LidarpoolError, match=r"'GPU' has had no workers for 60 s.*\"GPU=1\""):
+        look(124, *ALL[1:])
+
+
+def test_workers_that_are_paused_take_no_tasks(look):
+    paused = [("GPU", "paused"), *ALL[1:]]
+    look(59, *paused)
+    with pytest.raises(LidarpoolError, match=r"'GPU' have taken no tasks for 60 s.*--memory-limit"):
+        look(61, *paused)
+
+
+def test_one_that_is_not_paused_will_do(look):
+    look(61, ("GPU", "paused"), *ALL)
+
+
+def test_what_runs_already_goes_on_where_workers_are_paused(look):
+    look(61, *ALL[:2], ("LIDAR", "paused"))
+
+
+def test_a_partition_with_nothing_left_to_do_may_leave(look):
+    look.watching.forget(["OTHER"])
+    look(61, ALL[0], ALL[2])
