@@ -1,5 +1,6 @@
 """Every format gives the same objects, and every broken file gives one clear error."""
 
+import base64
 import gzip
 import json
 import re
@@ -523,6 +524,50 @@ def test_a_cut_file_never_loses_triangles_in_silence(tmp_path, two_objects, suff
         else:
             assert found == whole, f"cut at {cut} of {size}"
     assert refused > 30
+
+
+def damaged(content, rng):
+    """Content with one of the faults that disks, networks and editors make."""
+    at, size = (int(rng.integers(n)) for n in (len(content), 40))
+    number = rng.choice([b"-1", b"4294967295", b"9" * 20, b"1e999", b"nan", b"null"])
+    return [
+        content[:at],
+        content[:at] + bytes([content[at] ^ 1 << int(rng.integers(8))]) + content[at + 1 :],
+        content[:at] + bytes(size) + content[at + size :],
+        content[: at + size] + content[at:],
+        content[:at] + re.sub(rb"\d+", number, content[at:], count=1),
+    ][int(rng.integers(5))]
+
+
+def embedded_gltf():
+    header, body = gltf_triangle()
+    data = base64.b64encode(body).decode()
+    header["buffers"][0]["uri"] = f"data:application/octet-stream;base64,{data}"
+    return json.dumps(header).encode()
+
+
+@pytest.mark.parametrize("suffix", [*SUFFIXES, "ascii"])
+def test_damage_ends_in_meshes_or_in_one_clear_line(tmp_path, two_objects, suffix, capfd):
+    content = {
+        "ascii": lambda: two_objects.to_mesh().export(file_type="stl_ascii").encode(),
+        ".dae": lambda: dae().encode(),
+        ".off": lambda: export(two_objects.to_mesh(), suffix),
+        ".gltf": embedded_gltf,
+    }.get(suffix, lambda: export(two_objects, suffix))()
+    path = tmp_path / f"m{'.stl' if suffix == 'ascii' else suffix}"
+    rng = np.random.default_rng(7)
+    refused = 0
+    for _ in range(60):
+        try:
+            meshes = load_meshes(write(path, damaged(content, rng)))
+        except LidarpoolError as error:
+            refused += 1
+            assert str(error).startswith(str(path))
+            assert str(error).isprintable() and len(str(error)) < 400 + len(str(path))
+        else:
+            assert all(np.isfinite(mesh.vertices).all() for mesh in meshes)
+    assert refused > 5
+    assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)

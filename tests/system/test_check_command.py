@@ -233,6 +233,18 @@ def test_a_sensor_within_an_object(pose, hidden, check, tmp_path):
     assert (f"from ({pose}) nearly all that is seen are backs" in outcome.out) == hidden
 
 
+@pytest.mark.parametrize(("moved", "coarse"), [("stored", True), ("by the scenario", False)])
+def test_map_coordinates_in_single_precision(moved, coarse, check, tmp_path):
+    mesh = trimesh.creation.icosphere(2, 10)
+    place = [500_000, 4_000_000, 100]
+    if moved == "stored":
+        mesh.apply_translation(place)
+    (tmp_path / "ball.stl").write_bytes(mesh.export(file_type="stl"))
+    entry = {"file": "ball.stl"} | ({} if coarse else {"translation": place})
+    outcome = check(text=json.dumps({"scene": {"files": [entry]}}))
+    assert ("in steps of 0.25 m: export the mesh nearer to zero" in outcome.out) == coarse
+
+
 def test_a_scene_that_is_not_hit_says_where_it_is(check, tmp_path):
     box(tmp_path, (8, 6, 3))
     outcome = check(text="scene: [my box.stl]\nposes: [[900, 0, 90]]\nsensor: {layers: 1}\n")

@@ -41,6 +41,15 @@ def doubts(
             f"metres the scene is {in_metres(side)} m long: if that is wrong, give the file's "
             f"unit in scene.files, or begin with: {init}"
         )
+    world = scene.vertices + scene.origin
+    step = float(np.spacing(np.float32(np.abs(world).max())))
+    # Farther out, single precision, as .stl and .glb hold it, is coarser than what is asked for.
+    if step > survey.precision_m and np.array_equal(world, world.astype(np.float32)):
+        yield (
+            f"the coordinates of the scene are in single precision, and so far out they come in "
+            f"steps of {in_metres(step)} m: export the mesh nearer to zero, and move it with "
+            "translation in scene.files"
+        )
     if sample is None:
         return
     if not sample.hits:
