@@ -77,7 +77,7 @@ def left_over() -> Callable[[Client], tuple[list[str], list[str], list[str]]]:
         return [str(key) for key in dask_scheduler.tasks], list(queues), list(variables)
 
     def left_over(client: Client) -> tuple[list[str], list[str], list[str]]:
-        until = time.monotonic() + 5  # cancelling is told to the scheduler, not asked
+        until = time.monotonic() + 15  # cancelling is told to the scheduler, not asked
         while any(found := client.run_on_scheduler(look)) and time.monotonic() < until:
             time.sleep(0.05)
         return found
@@ -130,12 +130,12 @@ class OutsideCluster:
     def wait(self) -> None:
         """Wait until all workers are there."""
         with Client(self.address, set_as_default=False) as client:
-            client.wait_for_workers(len(self.processes) - 1, timeout=60)
+            client.wait_for_workers(len(self.processes) - 1, timeout=120)
 
     def kill(self, name: str) -> None:
         """Kill a process, without goodbye."""
         self.processes[name].kill()
-        self.processes.pop(name).wait(10)
+        self.processes.pop(name).wait(60)
 
     def log(self) -> str:
         """What all processes have logged."""
@@ -146,7 +146,7 @@ class OutsideCluster:
         for process in self.processes.values():
             process.kill()
         for process in self.processes.values():
-            process.wait(10)
+            process.wait(60)
 
 
 @pytest.fixture(scope="module")
@@ -165,7 +165,7 @@ def outside(
         cluster.close()
 
 
-def _wait(condition: Callable[[], bool], seconds: float = 60) -> None:
+def _wait(condition: Callable[[], bool], seconds: float = 120) -> None:
     stop = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < stop, "waited in vain"
@@ -211,7 +211,7 @@ def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 
 # -- the command as a process of its own ---------------------------------------------------------
 
-ENDS_WITHIN_S = 20  # on a busy machine; a second or two on an idle one
+ENDS_WITHIN_S = 60  # on a busy machine; a second or two on an idle one
 
 
 class RunningCommand:
@@ -246,7 +246,7 @@ class RunningCommand:
 
     def wait_for(self, pattern: str) -> RunningCommand:
         """Wait until the run says something."""
-        stop = time.monotonic() + 90
+        stop = time.monotonic() + 180
         while not re.search(pattern, self.said):
             assert self.process.poll() is None, self.said
             assert time.monotonic() < stop, self.said
@@ -286,7 +286,7 @@ class RunningCommand:
     def close(self) -> None:
         for process in self.processes:
             os.kill(process, signal.SIGKILL)
-        self.process.wait(10)
+        self.process.wait(60)
 
 
 @pytest.fixture

@@ -247,7 +247,7 @@ def on_a_terminal(arguments: list[str], **environment: str) -> tuple[int, str]:
             except OSError:  # as Linux says that the other end was closed
                 break
     os.close(master)
-    return process.wait(10), drawn.decode()
+    return process.wait(60), drawn.decode()
 
 
 @pytest.mark.parametrize("colour", [True, False])

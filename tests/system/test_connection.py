@@ -51,10 +51,10 @@ def test_simulate_leaves_nothing_when_it_is_interrupted_twice(word, pauses, tmp_
             time.sleep(pause)
             started = psutil.Process(run.pid).children(recursive=True)
             os.killpg(run.pid, signal.SIGINT)
-        out, err = run.communicate(timeout=60)
+        out, err = run.communicate(timeout=120)
     assert "interrupted" in out or err.rstrip().endswith("KeyboardInterrupt")
     # Python's own helper process ends a moment after its parent.
-    _, alive = psutil.wait_procs(started, timeout=10)
+    _, alive = psutil.wait_procs(started, timeout=60)
     assert alive == []
 
 

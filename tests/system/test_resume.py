@@ -75,7 +75,7 @@ def kept_in(journal: Path) -> int:
 
 def kill_at_random(run: Any, journal: Path, dice: random.Random) -> None:
     """Kill the driver once it has delivered something more, or at any time from its start on."""
-    enough, deadline = kept_in(journal) + dice.randrange(16_000), time.monotonic() + 60
+    enough, deadline = kept_in(journal) + dice.randrange(16_000), time.monotonic() + 120
     if dice.random() < 0.2:
         time.sleep(dice.uniform(0, 3))
     else:
@@ -83,7 +83,7 @@ def kill_at_random(run: Any, journal: Path, dice: random.Random) -> None:
             assert time.monotonic() < deadline, run.said
             time.sleep(0.002)
     run.process.kill()
-    run.process.wait(10)
+    run.process.wait(60)
 
 
 def kill_and_resume(
