@@ -61,7 +61,8 @@ def test_it_is_rough_at_every_scale():
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"triangles": 1}, {"triangles": 10**9}, {"seed": -1}, {"side_m": 0.0}]
+    "wrong",
+    [{"triangles": 1}, {"triangles": 10**9}, {"seed": -1}, {"side_m": 0.0}, {"side_m": 1e8}],
 )
 def test_out_of_range(wrong):
     with pytest.raises(LidarpoolError):

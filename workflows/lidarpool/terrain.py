@@ -13,6 +13,7 @@ Float = NDArray[np.float64]
 
 LEAST_TRIANGLES = 2
 MOST_TRIANGLES = 100_000_000
+LONGEST_M = 1e7  # what is farther from the middle than 1e8 m is refused when it is read
 _COARSEST = 4  # cells of the first octave along a side
 _OCTAVES = 11
 _ROUGHNESS = 0.5  # height of each octave over that of the one before
@@ -50,9 +51,10 @@ def terrain(triangles: int = 2_000_000, seed: int = 0, side_m: float = 1000.0) -
             f"A terrain of {triangles} triangles cannot be made: "
             f"give {LEAST_TRIANGLES} to {MOST_TRIANGLES}."
         )
-    if seed < 0 or not 0 < side_m < np.inf:
+    if seed < 0 or not 0 < side_m <= LONGEST_M:
         raise LidarpoolError(
-            f"seed is {seed} and side_m {side_m}; seed must be at least 0, side_m above 0."
+            f"seed is {seed} and side_m {side_m}; seed must be at least 0, side_m above 0 and at "
+            f"most {LONGEST_M:,.0f}."
         )
     rows = int(np.sqrt(triangles / 2))
     columns = triangles // (2 * rows)
