@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from .page import LivePage
 
-# Together pi at most: more than that is paler than the colour itself. viser's own are three times
-# as bright from above, where a floor of any colour is nearly white.
-_AROUND, _SUN = 0.9, 2.4
+# About pi in all: under more than that colours are paler than they are. viser's own lights make a
+# floor of any colour nearly white.
+_AROUND, _SUN = 1.3, 2.0
 _FROM = (0.15, -0.75, 1.2)  # left of the camera's first place, so that no two sides look alike
 
 
