@@ -344,8 +344,9 @@ class SurveyPump:
             self._take_last_records()
         finally:
             forget_pipes(self.client, [pipe.name for pipe in self._pipes])
-            self._stages.finish()
-            self.client.cancel(self._crew.futures)
+            # In one message: a client that leaves right behind a second is missed by the answer.
+            self.client.cancel([*self._stages.futures.values(), *self._crew.futures])
+            self._stages.give_back()
             self._under_way.clear()
 
     def _take_last_records(self) -> None:

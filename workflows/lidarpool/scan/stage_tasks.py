@@ -122,9 +122,8 @@ class StageTasks:
                 f'--resources "{self.partition.name}=1" and run it again.'
             )
 
-    def finish(self) -> None:
-        """Let go of everything on the scheduler."""
-        self.client.cancel(list(self.futures.values()))
+    def give_back(self) -> None:
+        """Give back the slots that were granted and not used."""
         drop_claim(self.client, self.partition.name)
 
     def look(self, progress: int) -> None:
