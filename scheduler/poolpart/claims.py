@@ -43,20 +43,24 @@ class Claims(SchedulerPlugin):
     """Knows for which tasks slots are promised; there as long as there are promises."""
 
     def __init__(self) -> None:
-        self.held: dict[tuple[str, str], set[str]] = {}  # {(client, resource): keys to come}
+        self.held: dict[str, tuple[str, str]] = {}  # {key of a task to come: (client, resource)}
 
-    def promised(self, scheduler: Any, client: str, resource: str) -> int:
-        """Slots of a resource that are promised to other clients, for tasks not there yet."""
-        for keys in self.held.values():
-            keys.difference_update([key for key in keys if key in scheduler.tasks])
-        return sum(len(k) for (c, r), k in self.held.items() if r == resource and c != client)
+    def promised(self, scheduler: Any, resource: str, besides: Collection[str]) -> int:
+        """Slots of a resource that are promised for tasks not there yet, but for these keys."""
+        for key in [key for key in self.held if key in scheduler.tasks]:
+            del self.held[key]
+        return sum(r == resource for key, (_, r) in self.held.items() if key not in besides)
+
+    def drop(self, scheduler: Any, keys: Collection[str]) -> None:
+        """Forget promises; the last one takes the plugin with it."""
+        for key in keys:
+            self.held.pop(key, None)
+        if not self.held:
+            scheduler.remove_plugin(NAME)
 
     def remove_client(self, scheduler: Any, client: str) -> None:
         """Forget what a client was promised that has left."""
-        for held in [held for held in self.held if held[0] == client]:
-            del self.held[held]
-        if not self.held:
-            scheduler.remove_plugin(NAME)
+        self.drop(scheduler, [key for key, (owner, _) in self.held.items() if owner == client])
 
 
 def claim_slots(client: Client, resource: str, keys: Collection[str]) -> Claim:
@@ -72,15 +76,15 @@ def claim_slots(client: Client, resource: str, keys: Collection[str]) -> Claim:
     resource
         Name of the partition.
     keys
-        Keys of the tasks.
+        Keys of the tasks, which nobody else uses. Who asks for them again is not in their own way.
     """
     answer = on_scheduler(client, _claim, owner=client.id, resource=resource, keys=list(keys))
     return Claim(*answer)
 
 
-def drop_claim(client: Client, resource: str) -> None:
-    """Give back what a client was granted and has not used; no error if that is nothing."""
-    on_scheduler(client, _drop, owner=client.id, resource=resource)
+def drop_claim(client: Client, keys: Collection[str]) -> None:
+    """Give back what was granted for these keys and has not been used; no error if nothing was."""
+    on_scheduler(client, _drop, keys=list(keys))
 
 
 def _claim(
@@ -89,19 +93,20 @@ def _claim(
     free = free_slots(dask_scheduler, resource)
     slots = sum(int(ws.resources[resource]) for ws in usable_members(dask_scheduler, resource))
     claims = dask_scheduler.plugins.get(NAME)
-    others = claims.promised(dask_scheduler, owner, resource) if claims else 0
+    others = claims.promised(dask_scheduler, resource, set(keys)) if claims else 0
     granted = sum(max(0, count) for count in free.values()) - others >= len(keys)
+    # A client that was killed may be known to have left before its last question is read, and
+    # nobody would take back what it is promised then.
+    granted = granted and owner in dask_scheduler.clients
     if granted:
         if claims is None:
             claims = Claims()
             dask_scheduler.add_plugin(claims, name=NAME)
-        claims.held[owner, resource] = set(keys)
+        claims.held.update(dict.fromkeys(keys, (owner, resource)))
     return granted, free, slots
 
 
-def _drop(owner: str, resource: str, dask_scheduler: Any = None) -> None:
+def _drop(keys: list[str], dask_scheduler: Any = None) -> None:
     claims = dask_scheduler.plugins.get(NAME)
     if claims is not None:
-        claims.held.pop((owner, resource), None)
-        if not claims.held:
-            dask_scheduler.remove_plugin(NAME)
+        claims.drop(dask_scheduler, keys)

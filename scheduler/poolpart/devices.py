@@ -16,7 +16,7 @@ from typing import Any
 from distributed import Client, get_worker
 
 from . import probe
-from .current_client import own_client
+from .current_client import in_event_loop, own_client
 from .departure import WorkerLeft, telling_departure
 from .remote import on_scheduler
 from .worker_info import WorkerInfo
@@ -79,6 +79,8 @@ def own_device() -> int | None:
         If the worker is leaving.
     ValueError
         Outside of a task.
+    PoolError
+        In a coroutine, if its worker has not been asked before: ask in a thread.
 
     Examples
     --------
@@ -87,6 +89,10 @@ def own_device() -> int | None:
     ...         return cupy.asnumpy(work(cupy.asarray(block)))
     """
     address = get_worker().address
+    if address in _own:
+        return _own[address]
+    if in_event_loop():  # a thread that holds the lock needs the loop
+        return _ask(address)
     with _lock:  # of several tasks that begin at once, one asks
         if address not in _own:
             _own[address] = _ask(address)

@@ -9,9 +9,10 @@ from lidarpool import Frame, Pose, ScanSpec, Sensor
 from lidarpool.scan import stages
 from lidarpool.scan.builder import CloudBuilder
 from lidarpool.scan.casting import _same_pose
+from lidarpool.scan.failures import naming_scans
 from lidarpool.scan.messages import HIT, POINT, Attempt, Delivery, FrameRun, Part
 from lidarpool.scan.setup import ray_directions
-from poolpart import TaskRecord
+from poolpart import TaskRecord, WorkerLeft
 
 SENSOR = Sensor(rays_per_revolution=12, layers=3, vertical_fov_deg=60, step_deg=60)
 RECORD = TaskRecord("intersect", "GPU", "w", ("GPU",), 0.0, 1.0)
@@ -163,3 +164,17 @@ class TestCloudBuilder:
         assert [repr(float(x)) for x in cloud.positions[:, 0]] == [
             repr(round(i * 0.01, 2)) for i in range(1000)
         ]
+
+
+class TestNamingScans:
+    def test_what_fails_is_told_with_its_scans(self):
+        with (
+            pytest.raises(RuntimeError, match=r"scans 3 to 5: ValueError: bad"),
+            naming_scans(3, 5),
+        ):
+            raise ValueError("bad")
+
+    def test_a_worker_that_leaves_is_not_a_failure_of_its_scans(self):
+        """The driver casts those elsewhere, and would end the run at any other error."""
+        with pytest.raises(WorkerLeft), naming_scans(3, 5):
+            raise WorkerLeft("the worker has left")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -36,6 +37,27 @@ def test_one_that_fails_does_not_keep_others_out(monkeypatch):
     for _ in range(2):
         with pytest.raises(OSError, match="no scheduler"):
             own_client()
+
+
+def test_a_coroutine_does_not_wait_for_a_thread_that_needs_its_loop(monkeypatch):
+    """As a task that is a coroutine, beside one that is none: both would wait for ever."""
+
+    async def meet() -> list[str]:
+        loop, entered = asyncio.get_running_loop(), threading.Event()
+
+        def make() -> str:
+            if threading.current_thread() is threading.main_thread():
+                return "coroutine"
+            entered.set()
+            asyncio.run_coroutine_threadsafe(asyncio.sleep(0.01), loop).result(10)
+            return "thread"
+
+        monkeypatch.setattr("poolpart.current_client.get_client", make)
+        thread = asyncio.create_task(asyncio.to_thread(own_client))
+        await asyncio.to_thread(entered.wait)
+        return [own_client(), await thread]
+
+    assert asyncio.run(meet()) == ["coroutine", "thread"]
 
 
 class TellAtOnce(SchedulerPlugin):

@@ -22,9 +22,13 @@ def naming_scans(first: int, last: int | None = None) -> Iterator[None]:
     ------
     RuntimeError
         In place of any error of the body; it travels through Dask whatever the error was.
+    WorkerLeft
+        If that is what was raised: the scans are not to blame.
     """
     try:
         yield
+    except WorkerLeft:
+        raise
     except Exception as error:
         span = f"scan {first}" if last in (None, first) else f"scans {first} to {last}"
         raise RuntimeError(f"{span}: {type(error).__name__}: {error}") from error

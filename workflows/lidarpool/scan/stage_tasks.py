@@ -88,6 +88,11 @@ class StageTasks:
         return {name: task.future for name, task in self._tasks.items()}
 
     @property
+    def _first_keys(self) -> list[str]:
+        """Keys of the stages as they are started first, for which slots are claimed."""
+        return [f"{self._key(name)}-{number}" for number, name in enumerate(self._commands)]
+
+    @property
     def done(self) -> bool:
         """Whether all have ended."""
         return all(task.future.done() for task in self._tasks.values())
@@ -100,8 +105,7 @@ class StageTasks:
         LidarpoolError
             If the partition has too few slots, and goes on having too few.
         """
-        names = enumerate(self._commands)
-        keys = [f"{self._key(name)}-{number}" for number, name in names]
+        keys = self._first_keys
         claim = claim_slots(self.client, self.partition.name, keys)
         now = time.monotonic()
         if claim.granted:
@@ -124,7 +128,7 @@ class StageTasks:
 
     def give_back(self) -> None:
         """Give back the slots that were granted and not used."""
-        drop_claim(self.client, self.partition.name)
+        drop_claim(self.client, self._first_keys)
 
     def look(self, progress: int) -> None:
         """See, once in a while, to stages that died or wait behind another.
