@@ -85,6 +85,11 @@ def left_over() -> Callable[[Client], tuple[list[str], list[str], list[str]]]:
     return left_over
 
 
+_CLIENT_HUNG_UP = (
+    r".* - distributed\.batched - INFO - Batched Comm Closed <TCP \(closed\) Scheduler->Client "
+)
+
+
 class OutsideCluster:
     """A scheduler and workers from the `dask` command line, each a process of its own."""
 
@@ -140,6 +145,21 @@ class OutsideCluster:
     def log(self) -> str:
         """What all processes have logged."""
         return "\n".join(file.read_text() for file in sorted(self.folder.glob("*.log")))
+
+    def complaints(self) -> list[str]:
+        """What processes have logged with a traceback, a line each.
+
+        But for one that no program can avoid: a client that leaves waits a tenth of a second for
+        the scheduler's farewell and hangs up. On a busy machine the scheduler finds that out by
+        what it has yet to tell the client (that tasks were cancelled, say, or just that farewell),
+        and notes it as an information, with a traceback.
+        """
+        records = re.split(r"^(?=\d{4}-\d\d-\d\d )", self.log(), flags=re.MULTILINE)
+        return [
+            record.splitlines()[0]
+            for record in records
+            if record.count("Traceback") > bool(re.match(_CLIENT_HUNG_UP, record))
+        ]
 
     def close(self) -> None:
         """End all processes."""

@@ -45,7 +45,6 @@ def check_places(report: dict[str, Any], gpu_workers: int) -> None:
     assert report["tasks"]["GPU"].keys() == {"intersect"}
     assert report["tasks"]["LIDAR"] == {"generate": 1, "sort": 1, "collect": 2}
     assert report["tasks"]["OTHER"] == {"trial": 40}
-    assert report["seconds"]["survey_and_planning_overlap"] > 0
     assert 1 <= len(report["stages"]["intersect"]["workers"]) <= gpu_workers
 
 
@@ -79,7 +78,7 @@ def test_an_outside_cluster_gives_the_same_bytes(run, lidarpool, outside):
     assert "8 workers" in told.out and cluster.processes.keys() - {"scheduler"} <= set(
         told.out.split()
     )
-    assert "Traceback" not in cluster.log()
+    assert cluster.complaints() == []
 
 
 def test_backends_agree_on_one_worker_with_four_slots(run, outside, tmp_path):
