@@ -229,8 +229,9 @@ def test_obj_objects_keep_names_order_and_digits(tmp_path):
     assert meshes[0].vertices[:, 0].min() == 500000.123456
 
 
-def test_georeferenced_double_precision_ply(tmp_path):
-    scene = Scene.load(write(tmp_path / "geo.ply", PLY))
+@pytest.mark.parametrize("kind", ["double", "float", "float32"])
+def test_georeferenced_ply_keeps_all_digits_of_its_text(tmp_path, kind):
+    scene = Scene.load(write(tmp_path / "geo.ply", PLY.replace("double", kind)))
     np.testing.assert_array_equal(scene.origin % 1, 0)
     world = scene.vertices + scene.origin
     np.testing.assert_array_equal(world.min(axis=0), [500000.123456, 4000000.5, 1])
@@ -310,6 +311,40 @@ def test_more_bytes_than_a_ply_announces(tmp_path):
     assert len(load_meshes(path)[0].faces) == 6
     with pytest.raises(LidarpoolError, match="4 bytes more than announced"):
         load_meshes(write(path, ply_roof("<") + b"more"))
+
+
+@pytest.mark.parametrize("kind", ["char", "int"])
+@pytest.mark.parametrize("face", [0, 3, 4])
+def test_a_list_of_negative_length_is_not_the_rest_of_the_file(tmp_path, kind, face):
+    path = tmp_path / "roof.ply"
+    length = np.dtype({"char": "<i1", "int": "<i4"}[kind])
+    lists = [(np.array(len(row), length), np.array(row, "<i4")) for row in ROOF]
+    lists[face] = (np.array(-1, length), lists[face][1])
+    header = ply_roof("<").partition(b"end_header\n")[0].replace(b"uchar", kind.encode())
+    body = CORNERS.tobytes() + b"".join(part.tobytes() for row in lists for part in row)
+    with pytest.raises(LidarpoolError, match="broken"):
+        load_meshes(write(path, header + b"end_header\n" + body))
+
+
+def test_a_ply_header_as_programs_write_it(tmp_path):
+    header, _, body = PLY.partition("end_header\n")
+    header = header.replace("ply\n", "ply  \ncomment von Jörg Müller\nobj_info 3 übrig\n\n")
+    header = header.replace("vertex 4", "  vertex\t4 ")
+    lines = body.replace("\n3", "\n\n  3").encode()
+    path = write(tmp_path / "m.ply", header.encode("latin-1") + b"end_header \n" + lines)
+    assert len(load_meshes(path)[0].faces) == 2
+
+
+@pytest.mark.parametrize("order", ["", "<", ">"])
+def test_ply_faces_without_corners_and_elements_without_rows(tmp_path, order, recwarn):
+    content = ply_roof(order).replace(
+        b"end_header\n", b"element edge 0\nproperty int a\nend_header\n"
+    )
+    content = content.replace(b"face 5", b"face 6")
+    empty = b"0\n" if not order else b"\0"
+    (roof,) = load_meshes(write(tmp_path / "roof.ply", content + empty))
+    assert len(roof.faces) == 6
+    assert not recwarn.list
 
 
 def test_ply_strips(tmp_path):
@@ -614,12 +649,17 @@ def test_junk(tmp_path, suffix, content):
         ("m.ply", PLY.replace("element face 2", "element face 0"), "point cloud"),
         ("m.ply", PLY.replace("3 0 2 3\n", ""), "cut short"),
         ("m.ply", PLY.replace("3 0 2 3\n", "3 0 2\n"), "cut short"),
-        ("m.ply", PLY + "3 0 2 3\n", "4 more numbers than announced"),
+        ("m.ply", PLY + "3 0 2 3\n", "6 rows announced, 7 lines there"),
         ("m.ply", PLY.replace("double x", "double u"), "have no x"),
         ("m.ply", PLY.replace("vertex_indices", "corners"), "have no vertex_indices"),
-        ("m.ply", PLY.replace("3 0 2 3", "3 0 2 2.5"), "by fractions"),
-        ("m.ply", PLY.replace("uchar int", "uchar quad"), "a property of type list uchar quad"),
-        ("m.ply", PLY.replace("ascii", "morse"), "no format"),
+        ("m.ply", PLY.replace("3 0 2 3", "3 0 2 2.5"), "row 1: .*malformed input"),
+        (
+            "m.ply",
+            PLY.replace("r int v", "r float v").replace("3 0 2 3", "3 0 2 2.5"),
+            "by fractions",
+        ),
+        ("m.ply", PLY.replace("uchar int", "uchar quad"), "field type 'quad'"),
+        ("m.ply", PLY.replace("ascii", "morse"), "format 'morse'"),
         ("m.ply", PLY.replace("3 0 2 3", "3 0 2 9"), "vertices 0 to 9|broken"),
         ("m.ply", PLY.partition("end_header")[0], "no PLY header"),
         ("m.ply", PLY.replace("500001.123456 4000001.5", "nan 4000001.5"), "NaN|broken"),

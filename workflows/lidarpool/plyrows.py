@@ -1,266 +1,196 @@
-"""Rows of the elements of a .ply file, whose properties are numbers and lists of numbers."""
+"""Rows of the elements of a .ply file, by plyfile.
+
+plyfile believes what a header says: it makes room for the rows that are announced, reads a
+list of negative length to the end of the file, and does not ask what follows the last row. It
+also takes nothing but ASCII in comments. Hence a header is made plain here, and what it
+announces compared with what there is, before plyfile sees the file.
+"""
 
 from __future__ import annotations
 
-from array import array
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+import contextlib
+import io
+import os
+import re
+import sys
+import tempfile
+import warnings
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from plyfile import PlyData, PlyElement, PlyElementParseError, PlyListProperty
 
-_TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
-    "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
-    "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
-    "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
-}  # fmt: skip
+from .meshfault import MeshFileError
 
-
-@dataclass
-class Element:
-    """An element of a header.
-
-    Parameters
-    ----------
-    name, count
-        What it is called, and how many rows there are.
-    properties
-        Name, type of the length ('' for a single number) and type of the numbers of each.
-    """
-
-    name: str
-    count: int
-    properties: list[tuple[str, str, str]] = field(default_factory=list)
-
-    @classmethod
-    def named(cls, name: bytes, count: bytes) -> Element:
-        """Take an element from its line; ValueError for a count that is none."""
-        number = int(count)
-        if number < 0:
-            raise ValueError(f"{number} rows of {name[:20].decode(errors='replace')} announced")
-        return cls(name.decode("ascii", errors="replace"), number)
-
-    def add(self, words: Sequence[bytes]) -> None:
-        """Add a property from its line; ValueError for an unknown type."""
-        *kinds, name = (word.decode("ascii", errors="replace") for word in words)
-        types = [_TYPES.get(kind, "") for kind in kinds[-2:]]
-        listed = len(kinds) == 3 and kinds[0] == "list"
-        if not all(types) or not (listed or len(kinds) == 1) or (listed and types[0][0] == "f"):
-            raise ValueError(f"a property of type {' '.join(kinds)[:40] or 'none'}")
-        self.properties.append((name, types[0] if listed else "", types[-1]))
+_HEADER_LIMIT = 1 << 20  # bytes
+_ELEMENT = re.compile(rb"^element (\S+) (\S+)$", re.MULTILINE)
+_SINGLE = re.compile(rb"^property (list \S+ )?float(32)? ", re.MULTILINE)
 
 
-@dataclass(frozen=True)
-class Rows:
-    """All rows of an element.
+def announced_rows(data: bytes) -> dict[str, int]:
+    """Look up in the header of a file how many rows each element has; ValueError without one."""
+    header, _ = _divided(data)
+    return {name.decode(): int(count) for name, count in _ELEMENT.findall(header)}
+
+
+def read_rows(data: bytes) -> PlyData:
+    """Read all rows of all elements.
 
     Parameters
     ----------
-    single
-        {property: (rows,)} of single numbers.
-    lists
-        {property: (numbers of all rows one after the other, how many each row has)}.
-    """
-
-    single: Mapping[str, NDArray[Any]]
-    lists: Mapping[str, tuple[NDArray[Any], NDArray[np.int64]]]
-
-
-def text_rows(body: bytes, elements: Sequence[Element]) -> Iterator[Rows]:
-    """Yield the rows of each element of a text file; ValueError where it holds other than that."""
-    # Through ASCII, since NumPy takes whatever follows the last number that it understands.
-    numbers = np.fromstring(body.decode("ascii"), dtype=np.float64, sep=" ")
-    at = 0
-    for element in elements:
-        places, lengths = _text_layout(numbers, at, element)
-        at = int(places[-1, -1] + lengths[-1, -1]) if len(places) else at
-        if at > len(numbers):
-            raise ValueError(_cut(element, len(numbers)))
-        yield _gathered(numbers, element, places, lengths)
-    if at < len(numbers):
-        raise ValueError(f"{len(numbers) - at:,} more numbers than announced")
-
-
-def _text_layout(
-    numbers: NDArray[np.float64], at: int, element: Element
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Place and length of each property (rows, properties) from the number `at` on."""
-    lists = [bool(kind) for _, kind, _ in element.properties]
-    if not lists or not element.count:
-        return np.empty((0, 0), dtype=np.int64), np.empty((0, 0), dtype=np.int64)
-    if element.count > len(numbers) - at:
-        raise ValueError(_cut(element, len(numbers)))
-    row = _text_row(numbers, at, lists)
-    width = row[-1][0] + row[-1][1] - at
-    begins = at + width * np.arange(element.count, dtype=np.int64)
-    shape = (element.count, 1)
-    if begins[-1] + width <= len(numbers):
-        # Rows are mostly alike: if all lists are as long as those of the first, this is it.
-        alike = [
-            (numbers[begins + place - 1 - at] == length).all()
-            for (place, length), listed in zip(row, lists, strict=True)
-            if listed
-        ]
-        if all(alike):
-            places = begins[:, None] + np.array([place - at for place, _ in row])
-            return places, np.tile(np.array([length for _, length in row]), shape)
-    rows = []
-    for _ in range(element.count):
-        rows.append(_text_row(numbers, at, lists))
-        at = rows[-1][-1][0] + rows[-1][-1][1]
-    found = np.array(rows, dtype=np.int64)
-    return found[..., 0], found[..., 1]
-
-
-def _text_row(
-    numbers: NDArray[np.float64], at: int, lists: Sequence[bool]
-) -> list[tuple[int, int]]:
-    """Place and length of each property of the row that begins at the number `at`."""
-    row = []
-    for listed in lists:
-        length = 1
-        if listed:
-            if at >= len(numbers):
-                raise ValueError("its last row is cut short")
-            length = int(numbers[at])
-            at += 1
-        if length < 0:
-            raise ValueError(f"a list of {length} numbers")
-        row.append((at, length))
-        at += length
-    return row
-
-
-def binary_rows(body: bytes, elements: Sequence[Element], order: str) -> Iterator[Rows]:
-    """Yield the rows of each element of a binary file, `order` being '<' or '>'.
+    data
+        The whole file: text, or binary of either order.
 
     Raises
     ------
-    ValueError
-        If it holds other than announced.
+    ValueError, PlyParseError
+        If it is no PLY file, or holds more or less than announced.
+    MeshFileError
+        If there is no room for a temporary file.
     """
-    at = 0
-    for element in elements:
-        if not element.count or not element.properties:
-            yield _columns(element, np.empty(0, _row_type(element, {}, order)), {})
+    header, body = _divided(data)
+    # As if there were no rows: what elements and properties there are.
+    empty = PlyData.read(io.BytesIO(_ELEMENT.sub(rb"element \1 0", header)))
+    counts = [int(count) for _, count in _ELEMENT.findall(header)]
+    _check_room(empty, counts, len(body))
+    if empty.text:
+        return _text_rows(header, body, sum(counts))
+    return _binary_rows(header, body, _first_lengths(body, empty, counts))
+
+
+def numbers_of(element: PlyElement, name: str) -> tuple[NDArray[Any], NDArray[np.int64]]:
+    """Numbers of a list property of all rows one after the other, and how many each row has."""
+    column = element[name]
+    if column.dtype != object:  # lists of one length
+        count, length = column.shape
+        return column.reshape(-1), np.full(count, length, dtype=np.int64)
+    sizes = np.fromiter(map(len, column), dtype=np.int64, count=len(column))
+    return np.concatenate(column) if len(column) else np.empty(0, dtype=np.int64), sizes
+
+
+def _divided(data: bytes) -> tuple[bytes, bytes]:
+    """Header with one way to end a line and without comments, and what follows it."""
+    head = data[:_HEADER_LIMIT]
+    found = re.match(rb"ply[ \t]*\r?\n(.*?\n)??end_header[ \t]*\r?\n", head, re.DOTALL)
+    found = found or re.match(rb"ply\r(.*?\r)??end_header\r", head, re.DOTALL)
+    if not found:
+        raise ValueError("no PLY header, or cut within it")
+    lines = [b"ply"]
+    for line in (found[1] or b"").splitlines():
+        words = line.decode("ascii", errors="backslashreplace").split()
+        # An empty comment in its place keeps the numbers of lines in errors right.
+        said = words and words[0] not in ("comment", "obj_info")
+        lines.append(" ".join(words).encode() if said else b"comment")
+    return b"\n".join([*lines, b"end_header\n"]), data[found.end() :]
+
+
+def _check_room(empty: PlyData, counts: list[int], there: int) -> None:
+    """Compare what is announced with the bytes that are there."""
+    for element, count in zip(empty.elements, counts, strict=True):
+        least = sum(_least(prop, empty.text) for prop in element.properties)
+        if count < 0 or (count and not least):
+            raise ValueError(f"{count} rows of {element.name[:20]} announced, without content")
+        there -= count * least
+        if there < -1:  # text may end without the end of a line
+            raise ValueError(f"{count:,} rows of {element.name[:20]} announced, and less there")
+
+
+def _least(prop: Any, text: bool) -> int:
+    """Bytes that a property takes in a row at least: of a list its length alone."""
+    if text:
+        return 2  # a digit, and what divides it from others
+    return np.dtype(
+        prop.len_dtype if isinstance(prop, PlyListProperty) else prop.val_dtype
+    ).itemsize
+
+
+def _text_rows(header: bytes, body: bytes, count: int) -> PlyData:
+    """Rows of a text file, of which each has a line."""
+    lines = [line for line in body.decode("ascii").splitlines() if line.strip()]
+    if len(lines) != count:
+        raise ValueError(f"{count:,} rows announced, {len(lines):,} lines there")
+    # What is called single precision may have been written with more digits, on maps above all.
+    header = _SINGLE.sub(rb"property \1double ", header)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "loadtxt: input contained no data")  # an empty list
+        return PlyData.read(io.StringIO(header.decode("ascii") + "\n".join(lines)))
+
+
+def _binary_rows(header: bytes, body: bytes, lengths: dict[str, dict[str, int]]) -> PlyData:
+    """Rows of a binary file, whose lists mostly have these `lengths` in all rows."""
+    with _unnamed_file() as file:
+        file.write(header)
+        file.write(body)
+        content = _Content(file)
+        try:
+            content.seek(0)
+            data = PlyData.read(content, known_list_len=lengths)
+        except PlyElementParseError:
+            if not lengths:
+                raise
+            content.seek(0)
+            data = PlyData.read(content)  # row by row
+        if rest := file.read().strip(b"\0\r\n\t "):
+            raise ValueError(f"{len(rest):,} bytes more than announced")
+    return data
+
+
+def _first_lengths(body: bytes, empty: PlyData, counts: list[int]) -> dict[str, dict[str, int]]:
+    """Lengths of the lists of the first row with lists: {element: {property: length}}.
+
+    Mostly all rows have these, and plyfile takes as many at once if it is told so.
+    """
+    order, at = empty.byte_order, 0
+    for element, count in zip(empty.elements, counts, strict=True):
+        lists = [prop for prop in element.properties if isinstance(prop, PlyListProperty)]
+        if not lists or not count:
+            at += count * element.dtype(order).itemsize * (not lists)
             continue
-        lengths = _first_lengths(body, at, element, order)
-        dtype = _row_type(element, lengths, order)
-        if element.count * dtype.itemsize <= len(body) - at:
-            rows = np.frombuffer(body, dtype, element.count, at)
-            if all((rows[f"{i} length"] == n).all() for i, n in lengths.items()):
-                at += element.count * dtype.itemsize
-                yield _columns(element, rows, lengths)
-                continue
-        elif not lengths:
-            raise ValueError(_cut(element, len(body)))
-        walked = _walked(body, at, element, order)
-        yield _bytes_gathered(body, element, walked, order)
-        last, length = walked[-1, -1].tolist()
-        at = last + length * np.dtype(element.properties[-1][2]).itemsize
-    if rest := body[at:].strip(b"\0\r\n\t "):
-        raise ValueError(f"{len(rest):,} bytes more than announced")
+        lengths: dict[str, int] = {}
+        for prop in element.properties:
+            if prop in lists:
+                kind, each = map(np.dtype, prop.list_dtype(order))
+                lengths[prop.name] = int(np.frombuffer(body, kind, 1, at)[0])
+                at += kind.itemsize + lengths[prop.name] * each.itemsize
+                if not at <= len(body) or lengths[prop.name] < 0:
+                    return {}  # for the reader of single rows to say what is wrong
+            else:
+                at += np.dtype(prop.dtype(order)).itemsize
+        return {element.name: lengths}
+    return {}
 
 
-def _first_lengths(body: bytes, at: int, element: Element, order: str) -> dict[int, int]:
-    """Lengths of the lists of the first row: {number of the property: length}."""
-    if not element.count or not any(kind for _, kind, _ in element.properties):
-        return {}
-    only = Element(element.name, 1, element.properties)
-    row = _walked(body, at, only, order)[0]
-    return {i: int(row[i, 1]) for i, (_, kind, _) in enumerate(element.properties) if kind}
+@contextlib.contextmanager
+def _unnamed_file() -> Iterator[Any]:
+    """File to write and read, since plyfile takes rows at once from real files only.
+
+    The file that is read may change meanwhile, and a mapped one that is cut short ends the
+    process. Hence a copy: in memory where the system has such files, else in a temporary one.
+    """
+    memory = sys.platform == "linux"
+    try:
+        with (
+            os.fdopen(os.memfd_create("ply"), "w+b") if memory else tempfile.TemporaryFile() as file
+        ):
+            yield file
+    except OSError as error:
+        raise MeshFileError(f"cannot be copied to be read: {error.strerror or error}") from error
 
 
-def _row_type(element: Element, lengths: dict[int, int], order: str) -> np.dtype[np.void]:
-    """Row whose lists have these lengths."""
-    fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
-    for i, (_, kind, numbers) in enumerate(element.properties):
-        if kind:
-            fields.append((f"{i} length", order + kind))
-            fields.append((str(i), order + numbers, (lengths.get(i, 0),)))
-        else:
-            fields.append((str(i), order + numbers))
-    return np.dtype(fields)
+class _Content:
+    """What plyfile needs of a file, of which a negative number of bytes is not all the rest."""
 
+    def __init__(self, file: Any) -> None:
+        self._file = file
+        self.seek = file.seek
+        self.tell = file.tell
+        self.fileno = file.fileno
 
-def _columns(element: Element, rows: NDArray[np.void], lengths: dict[int, int]) -> Rows:
-    """Rows that are all alike, by property."""
-    single, lists = {}, {}
-    for i, (name, kind, _) in enumerate(element.properties):
-        if kind:
-            sizes = np.full(len(rows), lengths.get(i, 0), dtype=np.int64)
-            lists[name] = (rows[str(i)].reshape(-1), sizes)
-        else:
-            single[name] = rows[str(i)]
-    return Rows(single, lists)
-
-
-def _walked(body: bytes, at: int, element: Element, order: str) -> NDArray[np.int64]:
-    """Byte and length of each property, row by row: (rows, properties, 2)."""
-    steps = [
-        (np.dtype(kind).itemsize if kind else 0, kind[:1] == "i", np.dtype(numbers).itemsize)
-        for _, kind, numbers in element.properties
-    ]
-    least = sum(head or size for head, _, size in steps)
-    if element.count * least > len(body) - at:
-        raise ValueError(_cut(element, len(body)))
-    endian = "little" if order == "<" else "big"
-    rows = array("q")
-    for _ in range(element.count):
-        for head, signed, size in steps:
-            length = 1
-            if head:
-                length = int.from_bytes(body[at : at + head], endian, signed=signed)  # type: ignore[arg-type]
-                at += head
-                if length < 0:
-                    raise ValueError(f"a list of {length} numbers")
-            rows.extend((at, length))
-            at += length * size
-        if at > len(body):
-            raise ValueError(_cut(element, len(body)))
-    return np.frombuffer(rows, dtype=np.int64).reshape(element.count, len(steps), 2)
-
-
-def _bytes_gathered(body: bytes, element: Element, walked: NDArray[np.int64], order: str) -> Rows:
-    """Rows that differ, by property, from where each of them is."""
-    raw = np.frombuffer(body, dtype=np.uint8)
-    single, lists = {}, {}
-    for i, (name, kind, numbers) in enumerate(element.properties):
-        dtype = np.dtype(order + numbers)
-        lengths = walked[:, i, 1]
-        picked = raw[_spans(walked[:, i, 0], lengths * dtype.itemsize)].view(dtype)
-        if kind:
-            lists[name] = (picked, lengths)
-        else:
-            single[name] = picked
-    return Rows(single, lists)
-
-
-def _gathered(
-    numbers: NDArray[np.float64],
-    element: Element,
-    places: NDArray[np.int64],
-    lengths: NDArray[np.int64],
-) -> Rows:
-    """Rows of a text file by property."""
-    single, lists = {}, {}
-    none = np.empty(0, dtype=np.int64)
-    for i, (name, kind, _) in enumerate(element.properties):
-        begin, length = (places[:, i], lengths[:, i]) if len(places) else (none, none)
-        if kind:
-            lists[name] = (numbers[_spans(begin, length)], length)
-        else:
-            single[name] = numbers[begin]
-    return Rows(single, lists)
-
-
-def _spans(begins: NDArray[np.int64], lengths: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Numbers from each begin on, as many as its length, one after the other."""
-    before = np.cumsum(lengths) - lengths
-    return np.repeat(begins - before, lengths) + np.arange(int(lengths.sum()), dtype=np.int64)
-
-
-def _cut(element: Element, there: int) -> str:
-    return f"{element.count:,} rows of {element.name[:20]} announced, and less there"
+    def read(self, size: int) -> bytes:
+        """So many bytes, or what there is; ValueError for a negative number."""
+        if size < 0:
+            raise ValueError(f"a list of negative length, {size} bytes")
+        found: bytes = self._file.read(size)
+        return found
