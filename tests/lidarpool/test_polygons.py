@@ -78,10 +78,45 @@ def test_polygons_of_all_sizes_keep_their_order():
     st.lists(st.tuples(*[st.integers(-3, 3)] * 3), min_size=3, max_size=9),
     st.sampled_from([1.0, 1e-9, 1e8, float("nan")]),
 )
-def test_whatever_it_is_each_polygon_gives_its_triangles(points, scale):
-    faces = cut(np.array(points, dtype=float) * scale)
-    assert faces.shape == (len(points) - 2, 3)
+def test_whatever_it_is_each_polygon_gives_triangles(points, scale):
+    vertices = np.array(points, dtype=float) * scale
+    faces = cut(vertices)
+    assert 1 <= len(faces) <= len(points) - 2
     assert all(len(set(face)) == 3 for face in faces.tolist())
+    # Its neighbours stay what they are.
+    square = placed(SHAPES["square"])
+    among = cut(np.concatenate([square, vertices, square]), 4, len(points), 4)
+    np.testing.assert_array_equal(among[:2], [[0, 1, 2], [0, 2, 3]])
+    np.testing.assert_array_equal(among[2:-2], faces + 4)
+    np.testing.assert_array_equal(among[-2:], among[:2] + 4 + len(points))
+
+
+# What they enclose is filled, each with what it has of area.
+UNUSUAL = {
+    "slit to a hole": ([(0, 0), (4, 0), (4, 4), (0, 4), (0, 0), (1, 1), (1, 2), (2, 2), (2, 1),
+                        (1, 1)], 15),
+    "corner twice": ([(0, 0), (2, 0), (2, 0), (2, 2), (1, 1), (0, 2)], 3),
+    "there and back": ([(0, 0), (2, 0), (2, 2), (2, 5), (2, 2), (0, 2)], 4),
+    "two that touch": ([(0, 0), (2, 0), (2, 2), (4, 2), (4, 4), (2, 4), (2, 2), (0, 2)], 8),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1, 1e6])
+@pytest.mark.parametrize("shift", [0.0, 5e6])
+@pytest.mark.parametrize("backwards", [False, True])
+@pytest.mark.parametrize("name", UNUSUAL)
+def test_an_unusual_outline_is_filled(name, backwards, shift, scale):
+    shape, area = UNUSUAL[name]
+    vertices = placed(shape[::-1] if backwards else shape)[:, [0, 2, 1]] * scale
+    faces = cut(vertices + shift * scale)
+    whole, parts = area_vector(vertices), area_vectors(vertices, faces)
+    np.testing.assert_allclose(np.linalg.norm(parts, axis=1).sum(), area * scale**2)
+    assert (parts @ whole >= 0).all()
+
+
+def test_an_outline_without_area_keeps_its_corners():
+    shape = [(0, 0), (4, 0), (1, 0), (3, 0), (2, 0)]
+    assert set(cut(placed(shape)).ravel().tolist()) == set(range(5))
 
 
 def test_corners_that_are_not_there():

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import mapbox_earcut
 import numpy as np
 from numpy.typing import NDArray
 
-# Clipping takes their square in the worst case; outlines with more are rather files gone wrong.
+# One that crosses itself all over takes the clipper their cube, 20 seconds for this many;
+# outlines with more are rather files gone wrong.
 MOST_CORNERS = 5000
 
 _FLAT = 1e-12  # a corner turns back if its sine, of a plane polygon, is below minus this
-
-Point = tuple[float, float]
 
 
 def triangulated(
     vertices: NDArray[np.float64], corners: NDArray[np.int64], sizes: NDArray[np.int64]
 ) -> NDArray[np.int64]:
     """Cut polygons into triangles with the same corners and the same outside.
+
+    Convex ones and quadrangles become fans, all of one size at once; of others ears are clipped
+    off by mapbox_earcut.
 
     Parameters
     ----------
@@ -29,7 +32,9 @@ def triangulated(
 
     Returns
     -------
-    int64 (t, 3): of each polygon two triangles less than it has corners, in the same order.
+    int64 (t, 3), in the order of the polygons: of each two triangles less than it has corners.
+    There are fewer where an outline crosses or touches itself or runs back on itself, such as
+    around a hole: what it encloses is filled, and parts without area are left out.
 
     Raises
     ------
@@ -43,7 +48,7 @@ def triangulated(
         )
     first = np.cumsum(sizes) - sizes
     ends = np.cumsum(np.maximum(sizes - 2, 0))
-    out = np.empty((int(ends[-1]) if len(ends) else 0, 3), dtype=np.int64)
+    out = np.full((int(ends[-1]) if len(ends) else 0, 3), -1, dtype=np.int64)
     for size in np.unique(sizes[sizes > 2]).tolist():
         which = np.flatnonzero(sizes == size)
         rows = _begun_well(vertices, corners[first[which, None] + np.arange(size)])
@@ -53,8 +58,11 @@ def triangulated(
         out[places, 2] = rows[:, 2:]
         if size > 4:
             for i in np.flatnonzero(_turns(vertices, rows).any(axis=1)).tolist():
-                out[places[i]] = rows[i][_clipped(_plane(vertices[rows[i]]))]
-    return out
+                clipped = _clipped(vertices[rows[i]])
+                if len(clipped):  # else it has no area, and the fan has none that matters
+                    out[places[i]] = -1
+                    out[places[i, : len(clipped)]] = rows[i][clipped]
+    return out[out[:, 0] >= 0]
 
 
 def _begun_well(vertices: NDArray[np.float64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -84,54 +92,24 @@ def _turns(vertices: NDArray[np.float64], rows: NDArray[np.int64]) -> NDArray[np
     return along < -_FLAT * scale * np.linalg.norm(normal, axis=1)[:, None]
 
 
-def _plane(points: NDArray[np.float64]) -> list[Point]:
-    """Corners (k, 3) of a polygon as seen from its outside, anticlockwise."""
-    points = points - points[0]
+def _clipped(points: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Triangles (t, 3) of the corners (k, 3) of one polygon; none where it has no area."""
+    if len(points) > MOST_CORNERS:
+        raise ValueError(f"a face has {len(points):,} corners and is not convex: triangulate it")
+    rings = np.array([len(points)], dtype=np.uint32)
+    found = mapbox_earcut.triangulate_float64(_plane(points), rings)
+    return found.astype(np.int64).reshape(-1, 3)
+
+
+def _plane(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Corners (k, 3) of a polygon as seen from its outside, anticlockwise: (k, 2).
+
+    The clipper makes triangles that run anticlockwise, whatever the polygon does.
+    """
+    points = points - points[0]  # of coordinates far from zero nothing is lost
     normal = np.cross(points, np.roll(points, -1, axis=0)).sum(axis=0)
     drop = int(np.abs(normal).argmax())
     across, up = (drop + 1) % 3, (drop + 2) % 3
     if normal[drop] < 0:
         across, up = up, across
-    return list(map(tuple, points[:, [across, up]].tolist()))
-
-
-def _clipped(points: list[Point]) -> list[tuple[int, int, int]]:
-    """Cut ears off a polygon that runs anticlockwise (Meisters, 1975); numbers of its corners."""
-    if len(points) > MOST_CORNERS:
-        raise ValueError(f"a face has {len(points):,} corners and is not convex: triangulate it")
-    left = list(range(len(points)))
-    ears = []
-    at = missed = 0  # where we look, and in vain for how long
-    while len(left) > 3:
-        i, j, k = (left[(at + step) % len(left)] for step in (-1, 0, 1))
-        # Of one that crosses itself there may be no ear: then any corner will do.
-        if missed > len(left) or _is_ear(points, left, i, j, k):
-            ears.append((i, j, k))
-            left.pop(at % len(left))
-            at, missed = at - 1, 0
-        else:
-            at, missed = at + 1, missed + 1
-        at %= len(left)
-    return [*ears, (left[0], left[1], left[2])]
-
-
-def _is_ear(points: list[Point], left: list[int], i: int, j: int, k: int) -> bool:
-    """Whether the triangle of a corner and its neighbours is within the polygon."""
-    a, b, c = points[i], points[j], points[k]
-    if _side(a, b, c) <= 0:
-        return False
-    for other in left:
-        p = points[other]
-        if (
-            p not in (a, b, c)
-            and _side(a, b, p) >= 0
-            and _side(b, c, p) >= 0
-            and _side(c, a, p) >= 0
-        ):
-            return False
-    return True
-
-
-def _side(a: Point, b: Point, p: Point) -> float:
-    """Twice the area of a, b and p: positive where p is to the left."""
-    return (b[0] - a[0]) * (p[1] - a[1]) - (b[1] - a[1]) * (p[0] - a[0])
+    return np.ascontiguousarray(points[:, [across, up]])
