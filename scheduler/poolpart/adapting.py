@@ -88,9 +88,8 @@ class Adapting:
         if not room:
             return 0
         if not members:
-            waiting = sum(asks_for(task, [name]) for task in self.scheduler.unrunnable)
             # How long they take is not known, nor how many slots a worker will have.
-            return min(1, waiting)
+            return int(any(asks_for(task, [name]) for task in self.scheduler.unrunnable))
         states = [self.scheduler.workers[m.info.address] for m in members if m.absent_since is None]
         tasks = sum(len(state.processing) for state in states)
         slots = sum(member.slots for member in members) / len(members)

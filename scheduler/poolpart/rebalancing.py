@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 from .book import Book, Seat
@@ -83,7 +84,10 @@ class Rebalancing:
                 self._give_back([seat for seat in lent if self._idle(seat, patience, now)])
 
     def backlog(self, name: str) -> int:
-        """Tasks of a partition that wait for a slot of it."""
+        """Tasks of a partition that wait for a slot of it.
+
+        Where it has none at all, no more are counted than there are workers that might help.
+        """
         waiting = 0
         members = [
             self.scheduler.workers[seat.info.address]
@@ -93,7 +97,9 @@ class Rebalancing:
             busy = len(worker.processing) - len(worker.long_running)
             waiting += max(0, busy - int(worker.resources.get(name, 0)))
         if not any(worker.resources.get(name) for worker in members):
-            waiting += sum(asks_for(task, [name]) for task in self.scheduler.unrunnable)
+            # Ten times a second; there may be a hundred thousand.
+            mine = (task for task in self.scheduler.unrunnable if asks_for(task, [name]))
+            waiting += sum(1 for _ in islice(mine, len(self.scheduler.workers)))
         return waiting
 
     def _watch(self, now: float) -> None:

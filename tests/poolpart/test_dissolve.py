@@ -5,6 +5,7 @@ import os
 import signal
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 
 import pytest
 from distributed import Client, Event, get_worker
@@ -13,6 +14,7 @@ from poolpart import (
     Partition,
     Pool,
     PoolError,
+    dissolve,
     n_workers,
     named,
     per_host,
@@ -287,3 +289,24 @@ def test_another_client_can_undo_it(start):
     Pool.from_client(client).dissolve()
     assert declared(client) == {"a": {}}
     assert len(Partition("A", client)) == 0
+
+
+def test_a_scheduler_with_many_tasks_is_not_kept_from_them_by_looking(monkeypatch):
+    """By a clock of its own, on which one look takes 40 ms."""
+    clock = SimpleNamespace(now=0.0, looked=0.0)
+
+    def look(scheduler, names):
+        clock.now, clock.looked = clock.now + 0.04, clock.looked + 0.04
+        return [SimpleNamespace(key="long")]
+
+    async def sleep(seconds):
+        clock.now += seconds
+
+    monkeypatch.setattr(dissolve, "time", SimpleNamespace(monotonic=lambda: clock.now))
+    monkeypatch.setattr(dissolve, "asyncio", SimpleNamespace(sleep=sleep))
+    monkeypatch.setattr(dissolve, "_unfinished", look)
+    book = SimpleNamespace(rules={"A": rest()})
+    asked = dissolve._dissolve(SimpleNamespace(book=book, scheduler=None), ["A"], 10.0)
+    with pytest.raises(PoolError, match="1 tasks of A have not ended after 10 s"):
+        asyncio.run(asked)
+    assert clock.looked < 0.1 * clock.now < 1.1
