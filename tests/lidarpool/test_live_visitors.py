@@ -10,6 +10,7 @@ from importlib.metadata import version
 import msgspec
 import pytest
 import zstandard
+from benchmarks.live import CAMERA
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.frames import OP_BINARY, Frame
 from websockets.sync.client import connect
@@ -31,18 +32,6 @@ STRANGERS = [
 ]
 OWN = ["http://127.0.0.1:8080", "http://localhost:18080", "https://LOCALHOST", "http://[::1]:80"]
 PROTOCOL = f"viser-v{version('viser')}"
-CAMERA = {
-    "type": "ViewerCameraMessage",
-    "wxyz": [1.0, 0.0, 0.0, 0.0],
-    "position": [0.0, 0.0, 1.0],
-    "fov": 1.0,
-    "near": 0.1,
-    "far": 10.0,
-    "image_height": 10,
-    "image_width": 10,
-    "look_at": [0.0, 0.0, 0.0],
-    "up_direction": [0.0, 0.0, 1.0],
-}
 
 
 @pytest.fixture

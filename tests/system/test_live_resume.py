@@ -13,6 +13,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from benchmarks.live import CAMERA
 from distributed import Client
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
@@ -27,18 +28,6 @@ from lidarpool.run import Run
 
 LONG_S = 30.0
 POSES = [(0, 0, 1 + step / 40) for step in range(10)]
-CAMERA = {
-    "type": "ViewerCameraMessage",
-    "wxyz": [1.0, 0.0, 0.0, 0.0],
-    "position": [0.0, 0.0, 1.0],
-    "fov": 1.0,
-    "near": 0.1,
-    "far": 10.0,
-    "image_height": 10,
-    "image_width": 10,
-    "look_at": [0.0, 0.0, 0.0],
-    "up_direction": [0.0, 0.0, 1.0],
-}
 
 
 def make_job() -> Job:
