@@ -347,6 +347,33 @@ def test_a_journal_in_use_is_refused(path):
     reopen(path)
 
 
+def test_of_two_runs_that_begin_with_one_journal_the_first_to_deliver_has_it(path, expected):
+    one, other = reopen(path), reopen(path)
+    deliver(one, DELIVERIES[:9])
+    with (
+        pytest.raises(LidarpoolError, match="Another run is using the journal") as caught,
+        other.kept_on_error(),
+    ):
+        deliver(other)
+    assert not getattr(caught.value, "__notes__", [])
+    deliver(one, DELIVERIES[9:])
+    assert content(one) == expected
+    one.save()
+    one.close()
+    assert reopen(path).complete
+
+
+def test_a_run_that_has_kept_nothing_leaves_the_journal_in_its_place(path):
+    journal = reopen(path)
+    with pytest.raises(ZeroDivisionError), journal.kept_on_error():
+        deliver(journal, DELIVERIES[:1])
+        journal.trials.clear()
+        (path / RECORDS).unlink()
+        (path / RECORDS).write_bytes(b"another's")
+        raise ZeroDivisionError
+    assert (path / RECORDS).read_bytes() == b"another's"
+
+
 def test_a_missing_folder_is_named(path):
     with pytest.raises(LidarpoolError, match=r"The folder \S+nowhere of the journal does not"):
         reopen(path.parent / "nowhere" / "journal")

@@ -66,7 +66,13 @@ def _is_ours(path: Path) -> bool:
 
 def remove_files(path: Path) -> None:
     """Remove the files of a journal, as far as they are there."""
-    for name in (FRESH, FRAMES, RECORDS):
+    remove_totals(path)
+    (path / RECORDS).unlink(missing_ok=True)
+
+
+def remove_totals(path: Path) -> None:
+    """Remove the totals of the frames, as far as they are there."""
+    for name in (FRESH, FRAMES):
         (path / name).unlink(missing_ok=True)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from .errors import LidarpoolError
 from .identity import Identity
-from .journal_folder import RECORDS, flush_folder, remove_files, remove_folder
+from .journal_folder import RECORDS, flush_folder, remove_files, remove_folder, remove_totals
 from .journal_format import HEADER, POINTS, pack_header, pack_points
 from .records import RecordFile
 
@@ -66,11 +67,12 @@ class JournalStore:
     def discard(self) -> None:
         """Remove what there is of the journal: there is a header, and nothing was delivered."""
         if self.file is not None:
-            self.file.close()
-            self.file = None
             with self.explained():
-                remove_files(self.folder)
-                remove_folder(self.folder)
+                if self.is_there:  # not what another run has made in its place
+                    remove_files(self.folder)
+                    remove_folder(self.folder)
+            self.close()
+            self.file = None
 
     def close(self) -> None:
         """Let go of the file; afterwards the points cannot be read any more."""
@@ -97,10 +99,15 @@ class JournalStore:
         """Make the journal with its header, and both certain to be there after a crash."""
         self.folder.mkdir(exist_ok=True)
         try:
-            # What there may be is of an earlier run that came to nothing.
-            remove_files(self.folder)
-            file = RecordFile(self.folder / RECORDS)
+            file = self._open_alone()
+        except BaseException:
+            remove_folder(self.folder)
+            raise
+        try:
             try:
+                # What there may be is of an earlier run that came to nothing.
+                file.clear()
+                remove_totals(self.folder)
                 file.append(HEADER, pack_header(self.backend, self.identity))
                 file.sync()
                 flush_folder(self.folder)
@@ -112,4 +119,19 @@ class JournalStore:
             remove_files(self.folder)
             remove_folder(self.folder)
             raise
+        return file
+
+    def _open_alone(self) -> RecordFile:
+        """Open the file, new or not; LidarpoolError if a run that began meanwhile writes to it."""
+        try:
+            if os.name == "nt":  # has no locks, and does not remove what is open
+                (self.folder / RECORDS).unlink(missing_ok=True)
+            file = RecordFile(self.folder / RECORDS)
+        except BlockingIOError as error:
+            raise LidarpoolError(f"Another run is using the journal {self.folder}.") from error
+        if not file.is_at(self.folder / RECORDS):  # that run has ended, and removed it
+            file.close()
+            raise LidarpoolError(
+                f"Another run has just removed the journal {self.folder}: run it again."
+            )
         return file

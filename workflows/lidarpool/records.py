@@ -110,6 +110,12 @@ class RecordFile:
             )
         self.end, self._ragged = at, at < size
 
+    def clear(self) -> None:
+        """Drop all that is in the file; OSError if that cannot be done."""
+        self._file.truncate(0)
+        self.end = self._durable = 0
+        self._ragged = False
+
     def append(self, kind: int, *pieces: Buffer) -> int:
         """Write a record, its payload given in pieces; returns where the payload begins.
 
