@@ -199,6 +199,16 @@ def test_a_folder_that_is_not_there_yet(lidarpool, tmp_path, monkeypatch):
     assert json.loads(outcome.out)["disk"]["folder"] == "made/here"
 
 
+def test_a_folder_that_cannot_take_a_result(check, tmp_path, lidarpool):
+    (tmp_path / "out" / "cloud.ply").mkdir(parents=True)
+    outcome = check("--no-plan")
+    assert outcome.code == 2
+    assert "cloud.ply is a folder, and a result has a file of that name" in outcome.err
+    outcome = lidarpool("check", tmp_path / "s.yaml", "--out", tmp_path / "new" / ("n" * 300))
+    assert outcome.code == 2
+    assert "name too long: give another name or folder" in outcome.err
+
+
 def box(tmp_path: Path, size: tuple[float, float, float]) -> Path:
     mesh = trimesh.creation.box(size)
     (tmp_path / "my box.stl").write_bytes(mesh.export(file_type="stl"))

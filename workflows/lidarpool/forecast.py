@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from .errors import LidarpoolError
 from .job import Job
 from .journal_folder import RECORDS
 from .needs import Needs, needs_of
+from .output import folder_in_the_way
 from .run_command import JOURNAL
 from .sampling import Sample, sample_survey
 from .scan import GPU, LIDAR, OTHER
@@ -204,6 +205,11 @@ def _look_at_folder(made: Forecast) -> None:
         made.reasons.append(f"{there} is a file: give a folder for the results with --out.")
     elif not os.access(there, os.W_OK | os.X_OK):
         made.reasons.append(f"Cannot write to the folder {there}: give another with --out.")
+    elif obstacle := folder_in_the_way(made.out):
+        made.reasons.append(obstacle)
+    for part in made.out.absolute().relative_to(there.absolute()).parts:
+        with suppress(FileNotFoundError, NotADirectoryError):
+            os.lstat(there / part)  # OSError for a name that no folder of that disk can have
     if (made.out / JOURNAL / RECORDS).exists():
         made.notes.append(
             f"{made.out} holds an unfinished run: --resume goes on with it, --fresh drops it"

@@ -191,14 +191,21 @@ def _lock(folder: Path, spare: int) -> int:
     return handle
 
 
+def folder_in_the_way(folder: Path) -> str:
+    """Say which folder has the name of a file of a result, and what to do; empty if none has."""
+    taken = next((folder / name for name in FILES if (folder / name).is_dir()), None)
+    if taken is None:
+        return ""
+    return (
+        f"{taken} is a folder, and a result has a file of that name: give another folder with "
+        "--out."
+    )
+
+
 def _clear_up(folder: Path) -> None:
     """Finish or remove what a killed run left, and refuse folders where files are to go."""
-    for name in FILES:
-        if (folder / name).is_dir():
-            raise LidarpoolError(
-                f"{folder / name} is a folder, and a result has a file of that name: "
-                "give another folder with --out."
-            )
+    if obstacle := folder_in_the_way(folder):
+        raise LidarpoolError(obstacle)
     try:
         for whole in folder.glob(f"{_COMPLETE}*"):
             if (whole / REPORT).exists():
