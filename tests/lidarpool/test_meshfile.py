@@ -330,7 +330,8 @@ def test_a_ply_header_as_programs_write_it(tmp_path):
     header, _, body = PLY.partition("end_header\n")
     header = header.replace("ply\n", "ply  \ncomment von Jörg Müller\nobj_info 3 übrig\n\n")
     header = header.replace("vertex 4", "  vertex\t4 ")
-    lines = body.replace("\n3", "\n\n  3").encode()
+    header = header.replace("double z", "double z\nproperty uchar red")
+    lines = re.sub(r" 1$", " 1 0.5", body, flags=re.MULTILINE).replace("\n3", "\n\n  3").encode()
     path = write(tmp_path / "m.ply", header.encode("latin-1") + b"end_header \n" + lines)
     assert len(load_meshes(path)[0].faces) == 2
 
@@ -652,12 +653,13 @@ def test_junk(tmp_path, suffix, content):
         ("m.ply", PLY + "3 0 2 3\n", "6 rows announced, 7 lines there"),
         ("m.ply", PLY.replace("double x", "double u"), "have no x"),
         ("m.ply", PLY.replace("vertex_indices", "corners"), "have no vertex_indices"),
-        ("m.ply", PLY.replace("3 0 2 3", "3 0 2 2.5"), "row 1: .*malformed input"),
-        (
-            "m.ply",
-            PLY.replace("r int v", "r float v").replace("3 0 2 3", "3 0 2 2.5"),
-            "by fractions",
-        ),
+        ("m.ply", PLY.replace("3 0 2 3", "3 0 2 2.5"), "by fractions"),
+        ("m.ply", PLY.replace("3 0 2 3", "3 0 2 nan"), "by fractions"),
+        ("m.ply", PLY.replace("3 0 2 3", "3 0 2 inf"), "broken"),
+        ("m.ply", PLY.replace("3 0 2 3", "3 0 2 a"), "row 1: .*malformed input"),
+        ("m.ply", PLY.replace("3 0 2 3", "-3 0 2 3"), "broken"),
+        ("m.ply", PLY.replace("3 0 2 3", "3 0 2 3 1"), "expected end-of-line"),
+        ("m.ply", PLY.replace("double z", "half z"), "field type 'half'"),
         ("m.ply", PLY.replace("uchar int", "uchar quad"), "field type 'quad'"),
         ("m.ply", PLY.replace("ascii", "morse"), "format 'morse'"),
         ("m.ply", PLY.replace("3 0 2 3", "3 0 2 9"), "vertices 0 to 9|broken"),

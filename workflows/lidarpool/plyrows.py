@@ -26,7 +26,7 @@ from .meshfault import MeshFileError
 
 _HEADER_LIMIT = 1 << 20  # bytes
 _ELEMENT = re.compile(rb"^element (\S+) (\S+)$", re.MULTILINE)
-_SINGLE = re.compile(rb"^property (list \S+ )?float(32)? ", re.MULTILINE)
+_NUMBERS = re.compile(rb"^property (list \S+ )?\S+ (\S+)$", re.MULTILINE)
 
 
 def announced_rows(data: bytes) -> dict[str, int]:
@@ -111,8 +111,9 @@ def _text_rows(header: bytes, body: bytes, count: int) -> PlyData:
     lines = [line for line in body.decode("ascii").splitlines() if line.strip()]
     if len(lines) != count:
         raise ValueError(f"{count:,} rows announced, {len(lines):,} lines there")
-    # What is called single precision may have been written with more digits, on maps above all.
-    header = _SINGLE.sub(rb"property \1double ", header)
+    # What is called single precision may have more digits, on maps above all, and what is called
+    # a byte a fraction; in text that does no harm.
+    header = _NUMBERS.sub(rb"property \1double \2", header)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "loadtxt: input contained no data")  # an empty list
         return PlyData.read(io.StringIO(header.decode("ascii") + "\n".join(lines)))
