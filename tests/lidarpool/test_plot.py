@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -168,12 +169,25 @@ def test_positions_are_read_evenly(tmp_path):
     positions = np.arange(30.0).reshape(10, 3)
     write_cloud(path, positions, *np.zeros((3, 10), np.int32))
     chosen, count = read_positions(path, 4)
-    assert count == 10 and chosen.tolist() == positions[[0, 3, 6, 9]].tolist()
+    rows = (chosen[:, 0] / 3).astype(int)
+    assert count == 10 and np.array_equal(chosen, positions[rows])
+    assert all(
+        low <= row < high for row, (low, high) in zip(rows, pairwise([0, 2, 5, 7, 10]), strict=True)
+    )
     for most in (10, 1000):
         assert np.array_equal(read_positions(path, most)[0], positions)
     write_cloud(path, np.empty((0, 3)), *np.zeros((3, 0), np.int32))
     empty, none = read_positions(path, 4)
     assert empty.shape == (0, 3) and none == 0
+
+
+def test_some_of_the_points_are_of_every_ring(tmp_path):
+    path = tmp_path / "cloud.ply"
+    layers, rays = 40, 500  # a ray's points follow those of the ray beside it, ring by ring
+    ring = np.tile(np.arange(layers), rays).astype(np.int32)
+    write_cloud(path, np.stack([ring] * 3, axis=1).astype(float), 0 * ring, ring, 0 * ring)
+    chosen, _ = read_positions(path, len(ring) // 20)  # every 20th would be of two rings
+    assert len(np.unique(chosen[:, 2])) == layers
 
 
 # -- the command ---------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .choice import one_of_each_part
 from .cloud import CHUNK_POINTS, Cloud, CloudLike
 from .errors import LidarpoolError
 from .ply_format import header, layout, row_type
@@ -149,7 +150,7 @@ def read_positions(path: str | Path, most: int) -> tuple[NDArray[np.float64], in
         raise LidarpoolError(f"{path} cannot be read: {error.strerror or error}.") from error
     except ValueError as error:
         raise LidarpoolError(f"{path} is not a point cloud of lidarpool: {error}.") from error
-    chosen = rows[np.linspace(0, count - 1, min(count, most)).astype(np.int64)]
+    chosen = rows[one_of_each_part(count, most)]
     return np.stack([chosen[axis] for axis in "xyz"], axis=1, dtype=np.float64), count
 
 

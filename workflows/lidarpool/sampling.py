@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from raybeam import RayCaster
 
+from .choice import one_of_each_part
 from .scan.setup import ray_directions
 from .scene import Scene
 from .survey import Survey
@@ -67,7 +68,7 @@ def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> Sample
     rng = np.random.default_rng(_SEED)
     caster = RayCaster(scene.vertices, scene.faces, backend=backend)
     most = RAYS_MOST.get(caster.backend, RAYS_MOST_ELSE)
-    scans = _spread(survey.scan_count, SCANS_MOST, rng)
+    scans = one_of_each_part(survey.scan_count, SCANS_MOST, rng)
     each = most if survey.ray_count <= most else max(1, most // len(scans))
     cast = 0
     hits, points = [], []  # of each of these scans
@@ -75,7 +76,7 @@ def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> Sample
     for index in scans.tolist():
         spec = survey.scan(index)
         count = spec.ray_count(survey.sensor)
-        rays = _spread(count, each, rng)
+        rays = one_of_each_part(count, each, rng)
         directions = ray_directions(survey.sensor, spec, rays)
         found = caster.returns(
             np.asarray(spec.pose.position),
@@ -108,10 +109,3 @@ def _kept(hits: float, keep_every: int, counted: bool) -> float:
         return -(-hits // keep_every)
     # Rounding up adds half a point, less what whole numbers leave out, where there are any.
     return hits / keep_every + (keep_every - 1) / (2 * keep_every) if hits else 0.0
-
-
-def _spread(count: int, most: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """At most so many of the numbers below `count`, in order, one from each equal part."""
-    parts = min(count, most)
-    edges = np.arange(parts + 1, dtype=np.int64) * count // parts
-    return rng.integers(edges[:-1], edges[1:])

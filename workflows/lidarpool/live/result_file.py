@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..choice import one_of_each_part
 from ..errors import LidarpoolError
 from ..picture_file import PICTURE_FILE, Pictured
 from ..ply_format import layout
@@ -99,7 +100,7 @@ class ResultFile:
         low = bisect_left(scans, first) if first > 0 else 0
         high = bisect_right(scans, last) if last < 2**31 - 1 else len(scans)
         count = max(0, high - low)
-        rows = self._rows[low + _even(count, most)]
+        rows = self._rows[low + one_of_each_part(count, most)]
         positions = np.stack([rows[axis] for axis in "xyz"], axis=1, dtype=np.float64)
         out = np.empty(len(rows), DISPLAY)
         out["position"] = positions - self.origin
@@ -123,7 +124,7 @@ class ResultFile:
         found = {"poses": len(self.pictured.poses), "triangles": len(scene.faces)}
         fits = all(told.get(name, count) == count for name, count in found.items())
         if fits and len(self):
-            some = self._rows[_even(len(self), 10_000)]
+            some = self._rows[one_of_each_part(len(self), 10_000)]
             points = np.stack([some[axis] for axis in "xyz"], axis=1, dtype=np.float64)
             low, high = scene.bounds + scene.origin
             room = 0.01 * np.linalg.norm(high - low) + 1.0
@@ -141,19 +142,6 @@ class ResultFile:
             return np.full(len(positions), np.nan)
         sensor = self._sensors[(scans // self._steps).clip(0, len(self._sensors) - 1)]
         return np.asarray(np.linalg.norm(positions - sensor, axis=1))
-
-
-def _even(count: int, most: int) -> NDArray[np.int64]:
-    """At most so many of the numbers up to `count`, one out of each of equal parts.
-
-    Which of each part is left to chance, the same each time: every n-th point could always be
-    of the same ring.
-    """
-    if count <= most:
-        return np.arange(count)
-    edges = np.linspace(0, count, most + 1)
-    chance = np.random.default_rng(0).random(most)
-    return (edges[:-1] + chance * np.diff(edges)).astype(np.int64)
 
 
 def _cloud_in(path: Path) -> Path:

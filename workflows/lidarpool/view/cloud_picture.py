@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.colors import Normalize
 from numpy.typing import ArrayLike, NDArray
 
+from ..choice import one_of_each_part
 from ..errors import LidarpoolError
 from ..scene import Scene
 from .captions import facts, without_common_prefix
@@ -133,7 +134,7 @@ def _thinned(positions: ArrayLike, objects: ArrayLike | None) -> tuple[Floats, I
             f"number for each of the {len(points)} points."
         )
     keep = np.flatnonzero(np.isfinite(points).all(axis=1))
-    keep = keep[np.linspace(0, len(keep) - 1, min(len(keep), MOST_POINTS)).astype(np.int64)]
+    keep = keep[one_of_each_part(len(keep), MOST_POINTS)]
     return points[keep], None if owners is None else owners[keep].astype(np.int64), len(points)
 
 
