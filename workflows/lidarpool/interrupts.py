@@ -72,11 +72,12 @@ def deferred_interrupts() -> Iterator[None]:
         return
     seen: list[int] = []
     before = {n: signal.getsignal(n) for n in _SIGNALS}
-    # What raises nothing any more cannot break the body, and somebody is impatient.
+    # What raises nothing any more cannot break the body, and somebody is impatient. What a
+    # program around this interpreter has installed (None) could not be put back.
     held = [
         number
         for number, handler in before.items()
-        if handler is not signal.SIG_IGN and getattr(handler, "first_at", None) is None
+        if handler not in (None, signal.SIG_IGN) and getattr(handler, "first_at", None) is None
     ]
     for number in held:
         signal.signal(number, lambda number, _: seen.append(number))
