@@ -63,6 +63,10 @@ async def _open(name: str, owner: str, state: dict[str, Any], dask_scheduler: An
     variables = dask_scheduler.extensions["variables"]
     if name in queues.queues or name in variables.variables:
         return False
+    if owner not in dask_scheduler.clients:
+        # It was killed, and its last question is read after that was seen: nobody would take
+        # the pipe away, nor hear the answer.
+        return False
     # Without `maxsize`: see `Pipe.put`.
     queues.create(name=name)
     note_owner(dask_scheduler, name, owner, _forget)

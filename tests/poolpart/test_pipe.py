@@ -12,7 +12,7 @@ from distributed import Client
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from poolpart import Partition, Pipe, PipeClosed, PipeFailed, forget_pipes
+from poolpart import Partition, Pipe, PipeClosed, PipeFailed, forget_pipes, pipe_parts
 from poolpart import pipe as pipe_module
 
 LONG_S = 30.0  # for what happens at once, or the test fails
@@ -430,3 +430,11 @@ def test_two_pipes_of_one_name(client, make_pipe):
     assert pipe.get() == "mine"
     pipe.delete()
     assert again(pipe).create().depth == 0
+
+
+def test_a_pipe_of_a_client_that_has_left_is_not_made(client):
+    """One that was killed while it asked may be known to be gone before it is heard."""
+    before = known(client)
+    arguments = {"name": "late", "owner": "gone", "state": {}}
+    assert not client.run_on_scheduler(pipe_parts._open, **arguments)
+    assert known(client) == before
