@@ -170,14 +170,15 @@ def _unnamed_file() -> Iterator[Any]:
     The file that is read may change meanwhile, and a mapped one that is cut short ends the
     process. Hence a copy: in memory where the system has such files, else in a temporary one.
     """
-    memory = sys.platform == "linux"
     try:
-        with (
-            os.fdopen(os.memfd_create("ply"), "w+b") if memory else tempfile.TemporaryFile() as file
-        ):
+        with _memory_file() if sys.platform == "linux" else tempfile.TemporaryFile() as file:
             yield file
     except OSError as error:
         raise MeshFileError(f"cannot be copied to be read: {error.strerror or error}") from error
+
+
+def _memory_file() -> Any:
+    return os.fdopen(os.memfd_create("ply"), "w+b")
 
 
 class _Content:
