@@ -17,6 +17,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 
+from ..choice import one_of_each_part
 from ..plan import Plan, Planning
 from .page import FONT, Page
 from .shot import SIZE
@@ -72,7 +73,8 @@ def draw_path(
     theme = theme_for(dark)
     page = Page(size, theme)
     best = np.asarray(plan.path, dtype=np.float64)
-    others = _trial_paths(best, trials)
+    every = _trial_paths(best, trials)
+    others = [every[k] for k in one_of_each_part(len(every), MOST_TRIALS)]
     axes = page.figure.add_axes(FRAME)
     _frame(axes, page, _limits(best, others, planning, size))
     discs = [
@@ -93,12 +95,12 @@ def draw_path(
         axes.plot(*best[1:-1].T, "o", color=PATH_COLOUR, ms=2.6 * page.unit, zorder=5)
     _ends(axes, page, planning)
     page.key(_entries(page, len(others), bool(discs)), 7.4)
-    page.title("Planned path", _verdict(plan))
+    page.title("Planned path", _verdict(plan, every))
     return page.save(path)
 
 
-def _verdict(plan: Plan) -> str:
-    """Length, how it compares with the shortest, and whether it is free."""
+def _verdict(plan: Plan, trials: list[Floats]) -> str:
+    """Length, how it compares with the shortest, whether it is free, and how others fared."""
     length = f"length {plan.length:.2f} m"
     if math.isfinite(plan.shortest_possible) and plan.shortest_possible > 0:
         length += f" · shortest possible {plan.shortest_possible:.2f} m ({plan.excess:+.2%})"
@@ -106,15 +108,18 @@ def _verdict(plan: Plan) -> str:
     else:
         length += " · discs cut the target off"
     state = "collision-free" if plan.collision_free else "enters a disc"
-    return f"{length} · {state} · best of {plan.trials:,} trial{'s' * (plan.trials != 1)}"
+    best_of = f"best of {plan.trials:,} trial{'s' * (plan.trials != 1)}"
+    if len(trials) > 1:  # paths that are all alike are hidden by the best of them
+        longest = max(float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()) for path in trials)
+        best_of += f", the longest {longest:.2f} m"
+    return f"{length} · {state} · {best_of}"
 
 
 def _trial_paths(best: Floats, trials: Iterable[HasWaypoints]) -> list[Floats]:
-    """Paths (k + 2, 2) of the trials from end to end, thinned."""
+    """Paths (k + 2, 2) of the trials from end to end."""
     waypoints = [np.asarray(trial.waypoints, dtype=np.float64).reshape(-1, 2) for trial in trials]
     finite = [points for points in waypoints if np.isfinite(points).all()]
-    chosen = np.linspace(0, len(finite) - 1, min(len(finite), MOST_TRIALS)).astype(int)
-    return [np.concatenate([best[:1], finite[k], best[-1:]]) for k in chosen]
+    return [np.concatenate([best[:1], points, best[-1:]]) for points in finite]
 
 
 def _limits(

@@ -20,7 +20,8 @@ from .theme import Theme
 Floats = NDArray[np.float64]
 
 SIZE = (1600, 1000)  # pixels of a finished picture
-FRAME = (0.08, 0.09, 0.79, 0.91)  # where the scene is; legend and colour bar are right of it
+# Where the scene is: the title is above it, legend and colour bar are right of it.
+FRAME = (0.08, 0.115, 0.79, 0.91)
 
 
 @dataclass(frozen=True, eq=False)
