@@ -20,6 +20,7 @@ from .settling import LOOK_EVERY_S
 from .stats import forget_statistics
 from .steward import Steward
 
+_PATIENCE_S = 10.0  # for workers to declare what they did before, at least
 _LOOK_SHARE = 20  # the scheduler does other things for so many times as long as it looks
 _UNFINISHED = ("waiting", "queued", "no-worker", "processing")
 
@@ -89,7 +90,7 @@ async def _dissolve(steward: Steward, names: list[str] | None, timeout_s: float)
     for seat in seats:
         book.put(seat, None)
     _lift_restrictions(scheduler, gone)
-    late = await steward.settling.arrive(seats, max(timeout_s, 10.0))
+    late = await steward.settling.arrive(seats, max(timeout_s, _PATIENCE_S))
     for seat in seats:
         if not seat.holds:
             await steward.nannies.restore(seat)

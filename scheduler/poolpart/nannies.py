@@ -70,14 +70,20 @@ class Nannies:
             self._told[nanny] = wanted
 
     async def restore(self, seat: Seat) -> None:
-        """Have a worker that is not there started as it was found to be, if it comes back."""
-        if seat.nanny is None or seat.nanny not in self._told:
+        """Have a worker that is not there started as it was found to be, if it comes back.
+
+        One that is being started just now comes as before, and its nanny counts as told.
+        """
+        nanny = seat.nanny
+        if nanny is None or nanny not in self._told:
             return
-        del self._told[seat.nanny]
         try:
-            await call(self.scheduler, seat.nanny, restore_on_nanny)
+            starting = await call(self.scheduler, nanny, restore_on_nanny)
         except OSError as error:
-            logger.info("The nanny at %s is gone: %s", seat.nanny, error)
+            logger.info("The nanny at %s is gone: %s", nanny, error)
+            starting = False
+        if not starting:
+            self._told.pop(nanny, None)
 
 
 async def has_gone(nanny: str) -> bool:

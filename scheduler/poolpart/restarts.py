@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 from typing import Any
 
+from distributed import Status
+
 from .book import Resources
 
 _PATIENCE_S = 1.0
@@ -55,12 +57,19 @@ def keep_on_nanny(resources: Resources, dask_worker: Any = None) -> None:
     _start_with(nanny, dict(resources), dict(resources))
 
 
-def restore_on_nanny(dask_worker: Any = None) -> None:
-    """Have the nanny as `keep_on_nanny` found it; runs on a nanny, any number of times."""
+def restore_on_nanny(dask_worker: Any = None) -> bool:
+    """Have the nanny as `keep_on_nanny` found it; runs on a nanny, any number of times.
+
+    Returns
+    -------
+    starting
+        Whether it is starting its worker just now: that one comes as it was begun.
+    """
     nanny = dask_worker
     if hasattr(nanny, _FOUND):
         _start_with(nanny, *getattr(nanny, _FOUND))
         delattr(nanny, _FOUND)
+    return nanny.process is not None and nanny.process.status is Status.starting
 
 
 def _started_with(nanny: Any) -> Resources | None:

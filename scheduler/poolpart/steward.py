@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -56,6 +56,7 @@ class Steward(SchedulerPlugin):
         self._looked_at: Any = None  # rules and members when nobody wanted those without a place
         self._resources_before = set(scheduler.resources)
         self._missed: set[asyncio.Task[None]] = set()  # looks whether workers come back
+        self._restoring: dict[Hashable, asyncio.Task[None]] = {}  # {key of the seat: …}
         for worker in scheduler.workers.values():
             self._seat(worker)
         self._ticker = PeriodicCallback(self._tick, 1000 * TICK_S)
@@ -129,11 +130,12 @@ class Steward(SchedulerPlugin):
         self._ticker.stop()
         self.adapting.uninstall()
         self.settling.stop()
-        for task in self._missed:
+        for task in (*self._missed, *self._restoring.values()):
             task.cancel()
 
     def _tick(self) -> None:
         if not self.book.rules:
+            self._restore_nannies()
             self.remove_if_done()
             return
         self.rebalancing.look(time.monotonic())
@@ -194,11 +196,26 @@ class Steward(SchedulerPlugin):
 
     # -- the end -----------------------------------------------------------------------
 
+    def _restore_nannies(self) -> None:
+        """Let workers come back as they were found for whom nobody waits any more."""
+        for seat in self.book.seats.values():
+            if seat.key not in self._restoring and self._is_to_be_restored(seat):
+                self._restoring[seat.key] = asyncio.ensure_future(self._restore(seat))
+
+    async def _restore(self, seat: Seat) -> None:
+        while self._is_to_be_restored(seat):
+            await self.nannies.restore(seat)
+            await asyncio.sleep(10 * TICK_S)
+        del self._restoring[seat.key]
+
+    def _is_to_be_restored(self, seat: Seat) -> bool:
+        return seat.absent_since is not None and not seat.holds and self.nannies.was_told(seat)
+
     def _at_rest(self, seat: Seat) -> bool:
         """Whether nothing is left to do for a worker, or its nanny, which may start it again."""
         if seat.absent_since is None:
             return self.settling.settled(seat)
-        return not seat.holds or not self.nannies.was_told(seat)
+        return not self.nannies.was_told(seat)
 
     def remove_if_done(self) -> None:
         """Leave the scheduler, once there are no partitions and all workers are as they were."""

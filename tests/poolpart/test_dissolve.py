@@ -310,3 +310,28 @@ def test_a_scheduler_with_many_tasks_is_not_kept_from_them_by_looking(monkeypatc
     with pytest.raises(PoolError, match="1 tasks of A have not ended after 10 s"):
         asyncio.run(asked)
     assert clock.looked < 0.1 * clock.now < 1.1
+
+
+def start_slowly(dask_worker):
+    """Have a nanny's worker need some seconds to start, from now on."""
+    slow = ["import time; time.sleep(4)"]
+    dask_worker.preload = dask_worker.process.worker_kwargs["preload"] = slow
+
+
+def test_a_worker_that_comes_back_when_nobody_expects_it_is_as_it_was(
+    nannies, wait_until, monkeypatch
+):
+    """Its place has been given up by then, and there is no partition any more."""
+    part = Pool.from_client(nannies).divide({"A": rest()})["A"]
+    victim = part.workers[0]
+    nannies.run(start_slowly, nanny=True)
+    monkeypatch.setattr("poolpart.book.HOLD_S", 1.0)
+    monkeypatch.setattr(dissolve, "_PATIENCE_S", 0.2)
+    os.kill(nannies.run(os.getpid, workers=[victim.address])[victim.address], signal.SIGKILL)
+    wait_until(lambda: len(part.workers) == 1)
+    with pytest.raises(PoolError, match="did not answer while A were dissolved; they become what"):
+        part.dissolve(timeout_s=0.1)
+    nannies.wait_for_workers(2, timeout=LONG_S)
+    wait_until(lambda: steward.NAME not in nannies.cluster.scheduler.plugins)
+    assert set(map(str, declared(nannies).values())) == {"{}"}
+    assert {told[1] for told in nannies.run(_on_nanny, nanny=True).values()} == {None}
