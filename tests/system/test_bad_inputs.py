@@ -453,6 +453,13 @@ def test_info_of_a_cluster_without_workers(cluster, lidarpool):
     assert "has no workers" in outcome.err
 
 
+def test_info_lists_the_workers(cluster, lidarpool):
+    outcome = lidarpool("info", "--scheduler", cluster({"GPU": 1}, {"LIDAR": 4}))
+    lines = outcome.out[outcome.out.index("cluster:") :].splitlines()
+    assert lines[0] == "cluster: 2 workers on 1 host"
+    assert [line.split()[0] for line in lines[1:]] == ["GPU=1", "LIDAR=4"]
+
+
 WITHOUT_LIDARPOOL = """
 import sys
 

@@ -141,7 +141,7 @@ def test_all_reasons_are_given_at_once(check, tmp_path, monkeypatch):
 def test_a_backend_that_is_not_here(check, monkeypatch):
     outcome = check("--backend", "cuad")
     assert outcome.code == 2 and "Did you mean 'cuda'?" in outcome.err
-    assert "backend     none" in outcome.out
+    assert "backend     none yet" in outcome.out
 
 
 def test_a_mistake_in_the_scenario(check):
@@ -241,6 +241,15 @@ def test_a_sensor_within_an_object(pose, hidden, check, tmp_path):
     outcome = check(text=f"scene: [my box.stl]\nposes: [[{pose}]]\n")
     assert outcome.code == 0
     assert (f"from ({pose}) nearly all that is seen are backs" in outcome.out) == hidden
+
+
+@pytest.mark.parametrize(("heights", "above"), [((1, 2), True), ((-1, 1), False), ((2, 3), False)])
+def test_a_sensor_above_the_ceiling_of_the_room(heights, above, check, tmp_path):
+    box(tmp_path, (8, 6, 3))  # from -1.5 to 1.5 m
+    low, high = heights
+    outcome = check(text=f"scene: [my box.stl]\nposes: [[1, 0, {low}], [1, 0, {high}]]\n")
+    said = f"something is between (1, 0, {low}) and (1, 0, {high}): if it is a ceiling"
+    assert outcome.code == 0 and (said in outcome.out) == above
 
 
 @pytest.mark.parametrize(("moved", "coarse"), [("stored", True), ("by the scenario", False)])

@@ -110,7 +110,7 @@ def told(made: Forecast) -> Iterator[str]:
             f"{sample.rays:,} rays cast here with {sample.backend}"
         )
     yield f"planning    {f'{planning.trials:,} trials' if planning else 'none'}"
-    yield f"backend     {made.backend or 'none'}" + (" (auto)" if job.backend == "auto" else "")
+    yield f"backend     {made.backend or 'none yet'}" + (" (auto)" if job.backend == "auto" else "")
     for name, (needed, there) in made.slots.items():
         yield f"{name:<10}  {there:,} slot{'s' * (there != 1)}, at least {needed:,} needed"
     if needs is not None:

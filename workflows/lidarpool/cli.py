@@ -9,7 +9,7 @@ from typing import Any, NoReturn, TypeVar
 
 import click
 
-from poolpart import Pool, PoolError
+from poolpart import Pool, PoolError, WorkerInfo
 from poolpart.probe import visible_gpus
 from raybeam import available_backends
 
@@ -176,13 +176,23 @@ def info(
 
 
 def _tell_workers(pool: Pool) -> None:
-    click.echo(f"{pool!r}")
+    hosts = len({worker.host for worker in pool})
+    click.echo(
+        f"cluster: {len(pool)} worker{'s' * (len(pool) != 1)} on {hosts} host{'s' * (hosts != 1)}"
+    )
     for worker in sorted(pool, key=lambda worker: (sorted(worker.resources), worker.name)):
         held = ", ".join(f"{name}={slots:g}" for name, slots in sorted(worker.resources.items()))
         click.echo(
-            f"  {held or 'no partition':<12} {worker.name}  {worker.address}  "
-            f"{worker.nthreads} threads  {worker.memory / 2**30:.1f} GiB  {len(worker.gpus)} GPUs"
+            f"  {held or 'no partition':<12} {_called(worker)}  {worker.nthreads} "
+            f"thread{'s' * (worker.nthreads != 1)}  {worker.memory / 2**30:.1f} GiB  "
+            f"{len(worker.gpus) or 'no'} GPU{'s' * (len(worker.gpus) > 1)}"
         )
+
+
+def _called(worker: WorkerInfo) -> str:
+    """Address of a worker, after its name if it was given one."""
+    named = worker.name != worker.address
+    return f"{worker.name}  {worker.address}" if named else worker.address
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 
 import numpy as np
 
+from .floor import between
 from .sampling import Sample
 from .scene import Scene
 from .survey import Survey
@@ -15,6 +17,7 @@ from .survey import Survey
 LARGE_M = 500.0
 SMALL_M = 0.2
 
+_RAISED = 100  # poses that are looked at for ceilings between them
 _SHOWN = 3  # names or poses that a note lists
 
 
@@ -50,6 +53,7 @@ def doubts(
             f"steps of {in_metres(step)} m: export the mesh nearer to zero, and move it with "
             "translation in scene.files"
         )
+    yield from _ceilings(scene, survey)
     if sample is None:
         return
     if not sample.hits:
@@ -61,9 +65,25 @@ def doubts(
     if sample.behind:
         places = [_point(survey.poses[i].position + scene.origin) for i in sample.behind]
         yield (
-            f"from {_listed(places)} nearly all that is seen are backs of triangles: the sensor "
-            "may stand within an object or below the ground; if so, give other poses"
+            f"from {_listed(places)} nearly all that is seen are backs of triangles, as in a "
+            "room that is drawn as a solid box: if the sensor should not stand within something, "
+            "or below the ground, give other poses"
         )
+
+
+def _ceilings(scene: Scene, survey: Survey) -> Iterator[str]:
+    """Note sensors that are raised at one place until they stand on another floor.
+
+    The heights of sensors for which no poses are given fit a hall, and not every room.
+    """
+    at = sorted((pose.position + scene.origin).tolist() for pose in survey.poses[:_RAISED])
+    for lower, upper in pairwise(at):
+        if lower[:2] == upper[:2] and between(scene, lower[0], lower[1], lower[2], upper[2]):
+            yield (
+                f"something is between {_point(np.array(lower))} and {_point(np.array(upper))}: "
+                "if it is a ceiling and the sensor should be below it, give other poses"
+            )
+            return
 
 
 def _listed(words: Sequence[str]) -> str:
