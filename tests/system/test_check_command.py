@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections import namedtuple
 from collections.abc import Callable, Iterator
@@ -166,6 +167,7 @@ def test_an_unfinished_run_is_told_of(check, tmp_path):
 
 def test_a_cluster_that_can_do_it(check, cluster):
     outcome = check("--scheduler", cluster, "--no-plan")
+    assert re.search(r"^memory .* in a GPU worker; the driver [\d.]+ MB$", outcome.out, re.M)
     assert outcome.code == 0, outcome.err
     assert "LIDAR       4 slots, at least 4 needed" in outcome.out
     assert "no GPU in partition GPU" in outcome.out

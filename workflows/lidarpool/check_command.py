@@ -115,10 +115,14 @@ def told(made: Forecast) -> Iterator[str]:
         yield f"{name:<10}  {there:,} slot{'s' * (there != 1)}, at least {needed:,} needed"
     if needs is not None:
         limit = f" of {in_bytes(made.memory)}" if made.memory else ""
-        yield (
-            f"memory      about {in_bytes(made.memory_needed)}{limit}; a GPU worker "
-            f"{in_bytes(needs.gpu_worker)}, the driver {in_bytes(needs.driver)}"
-        )
+        whole = f"memory      about {in_bytes(made.memory_needed)}{limit}"
+        if made.memory_needed == needs.gpu_worker:  # another cluster's, whose workers differ
+            yield f"{whole} in a GPU worker; the driver {in_bytes(needs.driver)}"
+        else:
+            yield (
+                f"{whole}; a GPU worker {in_bytes(needs.gpu_worker)}, "
+                f"the driver {in_bytes(needs.driver)}"
+            )
         result = needs.cloud + needs.pictures
         yield (
             f"disk        about {in_bytes(needs.journal)} meanwhile and {in_bytes(result)} for "
