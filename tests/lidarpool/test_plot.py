@@ -245,6 +245,7 @@ def test_a_result_without_a_plan(unplanned, tmp_path):
     [
         (["--out", "all.png"], r"all\.png is one file, for 4 pictures: choose one with --only"),
         (["--only", "path", "--out", "p.png", "--format", "pdf"], r"ends in \.png.*is pdf: drop"),
+        (["--only", "cloud", "--out", "c.JPG"], r"c\.JPG ends in \.jpg, .* ends in \.png or \.pdf"),
         (["--out", "file/below"], r"file.below cannot be made"),
         (["--only", "path", "--out", "none/p.png"], r"picture .*p\.png could not be written"),
     ],

@@ -15,6 +15,8 @@ from .ply import read_positions
 
 CLOUD = "cloud.ply"
 FORMATS = ("png", "pdf")
+# Endings of pictures that one may ask for in vain, rather than of folders.
+OTHER_FORMATS = frozenset({"eps", "gif", "jpeg", "jpg", "ps", "svg", "tif", "tiff", "webp"})
 SIDE_LEAST, SIDE_MOST = 480, 4096  # letters need some pixels; each takes 0.4 kB of memory
 SIDES_RATIO = 2  # at most, or legends do not fit
 
@@ -143,6 +145,11 @@ def _targets(names: list[str], dark: bool, kind: str | None, out: Path) -> list[
         if kind not in (None, ending):
             raise LidarpoolError(f"{out} ends in .{ending}, and --format is {kind}: drop one.")
         return [(names[0], out)]
+    if ending in OTHER_FORMATS and not out.is_dir():
+        raise LidarpoolError(
+            f"{out} ends in .{ending}, which is not drawn: give a file that ends in "
+            f"{' or '.join(f'.{name}' for name in FORMATS)}, or a folder."
+        )
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
