@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator, Sequence
-from itertools import pairwise
 
 import numpy as np
 
@@ -17,8 +16,8 @@ from .survey import Survey
 LARGE_M = 500.0
 SMALL_M = 0.2
 
-_RAISED = 100  # poses that are looked at for ceilings between them
-_SHOWN = 3  # names or poses that a note lists
+_LOOKED_AT = 100  # poses, for ceilings between them
+_SHOWN = 3  # names or poses that a note lists; places that are looked at
 
 
 def doubts(
@@ -76,12 +75,17 @@ def _ceilings(scene: Scene, survey: Survey) -> Iterator[str]:
 
     The heights of sensors for which no poses are given fit a hall, and not every room.
     """
-    at = sorted((pose.position + scene.origin).tolist() for pose in survey.poses[:_RAISED])
-    for lower, upper in pairwise(at):
-        if lower[:2] == upper[:2] and between(scene, lower[0], lower[1], lower[2], upper[2]):
+    heights: dict[tuple[float, float], list[float]] = {}  # {place: of the sensors there}
+    for pose in survey.poses[:_LOOKED_AT]:
+        x, y, z = (pose.position + scene.origin).tolist()
+        heights.setdefault((x, y), []).append(z)
+    raised = [(place, min(zs), max(zs)) for place, zs in heights.items() if len(zs) > 1]
+    for (x, y), low, high in raised[:_SHOWN]:
+        if between(scene, x, y, low, high):
             yield (
-                f"something is between {_point(np.array(lower))} and {_point(np.array(upper))}: "
-                "if it is a ceiling and the sensor should be below it, give other poses"
+                f"something is between {_point(np.array((x, y, low)))} and "
+                f"{_point(np.array((x, y, high)))}: if it is a ceiling and the sensor should be "
+                "below it, give other poses"
             )
             return
 
