@@ -17,11 +17,17 @@ SURVEY = Survey(Sensor(rays_per_revolution=180, layers=4, step_deg=5), [(0, 0, 1
 def test_they_run_one_after_the_other(cluster, left_over):
     """If each had some of the slots, all would wait for each other for ever."""
     results: list[Result] = []
+    waited: set[str] = set()
 
     def run(go: threading.Barrier) -> None:
         with Client(cluster, set_as_default=False) as client:
             go.wait()
-            results.append(simulate(Scene.seed(), SURVEY, client=client, backend="numpy"))
+            results.append(
+                simulate(
+                    Scene.seed(), SURVEY, client=client, backend="numpy",
+                    on_progress=lambda progress: waited.add(progress.waits_for),
+                )
+            )  # fmt: skip
 
     for _ in range(3):
         go = threading.Barrier(3)
@@ -33,6 +39,7 @@ def test_they_run_one_after_the_other(cluster, left_over):
             assert not thread.is_alive(), "it waits for slots"
     assert len(results) == 9
     assert all(np.array_equal(results[0].hit_counts, other.hit_counts) for other in results)
+    assert waited == {"", "LIDAR"}
     assert any("until other runs had left it 4 slots" in n for r in results for n in r.notes)
     with Client(cluster, set_as_default=False) as client:
         assert left_over(client) == ([], [], [])

@@ -215,6 +215,7 @@ class Run:
             seconds=seconds,
             replayed=survey.replayed,
             paused=self.standstill.still,
+            waits_for=survey.waits_for,
         )
 
 

@@ -107,14 +107,14 @@ class PlainLines:
         self._next = PLAIN_EVERY_S[0]  # seconds since the start at which to tell again
         self._survey, self._planning = _Pace(), _Pace()
         self._done: set[str] = set()
-        self._paused = False
+        self._standing = ""  # what was said of it
 
     def __call__(self, progress: Progress) -> None:
         """Write what is new, if it is time or something has been completed."""
         now = progress.seconds
         self._survey.add(now, progress.collected)
         self._planning.add(now, progress.trials_done)
-        self._tell_pause(progress)
+        self._tell_standing(progress)
         due = now >= self._next and not progress.paused
         if due:
             least, most = PLAIN_EVERY_S
@@ -138,10 +138,15 @@ class PlainLines:
                 progress.trials_done == progress.trials,
             )
 
-    def _tell_pause(self, progress: Progress) -> None:
-        if progress.paused != self._paused:
-            self._paused = progress.paused
-            words = "paused from the live page" if self._paused else "goes on"
+    def _tell_standing(self, progress: Progress) -> None:
+        standing = ""
+        if progress.paused:
+            standing = "paused from the live page"
+        elif progress.waits_for:
+            standing = f"waits for slots of {progress.waits_for}, which other runs hold"
+        if standing != self._standing:
+            self._standing = standing
+            words = standing or "goes on"
             _tell(self.stream, f"run     {words}, {progress.collected:,} scans are done")
 
     def _line(self, what: str, due: bool, whole: str, part: str, pace: str, done: bool) -> None:
@@ -215,13 +220,20 @@ class _Left(TextColumn):
         super().__init__("")
 
     def render(self, task: Bar) -> Text:
-        if task.fields["paused"] and not task.finished:
-            return Text("paused", style="bold yellow")
+        if task.fields["standing"] and not task.finished:
+            return Text(task.fields["standing"], style="bold yellow")
         if task.finished:
             return Text(f"in {task.finished_time or 0:.1f} s", style="progress.elapsed")
         left = task.time_remaining
         words = "" if left is None else f"{time_in_words(left)} left"
         return Text(words, style="progress.remaining")
+
+
+def _standing(progress: Progress, what: str) -> str:
+    """Why no more scans or trials come, in few words; empty where they do."""
+    if progress.paused:
+        return "paused"
+    return f"waits for {progress.waits_for}" if progress.waits_for and what == "scans" else ""
 
 
 @contextmanager
@@ -241,9 +253,9 @@ def _bars(console: Console) -> Iterator[Show]:
             for label, done, total in _BARS:
                 whole = getattr(progress, total)
                 if whole and label not in lines:
-                    lines[label] = bars.add_task(label, total=whole, unit=total, paused=False)
+                    lines[label] = bars.add_task(label, total=whole, unit=total, standing="")
                 if label in lines:
-                    done_now = getattr(progress, done)
-                    bars.update(lines[label], completed=done_now, paused=progress.paused)
+                    done_now, standing = getattr(progress, done), _standing(progress, total)
+                    bars.update(lines[label], completed=done_now, standing=standing)
 
         yield show

@@ -161,6 +161,8 @@ class LiveRun:
         left = self._kept is not None and self._scene.draw(self._kept, self._over)
         words = self._words
         if not self._over:
+            if self._progress is not None and self._progress.waits_for:
+                words = f"waiting for slots of {self._progress.waits_for}"
             words = "stopping" if self.control.stopped else words
             if self.control.paused and self._progress is not None:
                 words = "paused" if self._progress.paused else "pausing"

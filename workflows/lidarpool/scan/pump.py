@@ -177,6 +177,11 @@ class SurveyPump:
         return self._resumed + self._handover.cast
 
     @property
+    def waits_for(self) -> str:
+        """Partition whose slots other runs hold, so that the stages cannot start; else empty."""
+        return self._stages.partition.name if self._stages.waiting else ""
+
+    @property
     def records(self) -> list[TaskRecord]:
         """Tasks of this run, of many a selection; `book` has the totals."""
         return self.book.records

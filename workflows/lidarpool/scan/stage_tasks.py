@@ -79,7 +79,9 @@ class StageTasks:
         self._tasks: dict[str, _Task] = {}
         self._submitted = 0
         self._looked_at = 0.0
-        self._begun = self._enough_at = time.monotonic()  # the latter: slots, free or not
+        self._enough_at = time.monotonic()  # slots, free or not
+        self._refused_at: float | None = None  # first, because other runs held them
+        self.waiting = False  # for slots that others hold, to start with
         self.notes: list[str] = []  # what a user should know
 
     @property
@@ -108,17 +110,19 @@ class StageTasks:
         keys = self._first_keys
         claim = claim_slots(self.client, self.partition.name, keys)
         now = time.monotonic()
+        self.waiting = not claim.granted and claim.slots >= len(keys)
         if claim.granted:
             free = dict(claim.free)
-            if (waited := now - self._begun) > LOOK_EVERY_S:
+            if self._refused_at is not None:
                 self.notes.append(
-                    f"the survey waited {waited:.1f} s for partition {self.partition.name}, "
+                    f"the survey waited {now - self._refused_at:.1f} s for partition {self.partition.name}, "
                     f"until other runs had left it {len(keys)} slots"
                 )
             for name in self._commands:
                 self._submit(name, free)
-        elif claim.slots >= len(keys):
-            self._enough_at = now  # others hold them, and are waited for
+        elif self.waiting:
+            self._refused_at = self._refused_at or now
+            self._enough_at = now
         elif now - self._enough_at > watch.PATIENCE_S:
             raise LidarpoolError(
                 f"Partition {self.partition.name!r} has had {claim.slots} of the {len(keys)} "
