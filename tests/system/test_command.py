@@ -337,6 +337,17 @@ def test_plain_lines_tell_of_a_wait_for_other_runs():
 
 
 @pytest.mark.parametrize(
+    ("done", "after_s", "sure"), [(1, 2.0, False), (5, 2.0, True), (1, 30.0, True)]
+)
+def test_time_left_is_told_when_enough_is_known(done, after_s, sure):
+    stream = StringIO()
+    show = PlainLines(stream)
+    show(progress(0.0, 0, 1))
+    show(progress(after_s, done, 1))
+    assert ("/s" in stream.getvalue(), " left" in stream.getvalue()) == (True, sure)
+
+
+@pytest.mark.parametrize(
     ("seconds", "words"),
     [(0, "0 s"), (99, "99 s"), (101, "2 min"), (5900, "98 min"), (7500, "2 h 05 min")],
 )

@@ -27,6 +27,10 @@ from .progress import Progress
 PLAIN_EVERY_S = (2.0, 60.0)
 WINDOW_S = 10.0  # that rates are taken over
 
+# The first items are slow, as workers warm up: what is left is told after this share of them, or
+# after this time.
+SURE_SHARE, SURE_S = 0.05, 20.0
+
 # Label, the count so far and the total of each bar.
 _BARS: tuple[tuple[str, str, str], ...] = (
     ("1 generate", "generated", "scans"),
@@ -179,8 +183,14 @@ class _Pace:
         """Rate and time left as the end of a line; empty as long as nothing has come."""
         if not self.rate:
             return ""
-        left = (whole - self._seen[-1][1]) / self.rate
-        return f"  {in_words(self.rate)}/s  {time_in_words(left)} left"
+        seconds, count = self._seen[-1]
+        left = f"  {time_in_words((whole - count) / self.rate)} left"
+        return f"  {in_words(self.rate)}/s{left if is_sure(count, whole, seconds) else ''}"
+
+
+def is_sure(count: float, whole: float, seconds: float) -> bool:
+    """Whether enough is done, after so many seconds, to say how long the rest will take."""
+    return count >= SURE_SHARE * whole or seconds >= SURE_S
 
 
 def in_words(rate: float) -> str:
@@ -225,8 +235,9 @@ class _Left(TextColumn):
         if task.finished:
             return Text(f"in {task.finished_time or 0:.1f} s", style="progress.elapsed")
         left = task.time_remaining
-        words = "" if left is None else f"{time_in_words(left)} left"
-        return Text(words, style="progress.remaining")
+        if left is None or not is_sure(task.completed, task.total or 0, task.elapsed or 0):
+            return Text("")
+        return Text(f"{time_in_words(left)} left", style="progress.remaining")
 
 
 def _standing(progress: Progress, what: str) -> str:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from html import escape
 
 from ..progress import Progress
-from ..terminal import in_words, time_in_words
+from ..terminal import in_words, is_sure, time_in_words
 
 WINDOW_S = 10.0  # that rates are taken over
 
@@ -98,7 +98,8 @@ class RunPanel:
         came = getattr(last, count) - getattr(first, count)
         if done < whole and came and span > 0:
             rate = came / span
-            pace = f"{in_words(rate)}/s, {time_in_words((whole - done) / rate)} left"
+            left = f", {time_in_words((whole - done) / rate)} left"
+            pace = f"{in_words(rate)}/s{left if is_sure(done, whole, last.seconds) else ''}"
         return (
             '<div style="display:flex;gap:0.6em;margin-top:0.35em">'
             f'<span style="flex:1">{label}</span><span style="opacity:0.65">{pace}</span>'

@@ -115,8 +115,8 @@ class StageTasks:
             free = dict(claim.free)
             if self._refused_at is not None:
                 self.notes.append(
-                    f"the survey waited {now - self._refused_at:.1f} s for partition {self.partition.name}, "
-                    f"until other runs had left it {len(keys)} slots"
+                    f"the survey waited {now - self._refused_at:.1f} s for partition "
+                    f"{self.partition.name}, until other runs had left it {len(keys)} slots"
                 )
             for name in self._commands:
                 self._submit(name, free)
