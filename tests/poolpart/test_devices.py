@@ -6,6 +6,7 @@ import signal
 import subprocess
 from collections import Counter
 from types import SimpleNamespace
+from unittest.mock import patch
 
 import dask
 import pytest
@@ -183,7 +184,12 @@ def nameless(tmp_path):
         for nanny in nannies:
             await nanny.close()
 
-    with SpecCluster(scheduler=scheduler, silence_logs=QUIET) as cluster, Client(cluster) as client:
+    # Nannies leave the variables of their workers in this process as well.
+    with (
+        patch.dict(os.environ),
+        SpecCluster(scheduler=scheduler, silence_logs=QUIET) as cluster,
+        Client(cluster) as client,
+    ):
         nannies = client.sync(make, client.scheduler.address)
         try:
             yield client
