@@ -14,8 +14,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import replace
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +25,7 @@ from distributed import Client
 import lidarpool.output
 from lidarpool import LidarpoolError, read_cloud, simulate
 from lidarpool.output import FILES, result_folder, write_result
-from lidarpool.progress import Progress
 from lidarpool.scenario import Scenario
-from lidarpool.terminal import PlainLines, time_in_words
 
 WAREHOUSE = Path(__file__).parents[3] / "shared" / "scenes" / "warehouse.glb"
 COMMAND = [sys.executable, "-c", "from lidarpool.cli import main; main()"]
@@ -272,87 +268,6 @@ def test_a_dumb_terminal_gets_lines(tmp_path, cluster):
     assert code == 0
     assert "survey  done: 108 scans" in drawn
     assert "\x1b" not in drawn
-
-
-# -- lines ---------------------------------------------------------------------------------------
-
-
-def progress(seconds: float, scans: int, trials: int = 0) -> Progress:
-    return Progress(100, scans, scans, scans, scans, 7 * scans, 10, trials, seconds)
-
-
-def test_plain_lines_come_seldom_and_tell_rate_and_time_left():
-    stream = StringIO()
-    show = PlainLines(stream)
-    for tenth in range(0, 51):
-        show(progress(tenth / 10, 2 * tenth))
-    lines = [line[10:] for line in stream.getvalue().splitlines()]
-    assert lines == [
-        "survey  40 of 100 scans (generated 40, cast 40, sorted 40)  20/s  3 s left",
-        "plan    0 of 10 trials",
-        "survey  80 of 100 scans (generated 80, cast 80, sorted 80)  20/s  1 s left",
-        "plan    0 of 10 trials",
-        "survey  done: 100 scans, 700 points in 5.0 s",
-    ]
-
-
-def test_plain_lines_say_once_that_something_is_done():
-    stream = StringIO()
-    show = PlainLines(stream)
-    for second in range(600):
-        show(progress(float(second), 100, min(10, second // 60)))
-    text = stream.getvalue()
-    assert text.count("survey") == text.count("survey  done") == 1
-    assert text.count("plan    done") == 0 and 20 < text.count("plan") < 60  # once a minute at last
-    show(progress(600.0, 100, 10))
-    show(progress(601.0, 100, 10))
-    assert stream.getvalue().count("plan    done: 10 trials in 600.0 s") == 1
-
-
-def test_plain_lines_tell_of_a_pause_and_are_silent_in_it():
-    stream = StringIO()
-    show = PlainLines(stream)
-    show(progress(1.0, 10))
-    for second in range(2, 100):
-        show(replace(progress(float(second), 20), paused=True))
-    show(progress(100.0, 40))
-    lines = [line[10:] for line in stream.getvalue().splitlines()]
-    assert lines[:2] == [
-        "run     paused from the live page, 20 scans are done",
-        "run     goes on, 40 scans are done",
-    ]
-    assert [line[:6] for line in lines[2:]] == ["survey", "plan  "]
-
-
-def test_plain_lines_tell_of_a_wait_for_other_runs():
-    stream = StringIO()
-    show = PlainLines(stream)
-    for second in range(2):
-        show(replace(progress(float(second), 0, 1), waits_for="LIDAR"))
-    show(progress(1.5, 40, 1))
-    assert [line[10:] for line in stream.getvalue().splitlines()] == [
-        "run     waits for slots of LIDAR, which other runs hold, 0 scans are done",
-        "run     goes on, 40 scans are done",
-    ]
-
-
-@pytest.mark.parametrize(
-    ("done", "after_s", "sure"), [(1, 2.0, False), (5, 2.0, True), (1, 30.0, True)]
-)
-def test_time_left_is_told_when_enough_is_known(done, after_s, sure):
-    stream = StringIO()
-    show = PlainLines(stream)
-    show(progress(0.0, 0, 1))
-    show(progress(after_s, done, 1))
-    assert ("/s" in stream.getvalue(), " left" in stream.getvalue()) == (True, sure)
-
-
-@pytest.mark.parametrize(
-    ("seconds", "words"),
-    [(0, "0 s"), (99, "99 s"), (101, "2 min"), (5900, "98 min"), (7500, "2 h 05 min")],
-)
-def test_time_in_words(seconds, words):
-    assert time_in_words(seconds) == words
 
 
 # -- the output folder ---------------------------------------------------------------------------

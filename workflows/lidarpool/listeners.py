@@ -48,6 +48,7 @@ class _Listener(io.RawIOBase):
         return True
 
     def write(self, data: Any) -> int | None:  # anything with a buffer
+        """Write bytes, or drop them once nobody takes any; returns how many were taken."""
         size = memoryview(data).nbytes
         if self._gone:
             return size

@@ -33,6 +33,7 @@ def shown_on_page(client: Client, wanted: bool, show: Show) -> Iterator[Show]:
     told = float("-inf")
 
     def tell(progress: Progress) -> None:
+        """Show the progress, and tell the page of it now and then."""
         nonlocal told
         if time.monotonic() - told >= TELL_EVERY_S:
             told = time.monotonic()

@@ -219,6 +219,7 @@ class _Rate(TextColumn):
         super().__init__("")
 
     def render(self, task: Bar) -> Text:
+        """Write it for a bar; empty as long as nothing is known."""
         speed = task.finished_speed or task.speed
         return Text(f"{in_words(speed)}/s" if speed else "", style="progress.data.speed")
 
@@ -230,6 +231,7 @@ class _Left(TextColumn):
         super().__init__("")
 
     def render(self, task: Bar) -> Text:
+        """Write it for a bar, or why the bar stands still."""
         if task.fields["standing"] and not task.finished:
             return Text(task.fields["standing"], style="bold yellow")
         if task.finished:
@@ -261,6 +263,7 @@ def _bars(console: Console) -> Iterator[Show]:
         lines: dict[str, TaskID] = {}
 
         def show(progress: Progress) -> None:
+            """Move the bars; one appears when its total is known."""
             for label, done, total in _BARS:
                 whole = getattr(progress, total)
                 if whole and label not in lines:

@@ -50,7 +50,28 @@ def coloured_triangles(
     rgba = np.full((count, 4), 255, np.uint8)  # four bytes each, as the format has them aligned
     rgba[:, :3] = np.repeat(_LINEAR[colours], 3, axis=0)
     places, paints = np.ascontiguousarray(flat, "<f4").tobytes(), rgba.tobytes()
-    described = {
+    described = _described(flat, parts, split, lit)
+    text = json.dumps(described).encode()
+    text += b" " * (-len(text) % 4)
+    size = _HEAD.size + 2 * _CHUNK.size + len(text) + len(places) + len(paints)
+    return b"".join(
+        (
+            _HEAD.pack(b"glTF", 2, size),
+            _CHUNK.pack(len(text), _JSON),
+            text,
+            _CHUNK.pack(len(places) + len(paints), _BINARY),
+            places,
+            paints,
+        )
+    )
+
+
+def _described(
+    flat: NDArray[np.float32], parts: list[tuple[int, int]], split: int, lit: bool
+) -> dict[str, Any]:
+    """Describe corners (n, 3) in parts (first, end); those from `split` on have one side."""
+    places, paints = 12 * len(flat), 4 * len(flat)  # bytes
+    return {
         "asset": {"version": "2.0"},
         "extensionsUsed": [] if lit else [_UNLIT],
         "scene": 0,
@@ -79,24 +100,11 @@ def coloured_triangles(
             accessor for first, end in parts for accessor in _accessors(flat[first:end], first)
         ],
         "bufferViews": [
-            {"buffer": 0, "byteLength": len(places)},
-            {"buffer": 0, "byteOffset": len(places), "byteLength": len(paints)},
+            {"buffer": 0, "byteLength": places},
+            {"buffer": 0, "byteOffset": places, "byteLength": paints},
         ],
-        "buffers": [{"byteLength": len(places) + len(paints)}],
+        "buffers": [{"byteLength": places + paints}],
     }
-    text = json.dumps(described).encode()
-    text += b" " * (-len(text) % 4)
-    size = _HEAD.size + 2 * _CHUNK.size + len(text) + len(places) + len(paints)
-    return b"".join(
-        (
-            _HEAD.pack(b"glTF", 2, size),
-            _CHUNK.pack(len(text), _JSON),
-            text,
-            _CHUNK.pack(len(places) + len(paints), _BINARY),
-            places,
-            paints,
-        )
-    )
 
 
 def _accessors(corners: NDArray[np.float32], first: int) -> list[dict[str, Any]]:

@@ -179,6 +179,7 @@ def _expose(
     """Cast one ray through each pixel, light the surfaces, and look closer along edges."""
 
     def see(pixels: Floats) -> Samples:
+        """Look through places (n, 2) of the picture, in pixels."""
         directions = camera.rays(pixels)
         hits = None
         if surface is not None:
