@@ -48,7 +48,7 @@ def run(client, path, total=24):
             for count, again in written.poll():
                 for number in filter(ledger.accept, range(ledger.delivered, count)):
                     del futures[number]
-                sent = count if again else sent
+                sent = max(ledger.delivered, 0 if again else sent)
             time.sleep(0.005)
         keys.close()
         task.result()
