@@ -100,7 +100,7 @@ def _soak(what: Survey, expected: Reference, seed: int, pace_s: float) -> Soaked
     samples: list[Sample] = []
     with Arena(pauses={"generate.put": pace_s}) as arena:
         known = scheduler_state(arena.client)
-        with Nemesis(arena, _faults(random.Random(seed)), drives=False) as nemesis:
+        with Nemesis(arena, _faults(random.Random(seed), what.scan_count), drives=False) as nemesis:
             driver = Driver(arena.client.scheduler.address, what, None, arena.board.folder)
             while not driver.is_done and not arena.board.has_events:
                 time.sleep(0.01)
@@ -115,7 +115,7 @@ def _soak(what: Survey, expected: Reference, seed: int, pace_s: float) -> Soaked
     rows = () if delivered.reference is None else delivered.reference.rows
     return Soaked(
         samples,
-        Counter({kind: number for (kind, _), number in nemesis.done.items()}),
+        _by_kind(nemesis.done),
         delivered,
         judge(events, what.scan_count, rows, expected.rows),
         delivered.reference == expected,
@@ -124,9 +124,9 @@ def _soak(what: Survey, expected: Reference, seed: int, pace_s: float) -> Soaked
     )
 
 
-def _faults(chance: random.Random) -> list[Fault]:
-    """More than any soak lasts."""
-    return [
+def _faults(chance: random.Random, scans: int) -> list[Fault]:
+    """More at random times than any soak lasts, and some that are sure to interrupt scans."""
+    timed = [
         Fault(
             number,
             chance.choice(LETHAL),
@@ -137,6 +137,19 @@ def _faults(chance: random.Random) -> list[Fault]:
         )
         for number in range(10_000)
     ]
+    # At the pace of a soak workers are idle at most moments: on a slow machine, with few kills,
+    # every one of those above has been seen to find nothing under way.
+    quarters = [scans * quarter // 4 for quarter in (1, 2, 3)]
+    under_way = [Fault(10_000 + scan, KILL, "intersect.start", scan=scan) for scan in quarters]
+    return timed + under_way
+
+
+def _by_kind(done: Counter[tuple[str, str]]) -> Counter[str]:
+    """Faults carried out, whatever the point."""
+    kinds: Counter[str] = Counter()
+    for (kind, _), number in done.items():
+        kinds[kind] += number
+    return kinds
 
 
 def _left_on_scheduler(arena: Arena, known: dict[str, Any]) -> list[str]:
