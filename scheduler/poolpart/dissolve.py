@@ -19,6 +19,7 @@ from .placing import asks_for
 from .settling import LOOK_EVERY_S
 from .stats import forget_statistics
 from .steward import Steward
+from .wording import counted
 
 _PATIENCE_S = 10.0  # for workers to declare what they did before, at least
 _LOOK_SHARE = 20  # the scheduler does other things for so many times as long as it looks
@@ -63,8 +64,8 @@ async def _dissolve(steward: Steward, names: list[str] | None, timeout_s: float)
         now = time.monotonic()
         if now >= deadline:
             raise PoolError(
-                f"{len(tasks)} tasks of {' and '.join(gone)} have not ended after {timeout_s:g} s, "
-                f"such as {tasks[0].key}: wait for them, or cancel them, and dissolve then."
+                f"After {timeout_s:g} s {counted(len(tasks), 'task')} of {' and '.join(gone)} "
+                f"had not ended, such as {tasks[0].key}: wait or cancel, then dissolve."
             )
         # To look at a hundred thousand tasks takes long; they are to end meanwhile.
         pause = max(LOOK_EVERY_S, _LOOK_SHARE * (now - began))

@@ -19,6 +19,7 @@ from .errors import PoolError
 from .placing import held_by
 from .rebalancing import Help
 from .steward import Steward
+from .wording import counted
 
 
 def grow(
@@ -84,8 +85,9 @@ async def _grow(
     if len(there) < count:
         place = f"partition {lender!r}, beyond its minimum," if source else "the remainder"
         raise PoolError(
-            f"Partition {name!r} cannot grow by {count}: {place} has {len(there)} workers to "
-            "spare. Start more, or shrink another partition first."
+            f"Partition {name!r} cannot grow by {count}: {place} has "
+            f"{counted(len(there), 'worker')} to spare. Start more, or "
+            "shrink another partition first."
         )
     return await _move(steward, _by_load(steward, there)[:count], name, timeout_s)
 
@@ -96,8 +98,8 @@ async def _shrink(steward: Steward, name: str, count: int, timeout_s: float) -> 
     members, least = _arrived(steward, name), book.rules[name].minimum
     if len(members) - count < least:
         raise PoolError(
-            f"Partition {name!r} cannot shrink by {count}: it has {len(members)} workers and "
-            f"needs at least {least}."
+            f"Partition {name!r} cannot shrink by {count}: it has "
+            f"{counted(len(members), 'worker')} and needs at least {least}."
         )
     target = book.remainder()
     chosen = _by_load(steward, members)[:count]
@@ -147,8 +149,8 @@ async def _move(
         leaving = [name for name, *_ in (before[seat] for seat in late) if name]
         steward.settling.settle(late)
         raise PoolError(
-            f"{len(late)} of {len(seats)} workers could not be moved within {timeout_s:g} s and "
-            f"stay where they are: {names_of(late)}{_held(steward, late, leaving)}."
+            f"{len(late)} of {counted(len(seats), 'worker')} could not be moved within "
+            f"{timeout_s:g} s; left in place: {names_of(late)}{_held(steward, late, leaving)}."
         )
     # Whoever else moves workers waits until they have arrived; dissolving does not.
     if target is not None and target not in steward.book.rules:

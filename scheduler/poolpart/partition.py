@@ -15,6 +15,7 @@ from .errors import PoolError
 from .identities import worker_identities
 from .stats import PartitionStats, partition_stats
 from .submitter import Submitter
+from .wording import counted
 from .worker_info import WorkerInfo
 
 
@@ -79,8 +80,8 @@ class Partition(Submitter):
         shown = ", ".join(names[:4]) + (", …" if len(names) > 4 else "")
         note = f"; {self.note}" if self.note else ""
         return (
-            f"<Partition {self.name!r}: {len(names)} worker{'s' * (len(names) != 1)} "
-            f"({shown}), {_slots(workers, self.name)} slots{note}>"
+            f"<Partition {self.name!r}: {counted(len(names), 'worker')} "
+            f"({shown}), {counted(_slots(workers, self.name), 'slot')}{note}>"
         )
 
     def stats(self) -> PartitionStats:
@@ -102,7 +103,7 @@ class Partition(Submitter):
         while (there := len(self)) < n_workers:
             if time.monotonic() >= deadline:
                 raise PoolError(
-                    f"Partition {self.name!r} has {there} of {n_workers} workers after "
+                    f"Partition {self.name!r} has {there} of {counted(n_workers, 'worker')} after "
                     f'{timeout_s} s: start some with dask worker … --resources "{self.name}=1"'
                 )
             pause.sleep()

@@ -20,6 +20,7 @@ from .probe import probe_worker
 from .rebalancing import Help
 from .rules import Rule, check_rule, check_rules, divide, rule_of
 from .selection import check_request, choose
+from .wording import counted
 from .worker_info import WorkerInfo
 
 
@@ -101,7 +102,8 @@ class Pool:
         gpus = {gpu for worker in self.workers for gpu in worker.gpus}
         declared = Counter(name for worker in self.workers for name in worker.partitions)
         parts = "".join(f", {name} {count}" for name, count in sorted(declared.items()))
-        return f"<Pool of {len(self)} workers on {len(hosts)} hosts with {len(gpus)} GPUs{parts}>"
+        size = f"{counted(len(self), 'worker')} on {counted(len(hosts), 'host')}"
+        return f"<Pool of {size} with {counted(len(gpus), 'GPU')}{parts}>"
 
     @property
     def names(self) -> list[str]:
@@ -141,7 +143,8 @@ class Pool:
             if there < needed:
                 reason = f" ({purpose[name]})" if purpose and name in purpose else ""
                 raise PoolError(
-                    f"Partition {name!r} has {there} of the {needed} slots needed{reason}: "
+                    f"Partition {name!r} has {there} of the "
+                    f"{counted(needed, 'slot')} needed{reason}: "
                     f'start workers with --resources "{name}=1" or one with --nthreads {needed} '
                     f'--resources "{name}={needed}".'
                 )

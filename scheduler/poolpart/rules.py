@@ -8,6 +8,7 @@ from typing import Any
 
 from .errors import PoolError
 from .selection import NO_GPU, by_gpu, by_host, check_name, check_slots
+from .wording import counted
 from .worker_info import WorkerInfo
 
 
@@ -209,9 +210,9 @@ def divide(
         taken |= {worker.address for worker in chosen[name]}
         if len(chosen[name]) < rule.minimum:
             raise PoolError(
-                f"Partition {name!r} would have {len(chosen[name])} workers of the {rule.minimum} "
-                f"that it needs: {len(free)} of {len(pool)} are left for it. Start more workers, "
-                "or put it before others."
+                f"Partition {name!r} would have {counted(len(chosen[name]), 'worker')} of the "
+                f"{rule.minimum} that it needs: {len(free)} of {len(pool)} are left for it. "
+                "Start more workers, or put it before others."
             )
         if isinstance(rule, PerGpu) and free and not any(worker.gpus for worker in free):
             notes[name] = NO_GPU

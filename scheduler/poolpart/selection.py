@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 
 from .errors import PoolError
+from .wording import counted
 from .worker_info import WorkerInfo
 
 NO_GPU = "no GPU in the pool: CPU workers instead"
@@ -119,8 +120,8 @@ def by_count(partition: str, free: Sequence[WorkerInfo], n_workers: int) -> list
     """Take so many workers."""
     if len(free) < n_workers:
         raise PoolError(
-            f"Partition {partition!r} asks for {n_workers} workers; the pool has {len(free)} "
-            "that belong to no other partition."
+            f"Partition {partition!r} asks for {counted(n_workers, 'worker')}; the pool has "
+            f"{counted(len(free), 'worker')} in no other partition."
         )
     return list(free[:n_workers])
 

@@ -145,7 +145,7 @@ def test_a_task_that_does_not_end_keeps_its_worker(divided, wait_until):
     scheduler = client.cluster.scheduler
     wait_until(lambda: sum(len(w.processing) for w in scheduler.workers.values()) == 3)
     before = declared(client)
-    with pytest.raises(PoolError, match=r"1 of 1 workers .* 0.2 s and stay .*: .*of endless-"):
+    with pytest.raises(PoolError, match=r"1 of 1 worker .* 0.2 s; left in place: .*of endless-"):
         parts["A"].shrink(1, timeout_s=0.2)
     wait_until(lambda: declared(client) == before)
     assert declared_by_themselves(client) == before
@@ -169,7 +169,7 @@ def test_partitions_that_are_dissolved_while_a_worker_moves(start, wait_until):
     moved = []
 
     def move():
-        with pytest.raises(PoolError, match="1 of 1 workers could not be moved") as error:
+        with pytest.raises(PoolError, match="1 of 1 worker could not be moved") as error:
             parts["A"].shrink(1, timeout_s=1)
         moved.append(error)
 

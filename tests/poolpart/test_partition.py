@@ -59,7 +59,7 @@ def test_members_are_what_the_workers_declare(a, b):
 def test_repr(a, client):
     assert repr(a) == "<Partition 'A': 2 workers (A-0, A-1), 4 slots>"
     with_note = Partition("B", client, note="no GPU")
-    assert repr(with_note) == "<Partition 'B': 1 worker (B-0), 1 slots; no GPU>"
+    assert repr(with_note) == "<Partition 'B': 1 worker (B-0), 1 slot; no GPU>"
     assert repr(Partition("C", client)) == "<Partition 'C': 0 workers (), 0 slots>"
 
 

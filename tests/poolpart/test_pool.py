@@ -30,7 +30,7 @@ def test_what_a_pool_knows(start):
         "b": (1, (), {"GPU"}),
     }
     assert sorted(pool.names) == ["a", "b"]
-    assert repr(pool) == "<Pool of 2 workers on 1 hosts with 0 GPUs, GPU 1>"
+    assert repr(pool) == "<Pool of 2 workers on 1 host with 0 GPUs, GPU 1>"
 
 
 def test_a_cluster_without_workers(start):
@@ -72,7 +72,7 @@ def test_dividing_the_remainder_again(start):
         ran = {future.result() for future in [part.submit(here) for _ in range(40)]}
         assert ran <= {worker.name for worker in part.workers}
     assert {len(resources) for resources in declared(client).values()} == {1}
-    with pytest.raises(PoolError, match="has 0 that belong to no other"):
+    with pytest.raises(PoolError, match="has 0 workers in no other partition"):
         rest.partition("FOUR", n_workers=1)
 
 
@@ -197,7 +197,7 @@ def test_workers_that_join_later_with_the_resource_belong(start, wait_until):
 def test_one_worker_for_each_gpu_of_a_host(start, monkeypatch):
     monkeypatch.setattr(probe, "visible_gpus", lambda: ("x", "y"))
     pool = Pool.from_client(start({name: {} for name in "abcde"}))
-    assert repr(pool) == "<Pool of 5 workers on 1 hosts with 2 GPUs>"
+    assert repr(pool) == "<Pool of 5 workers on 1 host with 2 GPUs>"
     gpu, rest = pool.partition("GPU", max_workers_per_gpu=1)
     assert (len(gpu), len(rest), gpu.note) == (2, 3, "")
     assert {worker.gpus for worker in rest} == {("x", "y")}
@@ -232,7 +232,7 @@ def test_slots_that_are_missing_are_named_with_their_purpose(start):
     pool.require({"LIDAR": 2})
     with pytest.raises(PoolError, match=r"'LIDAR' has 2 of the 4 slots needed \(four stages\): "):
         pool.require({"LIDAR": 4}, {"LIDAR": "four stages"})
-    with pytest.raises(PoolError, match="'GPU' has 0 of the 1 slots needed: start workers"):
+    with pytest.raises(PoolError, match="'GPU' has 0 of the 1 slot needed: start workers"):
         pool.require({"GPU": 1}, {"LIDAR": "four stages"})
 
 

@@ -65,7 +65,7 @@ def test_a_resource_of_quantity_0_does_not_bind_a_worker():
 
 
 def test_too_few():
-    with pytest.raises(PoolError, match="asks for 3 workers; the pool has 1 that belong to no"):
+    with pytest.raises(PoolError, match="3 workers; the pool has 1 worker in no other partition"):
         choose("P", [worker("a"), worker("b", Q=1)], n_workers=3)
 
 

@@ -115,7 +115,7 @@ def test_workers_that_are_under_way_are_not_counted_on(start, wait_until):
         wait_until(lambda: not any(d.get("B") for d in declared(client).values()))
         with pytest.raises(PoolError, match="'A' cannot shrink by 1: it has 1 worker"):
             parts["A"].shrink(1)
-        with pytest.raises(PoolError, match="1 of 1 workers could not be moved"):
+        with pytest.raises(PoolError, match="1 of 1 worker could not be moved"):
             growing.result()
     wait_until(lambda: sorted(map(str, declared(client).values())) == ["{'A': 1}", "{'B': 1}"])
     event.set()

@@ -127,7 +127,10 @@ SCENARIOS: dict[str, tuple[str | bytes, str]] = {
     "no poses": ("poses: []\n", "poses is []; it must be a list of at least 1"),
     "one pose without its list": ("poses: [0, 0, 1]\n", "must be in a list: [[x, y, z]]"),
     "one pose as a section": ("poses: {position: [0, 0, 1]}\n", "must be in a list"),
-    "flat pose": ("poses: [[0, 0]]\n", "poses[0].position is [0, 0]; it must be a list of 3"),
+    "flat pose": (
+        "poses: [[0, 0]]\n",
+        "poses[0].position is [0, 0]; it must be a list of 3 numbers",
+    ),
     "pose of words": ("poses: [[a, b, c]]\n", "poses[0].position[0] is 'a'"),
     "pose beyond floats": ("poses: [[1.0e+999, 0, 0]]\n", "poses[0].position[0] is inf"),
     "pose off the Earth": ("poses: [[1.0e+30, 0, 0]]\n", "poses[0].position[0] is 1e+30"),
@@ -419,8 +422,8 @@ def cluster() -> Iterator[Callable[..., str]]:
 
 CLUSTERS: dict[str, tuple[list[dict[str, int]], str]] = {
     "no workers": ([], "has no workers: start some"),
-    "workers of no partition": ([{}], "Partition 'GPU' has 0 of the 1 slots"),
-    "no GPU": ([{"LIDAR": 4}, {"OTHER": 1}], "Partition 'GPU' has 0 of the 1 slots"),
+    "workers of no partition": ([{}], "Partition 'GPU' has 0 of the 1 slot"),
+    "no GPU": ([{"LIDAR": 4}, {"OTHER": 1}], "Partition 'GPU' has 0 of the 1 slot"),
     "no LIDAR": ([{"GPU": 1}, {"OTHER": 1}], "Partition 'LIDAR' has 0 of the 4 slots"),
     "little LIDAR": (
         [{"GPU": 1}, {"LIDAR": 3}, {"OTHER": 1}],

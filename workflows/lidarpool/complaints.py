@@ -89,7 +89,7 @@ def _line(detail: ErrorDetails, model: type[BaseModel]) -> str:
         # One number of several: what was given is the list.
         field = _field_at(model, place[:-1])
         entries = get_args(field.annotation) if field else ()
-        allowed = f"a list of {len(entries)}" if entries else "a longer list"
+        allowed = _list_of(len(entries), detail["input"]) if entries else "a longer list"
         return f"{_dotted(place[:-1])} is {_given(detail['input'])}; it must be {allowed}."
     text = f"{_dotted(place)} is {_given(detail['input'])}; it must be {_allowed(detail, model)}."
     if kind == "literal_error" and isinstance(detail["input"], str):
@@ -104,7 +104,7 @@ def _allowed(detail: ErrorDetails, model: type[BaseModel]) -> str:
         return f"one of {context['expected'].replace(' or ', ', ')}"
     if kind in ("too_short", "too_long"):
         least, most = context.get("min_length"), context.get("max_length")
-        return f"a list of at least {least}" if least is not None else f"a list of {most}"
+        return f"a list of at least {least}" if least else _list_of(most, detail["input"])
     if kind in ("string_too_short", "string_too_long"):
         return "text that is not empty" if "min_length" in context else "shorter text"
     field = _field_at(model, detail["loc"])
@@ -115,6 +115,12 @@ def _allowed(detail: ErrorDetails, model: type[BaseModel]) -> str:
     if expected:
         return f"{expected}, {limits}" if limits else expected
     return detail["msg"].removeprefix("Input should be ")
+
+
+def _list_of(length: object, given: object) -> str:
+    """Name the list that should be there, its entries as those that were given."""
+    numbers = isinstance(given, list | tuple) and all(isinstance(e, int | float) for e in given)
+    return f"a list of {length} numbers" if numbers and given else f"a list of {length}"
 
 
 def _limits(metadata: Sequence[Any]) -> str:

@@ -8,6 +8,8 @@ from typing import Any
 
 import click
 
+from poolpart.wording import counted
+
 from .command_group import CommandGroup
 from .scene import Scene
 
@@ -77,6 +79,6 @@ def _write(out: Path, make: Callable[[], Scene]) -> None:
     low, high = made.bounds
     size = " x ".join(f"{length:.0f}" for length in high - low)
     click.echo(
-        f"{len(made.faces):,} triangles, {objects:,} object{'s' if objects > 1 else ''}, {size} m: "
+        f"{len(made.faces):,} triangles, {counted(objects, 'object')}, {size} m: "
         f"{click.format_filename(out)}"
     )

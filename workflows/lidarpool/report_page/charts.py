@@ -9,10 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from poolpart.wording import counted
+
 from ..plan import Plan, Trial
 from ..view.captions import without_common_prefix
 from ..view.stage import nice_step
-from .words import counted, share
+from .words import share
 
 HIGH, WIDE = 100, 1000  # units of a drawing, whatever its size on the page
 OBJECTS_MOST = 25

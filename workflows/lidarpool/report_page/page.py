@@ -13,6 +13,8 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from poolpart.wording import counted
+
 from ..plan import Planning
 from ..result import Result
 from ..scan import COLLECT, GENERATE, INTERSECT, SORT
@@ -119,7 +121,7 @@ def _environment() -> Environment:
     )
     for filter_ in (
         words.duration, words.rate, words.large, words.share, words.excess, words.metres,
-        words.numbers, words.shortened, words.counted,
+        words.numbers, words.shortened, counted,
     ):  # fmt: skip
         environment.filters[filter_.__name__] = filter_
     return environment

@@ -6,7 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from .words import counted, duration, excess, large, metres
+from poolpart.wording import counted
+
+from .words import duration, excess, large, metres
 
 Report = Mapping[str, Any]
 

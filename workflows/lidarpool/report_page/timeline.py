@@ -10,12 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from poolpart import TaskRecord
+from poolpart.wording import counted
 
 from ..scan import INTERSECT
 from ..task_book import StageTotals, union
 from ..trials import TRIAL
 from ..view.stage import nice_step
-from .words import counted, duration
+from .words import duration
 
 WIDTH = 1000  # units of the drawing, whatever its width on the page
 ROW = 18  # height of a row

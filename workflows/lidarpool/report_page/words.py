@@ -25,11 +25,6 @@ def shortened(name: str) -> str:
     return f"{name[: LETTERS_MOST - tail - 1]}…{name[-tail:]}"
 
 
-def counted(number: float, what: str, several: str = "") -> str:
-    """Return number and noun: «1 scan», «1,200 scans»."""
-    return f"{number:,} {what if number == 1 else several or what + 's'}"
-
-
 def duration(seconds: float) -> str:
     """Return a time in the unit that suits it."""
     if seconds < 0.001:
