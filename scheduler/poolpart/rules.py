@@ -132,6 +132,8 @@ def per_gpu(
 ) -> PerGpu:
     """At most so many workers for each GPU; CPU workers, so many a host, where there is none.
 
+    `slots`, `minimum` and `exclusive` are those of every `Rule`.
+
     Examples
     --------
     >>> per_gpu(1)
@@ -143,27 +145,33 @@ def per_gpu(
 def per_host(
     most: int, *, slots: int | None = None, minimum: int = 1, exclusive: bool = False
 ) -> PerHost:
-    """At most so many workers of each host."""
+    """At most so many workers of each host; `slots` and the rest as in every `Rule`."""
     return PerHost(most=most, slots=slots, minimum=minimum, exclusive=exclusive)
 
 
 def n_workers(
     workers: int, *, slots: int | None = None, minimum: int = 1, exclusive: bool = False
 ) -> Count:
-    """So many workers, wherever they are."""
+    """So many workers, wherever they are; `slots` and the rest as in every `Rule`."""
     return Count(workers=workers, slots=slots, minimum=minimum, exclusive=exclusive)
 
 
 def named(
     *names: str, slots: int | None = None, minimum: int = 1, exclusive: bool = False
 ) -> Named:
-    """Workers of these names or addresses; one that is not there yet belongs when it joins."""
+    """Workers of these names or addresses; one that is not there yet belongs when it joins.
+
+    `slots`, `minimum` and `exclusive` are those of every `Rule`.
+    """
     names = tuple(str(name) for name in names)
     return Named(names=names, slots=slots, minimum=minimum, exclusive=exclusive)
 
 
 def rest(*, slots: int | None = None, minimum: int = 0, exclusive: bool = False) -> Rest:
-    """Every worker that no rule before it wants; also where others find more workers."""
+    """Every worker that no rule before it wants; also where others find more workers.
+
+    `slots`, `minimum` and `exclusive` are those of every `Rule`; there may be none by default.
+    """
     return Rest(slots=slots, minimum=minimum, exclusive=exclusive)
 
 

@@ -100,7 +100,24 @@ class Scene:
     ) -> Scene:
         """Read a mesh file: .glb .gltf .obj .stl .ply .off .dae .3mf.
 
-        See `lidarpool.meshfile.load_meshes` for the parameters and for what is raised.
+        Parameters
+        ----------
+        path
+            The file; its objects keep their names.
+        unit
+            Length unit of the file: um, mm, cm, dm, m, km, in, ft, yd or mi. None takes what
+            the file states, else metres.
+        up_axis
+            Axis of the file that points up: x, y or z. None takes what the file or its format
+            states, else z.
+        transform
+            Where the mesh stands in the world, in metres, after unit and up axis: a
+            `lidarpool.transform.Transform`.
+
+        Raises
+        ------
+        LidarpoolError
+            If the file cannot be read whole, or there are no triangles in it.
         """
         return cls.from_meshes(load_meshes(path, unit=unit, up_axis=up_axis, transform=transform))
 
