@@ -24,13 +24,26 @@ _SECTIONS = {
     "pool": "PoolSection",
 }
 
+# What a reader of a package looks for first; the rest follows by the alphabet.
+_FIRST = {
+    "lidarpool": ("simulate", "Scene", "Sensor", "Pose", "Survey", "Planning", "Result", "Cloud"),
+    "poolpart": (
+        *("Pool", "Partition", "Rule", "per_gpu", "per_host", "n_workers", "named", "rest"),
+        *("Results", "PartitionStats", "StageStats", "Pipe", "Ledger", "local_cluster"),
+    ),
+    "raybeam": ("RayCaster", "Pattern", "Hits", "Returns"),
+}
+
 
 def members_page(package: str) -> str:
     """Public names of a package, each with its docstring."""
     module = import_module(package)
-    names = sorted(name for name in module.__all__ if not name.startswith("__"))
+    names = {name for name in module.__all__ if not name.startswith("__")}
+    first = _FIRST[package]
+    if not names.issuperset(first):
+        raise ValueError(f"{package} has none of these names: {set(first) - names}")
     parts = [f"# `{package}`\n\n{module.__doc__}\n"]
-    parts += [f"::: {package}.{name}\n" for name in names]
+    parts += [f"::: {package}.{name}\n" for name in (*first, *sorted(names - {*first}))]
     return "\n".join(parts)
 
 
@@ -93,18 +106,26 @@ def _kinds(content: dict[str, Any]) -> str:
     """Say what a field takes."""
     if "anyOf" in content:
         choices = [_kinds(choice) for choice in content["anyOf"] if choice.get("type") != "null"]
+        # A list of things, or one of them without the list.
+        choices = [c for c in choices if f"list: {c}" not in choices]
         return " or ".join(dict.fromkeys(choices))
     if "enum" in content:
         return ", ".join(f"`{value}`" for value in content["enum"])
     if "const" in content:
         return f"`{content['const']}`"
     if "$ref" in content:
-        return "a section"
+        return _section(content["$ref"].rpartition("/")[2])
     kind = content["type"]
     if kind == "array":
         return _list(content)
     words = {"integer": "whole number", "string": "text", "boolean": "true or false"}
     return words.get(kind, kind) + _limits(content)
+
+
+def _section(name: str) -> str:
+    """Link to the table of a section of this page, by its name in the schema."""
+    heading = next(heading for heading, section in _SECTIONS.items() if section == name)
+    return f"[{heading}](#{heading.replace(': ', '-')})"
 
 
 def _list(content: dict[str, Any]) -> str:
@@ -115,6 +136,12 @@ def _list(content: dict[str, Any]) -> str:
 
 
 def _limits(content: dict[str, Any]) -> str:
+    if "minimum" in content and "maximum" in content:
+        return f", {_number(content['minimum'])} to {_number(content['maximum'])}"
     signs = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
-    limits = [f"{sign} {content[key]:,}" for key, sign in signs.items() if key in content]
+    limits = [f"{sign} {_number(content[key])}" for key, sign in signs.items() if key in content]
     return " " + ", ".join(limits) if limits else ""
+
+
+def _number(value: float) -> str:
+    return f"{value:,.6f}".rstrip("0").rstrip(".")
