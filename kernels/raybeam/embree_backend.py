@@ -22,9 +22,10 @@ from .workspace import Workspace
 
 _MISS = 0xFFFFFFFF
 
-# Embree decides in float32: a start this much farther on, in local units, is surely beyond a
-# surface that refinement put just before the start.
-_NUDGE = 2.0**-20
+# Embree decides in float32, and may find again what refinement put just before the start. So the
+# start moves on, in local units: a little for most surfaces, and for those that a ray grazes, along
+# which float32 sees less sharply, as much as it takes.
+_STARTS = (0.0, *(4.0**k * 2**-20 for k in range(6)))
 
 # A ray that starts farther from zero than this, in local units, is begun at the scene's box:
 # then float32 rounds by the scene's size, not by the way to it.
@@ -180,8 +181,9 @@ class EmbreeBackend(Backend):
         parts = [hits.only(~early)]
         ray = hits.ray[early]
         directions = unit[:, ray].T  # a copy: the workspace is about to be used again
-        for start in (t_min, t_min + _NUDGE, t_min + 4 * _NUDGE):
-            again = self._cast(desk, desk.turn(directions, None), _of(origins, ray), start)
+        for ahead in _STARTS:
+            turned = desk.turn(directions, None)
+            again = self._cast(desk, turned, _of(origins, ray), t_min + ahead)
             parts.append(_Pairs(ray[again.ray], again.t, again.place).only(again.t >= t_min))
             left = again.ray[again.t < t_min]
             ray, directions = ray[left], directions[left]

@@ -183,6 +183,29 @@ def test_start_on_a_surface_within_rounding(caster, shapes):
     assert hits.distance == pytest.approx(2)
 
 
+@pytest.mark.parametrize("t_min", [0.0, 1.0])
+def test_a_ray_that_grazes_what_it_starts_on_meets_the_wall_behind(caster, t_min):
+    """The ground within rounding of `t_min`, before or behind it, takes nothing from the wall."""
+    rng = np.random.default_rng(9)
+    turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    ground = [[-10, -10, 0], [10, -10, 0], [10, 10, 0], [-10, 10, 0]]
+    points = np.array([*ground, *([x, y, 5] for x, y, _ in ground)], float)
+    rim = [(k, (k + 1) % 4) for k in range(4)]
+    walls = [row for a, b in rim for row in ([a, b, b + 4], [a, b + 4, a + 4])]
+    room = caster(points @ turn.T + [100, 200, 300], [[0, 1, 2], [0, 2, 3], *walls])
+    for rise in (0.03, 0.01, 0.003, 0.001):
+        around = rng.uniform(0, 2 * np.pi, 2000)
+        flat = np.sqrt(1 - rise**2)
+        out = np.stack([flat * np.cos(around), flat * np.sin(around), np.full(2000, rise)], axis=1)
+        start = np.pad(rng.uniform(-5, 5, (2000, 2)), ((0, 0), (0, 1))) - t_min * out
+        hits = room.cast(start @ turn.T + [100, 200, 300], out @ turn.T, t_min)
+        assert hits.hit.all()
+        wall = hits.triangle >= 2
+        assert 500 < wall.sum() < 2000
+        points = (start + hits.distance[:, None] * out)[wall]
+        np.testing.assert_allclose(np.abs(points[:, :2]).max(axis=1), 10, rtol=1e-9)
+
+
 def test_edges_and_corners_belong_to_the_triangle(exact_caster):
     triangle = exact_caster(*TRIANGLE)
     on = np.array([[0, 0, 1], [4, 0, 1], [0, 4, 1], [2, 0, 1], [0, 2, 1], [2, 2, 1], [1, 3, 1.0]])
