@@ -62,6 +62,8 @@ class CudaBackend(Backend):
         except RuntimeError as error:
             said = str(error).partition("\n")[0]
             return f"CuPy finds no compiler ({said}): pip install 'cupy-cuda13x[ctk]', or 12x"
+        if not _headers():
+            return "CuPy finds no CUDA headers: pip install 'cupy-cuda13x[ctk]', or 12x"
         return ""
 
     def __init__(
@@ -235,6 +237,18 @@ class CudaBackend(Backend):
 def flags(stack: int) -> tuple[str, ...]:
     """Compiler options of intersect.cu; `stack` is the most nodes that may wait in a walk."""
     return options(STACK=stack)
+
+
+def _headers() -> bool:
+    """Whether CuPy will find the headers of CUDA, without which it refuses to compile anything.
+
+    A driver and a compiler may well be there without them, as in containers made for running.
+    """
+    try:
+        from cuda.pathfinder import find_nvidia_header_directory
+    except ImportError:  # then this CuPy looks for them in another way
+        return True
+    return find_nvidia_header_directory("cudart") is not None
 
 
 def _device(cupy: Any, number: int | None) -> Any:

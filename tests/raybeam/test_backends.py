@@ -118,18 +118,25 @@ def refuse(message):
 
 
 @pytest.mark.parametrize(
-    ("devices", "version", "words"),
+    ("devices", "version", "headers", "words"),
     [
-        (lambda: refuse("driver too old"), lambda: (13, 0), "no CUDA device .driver too old"),
-        (lambda: 0, lambda: (13, 0), "there is no CUDA device"),
-        (lambda: 1, lambda: refuse("no libnvrtc\nat all"), r"no compiler .no libnvrtc.: pip"),
-        (lambda: 2, lambda: (13, 0), "^$"),
+        (lambda: refuse("too old"), lambda: (13, 0), "/usr", "no CUDA device .too old"),
+        (lambda: 0, lambda: (13, 0), "/usr", "there is no CUDA device"),
+        (lambda: 1, lambda: refuse("no nvrtc\nat all"), "/usr", r"no compiler .no nvrtc.: pip"),
+        (lambda: 1, lambda: (13, 0), None, "no CUDA headers: pip"),
+        (lambda: 2, lambda: (13, 0), "/usr", "^$"),
+        (lambda: 1, lambda: (13, 0), "no finder", "^$"),  # not every CuPy looks for them with it
     ],
 )
-def test_what_cuda_lacks(monkeypatch, devices, version, words):
+def test_what_cuda_lacks(monkeypatch, devices, version, headers, words):
     runtime = SimpleNamespace(getDeviceCount=devices, CUDARuntimeError=CudaError)
     cuda = SimpleNamespace(runtime=runtime, nvrtc=SimpleNamespace(getVersion=version))
     monkeypatch.setitem(sys.modules, "cupy", SimpleNamespace(cuda=cuda))
+    finder = SimpleNamespace(find_nvidia_header_directory={"cudart": headers}.get)
+    if headers == "no finder":
+        finder = None
+    monkeypatch.setitem(sys.modules, "cuda", SimpleNamespace(pathfinder=finder))
+    monkeypatch.setitem(sys.modules, "cuda.pathfinder", finder)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: name)
     assert re.search(words, CudaBackend.missing())
 
