@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+from operator import index
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .hits import Hits, Returns
 from .mesh import local_mesh
-from .rays import Pattern, check_interval, check_origins, check_rays, check_rotation
+from .rays import (
+    Pattern,
+    check_interval,
+    check_origins,
+    check_rays,
+    check_rotation,
+    check_window,
+)
 from .registry import choose
 
 
@@ -55,7 +64,7 @@ class RayCaster:
         threads: int | None = None,
         device: int | None = None,
     ) -> None:
-        if threads is not None and threads < 1:
+        if threads is not None and index(threads) < 1:
             raise ValueError(f"threads is {threads}; it must be at least 1, or None.")
         engine = choose(backend)
         self._mesh = local_mesh(vertices, faces)
@@ -148,10 +157,12 @@ class RayCaster:
         ValueError
             If the origin is not finite, the rotation is none, or the window is not within the
             pattern.
+        TypeError
+            If the pattern is none, or the window not two whole numbers.
         """
         return self._engine.scan(
             pattern,
-            pattern.window(*(window or (0, len(pattern)))),
+            check_window(pattern, window),
             check_origins(origin, 1),
             check_rotation(rotation),
             check_interval(t_min, t_max),
@@ -199,7 +210,7 @@ class RayCaster:
         """Count as `count` does, for a pattern cast from one pose as by `scan`."""
         return self._engine.count_scan(
             pattern,
-            pattern.window(*(window or (0, len(pattern)))),
+            check_window(pattern, window),
             check_origins(origin, 1),
             check_rotation(rotation),
             check_interval(t_min, t_max),

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .given import as_array
 from .memory import require
 
 _BLOCK = 1 << 16  # triangles that are looked at together
@@ -104,7 +105,7 @@ def _solid(corners: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def _check_vertices(vertices: ArrayLike) -> NDArray[np.float64]:
-    given = np.asarray(vertices)
+    given = as_array("vertices", vertices)
     if given.ndim != 2 or given.shape[1] != 3 or given.dtype.kind not in "fiu":
         raise ValueError(
             f"vertices must be real numbers of shape (v, 3), not {given.dtype} {given.shape}."
@@ -121,7 +122,7 @@ def _check_vertices(vertices: ArrayLike) -> NDArray[np.float64]:
 
 
 def _check_faces(faces: ArrayLike, vertex_count: int) -> NDArray[np.int64]:
-    given = np.asarray(faces)
+    given = as_array("faces", faces)
     if given.ndim != 2 or given.shape[1] != 3 or not len(given):
         raise ValueError(
             f"faces must have the shape (f, 3) with at least one triangle, not {given.shape}: "

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from operator import index
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .given import as_array
 from .hits import MOST_RAYS
 from .memory import require
 
@@ -91,6 +93,22 @@ class Pattern:
         return start, stop
 
 
+def check_window(pattern: object, window: tuple[int, int] | None) -> tuple[int, int]:
+    """Rows of a pattern, all for None; raises TypeError or ValueError for what is not that."""
+    if not isinstance(pattern, Pattern):
+        raise TypeError(
+            f"pattern must be a raybeam.Pattern, not {type(pattern).__name__}: "
+            "make one of the directions, once, by Pattern(directions)."
+        )
+    try:
+        start, stop = (0, len(pattern)) if window is None else map(index, window)
+    except (TypeError, ValueError) as error:
+        raise TypeError(
+            f"window must be two row numbers, (start, stop), or None for all, not {window!r}."
+        ) from error
+    return pattern.window(start, stop)
+
+
 def check_rays(origins: ArrayLike, directions: ArrayLike, t_min: float, t_max: float) -> Rays:
     """Rays as they were given; raises ValueError for those that are none.
 
@@ -121,8 +139,17 @@ def check_origins(origins: ArrayLike, rays: int) -> NDArray[Any]:
 
 
 def check_interval(t_min: float, t_max: float) -> tuple[float, float]:
-    """`t_min` and `t_max` as floats; raises ValueError unless ``0 <= t_min <= t_max``."""
-    t_min, t_max = float(t_min), float(t_max)
+    """Return both as floats.
+
+    Raises TypeError if they are no numbers, ValueError unless ``0 <= t_min <= t_max``.
+    """
+    try:
+        t_min, t_max = float(t_min), float(t_max)
+    except (TypeError, ValueError) as error:
+        raise TypeError(
+            "t_min and t_max must be numbers, the same for all rays of a call, "
+            f"not {t_min!r} and {t_max!r}."
+        ) from error
     if not (0 <= t_min < np.inf and t_min <= t_max):
         raise ValueError(
             f"t_min is {t_min} and t_max {t_max}: distances must be finite, at least 0, "
@@ -185,19 +212,21 @@ def check_rotation(rotation: ArrayLike | None) -> NDArray[np.float64] | None:
     """Return a rotation matrix in float64; raises ValueError when it is not orthonormal."""
     if rotation is None:
         return None
-    matrix = np.asarray(rotation, dtype=np.float64)
+    given = as_array("rotation", rotation)
+    right = given.shape == (3, 3) and given.dtype.kind in "fiu"
+    matrix = given.astype(np.float64) if right else np.zeros((3, 3))
     # Not np.allclose, which takes longer than casting a thousand rays; NaN compares as false.
-    if matrix.shape != (3, 3) or not np.abs(matrix @ matrix.T - np.eye(3)).max() <= 2e-9:
+    if not np.abs(matrix @ matrix.T - np.eye(3)).max() <= 2e-9:
         raise ValueError(
             "rotation must be a (3, 3) matrix with orthonormal rows (sensor to scene axes), "
-            f"not {np.asarray(rotation).tolist()}."
+            f"not {given.tolist()}."
         )
     return matrix
 
 
 def _table(name: str, values: ArrayLike) -> NDArray[Any]:
     """Real numbers (n, 3), copied only if they are no array; a single (3,) becomes one row."""
-    given = np.asarray(values)
+    given = as_array(name, values)
     if given.dtype.kind not in "fiu":
         raise ValueError(f"{name} must be real numbers, not {given.dtype}.")
     if given.ndim == 1 and given.shape == (3,):

@@ -28,6 +28,8 @@ POINTS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
         ([[0, 0, 0], [1, 0, 0], [0, np.inf, 0]], [[0, 1, 2]], "Vertex 2 is .*inf"),
         ([[0, 0, 0], [1e308, 0, 0], [-1e308, 1, 0]], [[0, 1, 2]], "its size must be"),
         (POINTS * 5e-324, [[0, 1, 2]], "its size must be"),
+        ([[0, 0, 0], [1, 0], [0, 1, 0]], [[0, 1, 2]], "vertices must be an array or rows"),
+        (POINTS, [[0, 1, 2], [0, 1]], "faces must be an array or rows of numbers"),
     ],
 )
 def test_refused(vertices, faces, words):

@@ -28,6 +28,8 @@ DOWN = [[0.0, 0, -1]]
         ([0, 0], DOWN, r"origins must have the shape \(n, 3\) or \(3,\), not \(2,\)"),
         ([0, 0, 1], [["a", "b", "c"]], "directions must be real numbers"),
         ([0, 0, 1], [[0, 0, 1j]], "directions must be real numbers"),
+        ([0, 0, 1], [[0, 0, -1], [0, 0]], "directions must be an array or rows of numbers, each"),
+        ([[0, 0, 1], 2], DOWN, "origins must be an array or rows of numbers, each"),
     ],
 )
 def test_refused(backend, origins, directions, words):
@@ -42,6 +44,12 @@ def test_refused(backend, origins, directions, words):
 )
 def test_limits_refused(limits):
     with pytest.raises(ValueError, match="t_min is"):
+        check_rays([0, 0, 0], DOWN, *limits)
+
+
+@pytest.mark.parametrize("limits", [([0], [5, 6]), (None, 5), (0, "far")], ids=str)
+def test_limits_that_are_no_numbers(limits):
+    with pytest.raises(TypeError, match="t_min and t_max must be numbers, the same for all rays"):
         check_rays([0, 0, 0], DOWN, *limits)
 
 
@@ -115,6 +123,9 @@ def test_scan_is_the_same_as_its_rays(backend, shapes):
         ({"rotation": 2 * np.eye(3)}, "orthonormal"),
         ({"rotation": np.eye(2)}, "orthonormal"),
         ({"rotation": np.full((3, 3), np.nan)}, "orthonormal"),
+        ({"rotation": np.eye(3) * 1j}, "orthonormal"),
+        ({"rotation": "level"}, "orthonormal.*not level"),
+        ({"rotation": [[1, 0, 0], [0, 1], [0, 0, 1]]}, "rotation must be an array or rows"),
         ({"origin": [0, 0, np.nan]}, "Origin 0"),
         ({"origin": [[0, 0, 0], [0, 0, 1]]}, "2 origins and 1"),
         ({"t_min": 2, "t_max": 1}, "t_min is 2.0 and t_max 1.0"),
@@ -124,6 +135,30 @@ def test_scan_refused(change, words):
     caster = RayCaster([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], "numpy")
     with pytest.raises(ValueError, match=words):
         caster.scan(Pattern(np.eye(3)), **{"origin": [0, 0, 0], **change})
+
+
+@pytest.mark.parametrize("window", [(0, 1.0), (0, 1, 2), 1, slice(0, 1)], ids=str)
+def test_window_that_is_none(window):
+    caster = RayCaster([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], "numpy")
+    for method in (caster.scan, caster.count_scan):
+        with pytest.raises(TypeError, match=r"window must be two row numbers, \(start, stop\), or"):
+            method(Pattern(np.eye(3)), [0, 0, 0], window=window)
+
+
+def test_window_of_numpy_integers():
+    caster = RayCaster([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], "numpy")
+    pattern = Pattern([[0, 0, 1], [0, 0, -1], [0, 1, 0]])
+    hits = caster.scan(pattern, [0.2, 0.2, 1], window=np.array([1, 3]))
+    assert hits.ray.tolist() == [0]
+
+
+def test_directions_that_are_no_pattern():
+    caster = RayCaster([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], "numpy")
+    for method in (caster.scan, caster.count_scan):
+        with pytest.raises(
+            TypeError, match=r"pattern must be .*, not list: make one .* by Pattern"
+        ):
+            method([[0, 0, -1]], [0.2, 0.2, 1])
 
 
 def test_more_rays_than_can_be_numbered_are_refused():
