@@ -97,9 +97,11 @@ async def _shrink(steward: Steward, name: str, count: int, timeout_s: float) -> 
     book.adopt(name)
     members, least = _arrived(steward, name), book.rules[name].minimum
     if len(members) - count < least:
+        lent = sum(seat.home is not None for seat in book.members(name, present=True))
         raise PoolError(
             f"Partition {name!r} cannot shrink by {count}: it has "
-            f"{counted(len(members), 'worker')} and needs at least {least}."
+            f"{counted(len(members), 'worker')} and needs at least {least}"
+            f"{f'; {lent} more are only lent to it' if lent else ''}."
         )
     target = book.remainder()
     chosen = _by_load(steward, members)[:count]
@@ -161,8 +163,13 @@ async def _move(
 
 
 def _arrived(steward: Steward, name: str) -> list[Seat]:
-    """Members that are not under way: those may turn back, and belong to another's move."""
-    return [s for s in steward.book.members(name, present=True) if steward.settling.settled(s)]
+    """Members that may be moved.
+
+    Not those under way, which may turn back, and belong to another's move; nor those that are
+    only lent: they go back, and would leave fewer than the minimum behind.
+    """
+    members = steward.book.members(name, present=True)
+    return [s for s in members if s.home is None and steward.settling.settled(s)]
 
 
 def _resize(steward: Steward, name: str | None, change: int) -> None:

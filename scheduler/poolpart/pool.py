@@ -278,8 +278,8 @@ class Pool:
         While tasks of `helps` wait for a slot, workers of `lender` that have had nothing to
         do for a while are moved there, as far as its minimum allows. They go back as soon as
         tasks of `lender` wait, once what they have begun has ended, or when they have had
-        nothing to do there either, for two seconds longer. The scheduler does this, also when
-        this client has gone.
+        nothing to do there either, for two seconds longer. Until then `grow` and `shrink` leave
+        them alone. The scheduler does this, also when this client has gone.
 
         Parameters
         ----------

@@ -8,26 +8,37 @@ from typing import Any
 from distributed import Status
 
 from .book import Resources
+from .marks import is_awaited
 
 _PATIENCE_S = 1.0
 _FOUND = "poolpart_found"  # on a nanny: what it started its worker with before
 
 
-async def declare_on_worker(resources: Resources, dask_worker: Any = None) -> bool:
+async def declare_on_worker(
+    resources: Resources, after_mark: bool = False, dask_worker: Any = None
+) -> bool:
     """Declare these resources and no others; runs on a worker.
+
+    Parameters
+    ----------
+    resources
+        What to declare.
+    after_mark
+        Whether to wait for what the scheduler has sent before, see `marks.py`.
 
     Returns
     -------
     done
         False if tasks still hold a resource that is to go: they give it back when they end,
         and must find it then. Such a task may be one that was cancelled, of which the
-        scheduler knows nothing any more.
+        scheduler knows nothing any more; it may even be on its way.
     """
     state = dask_worker.state
     total, available = state.total_resources, state.available_resources
     leaving = total.keys() - resources.keys()
     for _ in range(int(_PATIENCE_S / 0.01)):
-        if all(available[name] >= total[name] for name in leaving):
+        held = any(available[name] < total[name] for name in leaving)
+        if not held and not (after_mark and is_awaited(dask_worker)):
             break
         await asyncio.sleep(0.01)
     else:

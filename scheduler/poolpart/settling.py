@@ -14,6 +14,7 @@ from typing import Any
 
 from .book import Book, Resources, Seat, seat_key
 from .calls import call
+from .marks import send_mark
 from .nannies import Nannies
 from .placing import hand_off, held_by, recount, show, wake
 from .restarts import declare_on_worker
@@ -70,7 +71,7 @@ class Settling:
 
     def is_under_way(self, seat: Seat) -> bool:
         """Whether something is being done for a worker."""
-        return seat.info.address in self._tasks
+        return self._at_work(seat.info.address)
 
     def stop(self) -> None:
         """Do nothing more."""
@@ -95,8 +96,13 @@ class Settling:
             and self.nannies.agrees(seat, wanted)
         )
 
+    def _at_work(self, address: str) -> bool:
+        # One that has ended is in the table until the event loop comes to its callback.
+        task = self._tasks.get(address)
+        return task is not None and not task.done()
+
     def _spawn(self, address: str) -> None:
-        if address in self._tasks:  # it looks at the book again before it ends
+        if self._at_work(address):  # it looks at the book again before it ends
             return
         task = asyncio.ensure_future(self._settle(address))
         self._tasks[address] = task
@@ -138,7 +144,16 @@ class Settling:
         # First the nanny: a worker that dies right after would come back as it was.
         await self.nannies.tell(seat, wanted)
         trace("partition.nanny_told", worker=worker.address, declares=dict(wanted))
-        if not await call(self.scheduler, worker.address, declare_on_worker, resources=wanted):
+        if leaving:
+            await send_mark(self.scheduler, worker.address)
+        done = await call(
+            self.scheduler,
+            worker.address,
+            declare_on_worker,
+            resources=wanted,
+            after_mark=bool(leaving),
+        )
+        if not done:
             return
         if self.scheduler.workers.get(worker.address) is not worker:
             return

@@ -1,14 +1,27 @@
 """Moving workers between partitions while tasks run: none is lost, none runs elsewhere."""
 
+import asyncio
 import os
 import signal
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from distributed import Event, get_worker, secede
 
-from poolpart import Partition, Pool, PoolError, n_workers, per_host, recorded, rest, trace_to
+from poolpart import (
+    Partition,
+    Pool,
+    PoolError,
+    n_workers,
+    per_host,
+    recorded,
+    rest,
+    settling,
+    trace_to,
+)
+from poolpart.placing import wake
 
 LONG_S = 60.0
 
@@ -214,6 +227,63 @@ def test_what_was_moved_is_counted_where_it_is(divided, wait_until):
     assert all(not any(u.values()) for u in used(client).values())
 
 
+def test_a_worker_that_is_moved_on_in_the_moment_in_which_it_arrives(
+    divided, monkeypatch, wait_until
+):
+    client, parts = divided
+    before = members(parts["A"])
+    steward = client.cluster.scheduler.plugins["poolpart-steward"]
+    arrived = []
+
+    def move_on(seat):
+        steward.book.put(seat, "B")
+        steward.settling.settle([seat])
+
+    def wake_and_move_on(scheduler, worker):
+        # The last that is done for a worker; what comes next in the event loop is before anybody
+        # hears that it is done.
+        wake(scheduler, worker)
+        if worker.resources.get("A") and worker.name not in before and not arrived:
+            arrived.append(worker.name)
+            seat = steward.settling.seat_at(worker.address)
+            asyncio.get_running_loop().call_soon(move_on, seat)
+
+    monkeypatch.setattr(settling, "wake", wake_and_move_on)
+    parts["A"].grow(1, source="C")
+    wait_until(lambda: arrived and arrived[0] in members(parts["B"]))
+    assert members(parts["A"]) == before
+    assert declared(client) == declared_by_themselves(client)
+
+
+def test_a_cancelled_task_that_is_on_its_way_when_its_worker_leaves(start, monkeypatch, wait_until):
+    client = start({"a": {}, "b": {}})
+    parts = Pool.from_client(client).divide({"A": n_workers(1, minimum=0), "B": rest()})
+    scheduler, moving = client.cluster.scheduler, parts["A"].workers[0]
+    stream, on_the_way = scheduler.stream_comms[moving.address], []
+    send = stream.send
+    monkeypatch.setattr(stream, "send", lambda *messages: on_the_way.extend(messages))
+    task = parts["A"].submit(brief)
+    wait_until(lambda: any(message["op"] == "compute-task" for message in on_the_way))
+    task.cancel()
+    wait_until(lambda: not scheduler.tasks)
+    with ThreadPoolExecutor(1) as thread:
+        moved = thread.submit(parts["A"].shrink)
+        wait_until(lambda: on_the_way[-1]["op"] == "poolpart-mark")
+        time.sleep(0.1)
+        assert not moved.done()
+        monkeypatch.undo()
+        client.sync(_send_all, send, on_the_way)
+        assert moved.result(timeout=LONG_S) == [moving.name]
+    assert client.submit(here, workers=[moving.address]).result(timeout=LONG_S) == moving.name
+    worker = client.cluster.workers[moving.name]
+    assert worker.state.total_resources == worker.state.available_resources == {"B": 1}
+    assert len({frozenset(w.stream_handlers) for w in client.cluster.workers.values()}) == 1
+
+
+async def _send_all(send, messages):
+    send(*messages)
+
+
 # -- what is refused -------------------------------------------------------------------
 
 
@@ -308,6 +378,25 @@ def test_the_lender_keeps_its_minimum(start, wait_until):
     client.gather(tasks)
     pool.stop_rebalancing("B", helps="A")
     assert (len(parts["A"]), len(parts["B"])) == (1, 3)
+
+
+def test_a_borrower_keeps_its_minimum_when_its_helpers_go_back(divided, wait_until):
+    client, parts = divided
+    pool = Pool.from_client(client)
+    pool.rebalance("C", helps="A", idle_s=0.0)
+    event = Event("borrower", client)
+    tasks = [parts["A"].submit(wait_for, "borrower") for _ in range(9)]
+    wait_until(lambda: len(parts["A"]) == 5)
+    event.set()
+    client.gather(tasks)
+    assert len(parts["A"].shrink(2)) == 2
+    with pytest.raises(PoolError, match="cannot shrink by 1: it has 1 worker and needs at least 1"):
+        parts["A"].shrink(1)
+    with pytest.raises(PoolError, match="'B' cannot grow by 1: partition 'A', beyond its minimum"):
+        parts["B"].grow(1, source="A")
+    pool.stop_rebalancing("C", helps="A")
+    assert (len(parts["A"]), len(parts["B"]), len(parts["C"])) == (1, 1, 4)
+    assert parts["A"].minimum == 1
 
 
 def test_rebalancing_that_makes_no_sense(divided):
