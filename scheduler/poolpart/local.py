@@ -130,7 +130,8 @@ def _advice() -> str:
         return "Dask's dashboard looks for a home folder: let HOME name one."
     return (
         "Each imports the script that starts the cluster: do that under "
-        "`if __name__ == '__main__':` in it."
+        "`if __name__ == '__main__':` in it. If it does so, or there is none, one was killed while "
+        "it started: look whether memory is short."
     )
 
 
