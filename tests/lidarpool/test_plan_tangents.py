@@ -9,7 +9,7 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from lidarpool.plan import shortest_path_length
+from lidarpool.plan import shortest_path_length, tangents
 from lidarpool.plan.geometry import segment_distances
 
 CORNERS = 16
@@ -105,6 +105,26 @@ def test_the_default_scene():
     centres = [(-20, -20), (20, -20), (-20, 20), (20, 20), (-10, -5), (5, 5)]
     found = shortest_path_length((25, 25), (-30, -20), centres, [2] * 6)
     assert math.dist((25, 25), (-30, -20)) < found < 71.3
+
+
+def test_of_thousands_of_discs_those_out_of_reach_cost_nothing():
+    """Looking at all of them would take an hour."""
+    x, y = np.meshgrid(np.linspace(-50, 50, 60), np.linspace(6, 60, 50))
+    grid = np.stack([x.ravel(), y.ravel()], axis=1)
+    found = shortest_path_length((-5, 0), (5, 0), [*grid, (0, 0)], [*np.full(3000, 0.4), 2])
+    assert found == pytest.approx(around_one(5, 2), rel=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_leaving_out_what_is_out_of_reach_changes_nothing(seed):
+    random = np.random.default_rng(seed)
+    centres, radii = random.uniform(-20, 20, (60, 2)), random.uniform(0.5, 3.2, 60)
+    ends = np.array([[-24.0, -3], [24, 5]])
+    centres, radii = tangents._outermost(centres, radii)
+    of_all = tangents._around(ends, centres, radii, tolerance=1e-9)
+    assert shortest_path_length(*map(tuple, ends), centres, radii) == pytest.approx(
+        of_all, rel=1e-12
+    )
 
 
 def polygon(centre, radius):
