@@ -9,7 +9,7 @@ import secrets
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -58,18 +58,30 @@ def result_folder(folder: Path) -> Iterator[None]:
     made = [path for path in (folder, *folder.parents) if not path.exists()]  # innermost first
     try:
         lock = _claim(folder)
-        try:
-            _clear_up(folder)
-            _check_room(folder)
-            yield
-        finally:
-            os.close(lock)
+    except BaseException as error:
+        if not isinstance(error.__cause__, BlockingIOError):  # else another run has made them, too
+            _remove_empty(made)
+        raise
+    try:
+        _clear_up(folder)
+        _check_room(folder)
+        yield
     finally:
-        for path in made:
-            if path.exists():
-                if any(path.iterdir()):
-                    break
-                path.rmdir()
+        if sys.platform == "win32":  # removes no folder with an open file
+            os.close(lock)
+            _remove_empty(made)
+        else:  # as long as no other run can have begun to use them
+            _remove_empty(made)
+            os.close(lock)
+
+
+def _remove_empty(folders: Iterable[Path]) -> None:
+    """Remove folders, innermost first, up to one that holds something."""
+    for path in folders:
+        if path.exists():
+            if any(path.iterdir()):
+                break
+            path.rmdir()
 
 
 def write_result(
@@ -184,6 +196,8 @@ def _lock(folder: Path, spare: int) -> int:
     handle = os.open(folder, os.O_RDONLY)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if not (folder.exists() and os.path.samestat(os.fstat(handle), folder.stat())):
+            raise BlockingIOError(errno.EAGAIN, "removed by the run that had made it")
     except OSError as error:
         if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP):  # a network disk without locks
             os.close(handle)
