@@ -378,6 +378,13 @@ def test_dae_that_states_nothing_is_in_metres_and_stands_by_its_standard(tmp_pat
     assert np.ptp(meshes[1].vertices, axis=0).tolist() == [2, 0, 2]
 
 
+@pytest.mark.parametrize("metres", ["0,01", "0", "-1", "nan", ""])
+def test_dae_with_a_unit_that_is_no_length(tmp_path, metres):
+    text = dae(unit=f'<unit name="cm" meter="{metres}"/>')
+    with pytest.raises(LidarpoolError, match=f"its unit is '{metres}' metres"):
+        load_meshes(write(tmp_path / "m.dae", text))
+
+
 def test_dae_with_a_lost_geometry(tmp_path):
     with pytest.raises(LidarpoolError, match=r"broken or cut short .*lost"):
         load_meshes(write(tmp_path / "m.dae", dae(url="#lost")))
@@ -535,6 +542,12 @@ def test_missing_and_folders(tmp_path):
         load_meshes(tmp_path / "no.glb")
     with pytest.raises(LidarpoolError, match="is not a file"):
         load_meshes(tmp_path / "d.glb")
+
+
+def test_a_link_to_nothing(tmp_path):
+    (tmp_path / "hall.glb").symlink_to("lost.glb")
+    with pytest.raises(LidarpoolError, match=r"hall\.glb is a link to lost\.glb, which does not"):
+        load_meshes(tmp_path / "hall.glb")
 
 
 def test_unreadable(tmp_path, monkeypatch):

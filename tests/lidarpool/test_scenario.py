@@ -177,6 +177,22 @@ def test_flat_objects_are_no_obstacles(scenario):
     assert len(everything(scenario(text))[2].radii) == 6
 
 
+def test_an_obstacle_whose_name_has_brackets(tmp_path, scenario):
+    walls = "v 0 0 0\nv 1 0 0\nv 0 1 2\no Wall[1]\nf 1 2 3\no Wall1\nf 1 2 3\n"
+    (tmp_path / "m.obj").write_text(walls)
+    ends = "scene: m.obj\nplanning: {start: [-9, 0], target: [9, 0], obstacles: "
+    assert len(everything(scenario(ends + '["Wall[1]"]}'))[2].radii) == 1
+    assert len(everything(scenario(ends + '["Wall[12]"]}'))[2].radii) == 1  # any of 1 and 2
+    assert len(everything(scenario(ends + '["Wall*"]}'))[2].radii) == 2
+
+
+@pytest.mark.parametrize(("more", "radii"), [("", []), (", clearance_m: 0.5", [0.5])])
+def test_an_upright_line_is_no_obstacle_unless_there_is_clearance(tmp_path, scenario, more, radii):
+    (tmp_path / "m.obj").write_text("v 1 0 0\nv 1 0 1\nv 1 0 2\no Line\nf 1 2 3\n")
+    text = f"scene: m.obj\nplanning: {{start: [-9, 0], target: [9, 0]{more}}}"
+    assert everything(scenario(text))[2].radii.tolist() == radii
+
+
 def test_numbers_as_everybody_writes_them(scenario):
     loaded = scenario("cloud: {precision_m: 1e-3}\nsensor: {max_range_m: .inf, step_deg: 20}")
     assert loaded.cloud.precision_m == 0.001

@@ -55,7 +55,22 @@ def read_dae(file: IO[bytes]) -> tuple[list[Mesh], float | None, str | None]:
     if document.scene is not None:
         meshes += _meshes(document.scene)
     axis = document.assetInfo.upaxis
-    return meshes, document.assetInfo.unitmeter, axis[0].lower() if axis else None
+    return meshes, _unit_m(document), axis[0].lower() if axis else None
+
+
+def _unit_m(document: Any) -> float | None:
+    """Metres in the file's unit; ValueError for one that pycollada would pass over in silence."""
+    unit = document.xmlnode.find("{*}asset/{*}unit")
+    stated = None if unit is None else unit.get("meter")
+    if stated is None:
+        return None
+    try:
+        metres = float(stated)
+    except ValueError:
+        metres = 0.0
+    if not 0 < metres < np.inf:
+        raise ValueError(f"its unit is {stated!r} metres")
+    return metres
 
 
 def _meshes(scene: Any) -> Iterator[Mesh]:

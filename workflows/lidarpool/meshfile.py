@@ -134,6 +134,11 @@ def _bytes_of(path: Path) -> bytes:
     try:
         kind = path.stat().st_mode
     except OSError as error:
+        if error.errno == errno.ENOENT and path.is_symlink():
+            raise LidarpoolError(
+                f"{path} is a link to {path.readlink()}, which does not exist: mend the link, or "
+                "give the file itself."
+            ) from error
         if error.errno in (errno.ENOENT, errno.ENOTDIR):
             raise LidarpoolError(
                 f"{path} does not exist: check the name and the folder.{_like(path)}"

@@ -233,6 +233,8 @@ class Scenario(Section):
         with self._named():
             discs, labels = self._discs(scene)
             discs[:, 2] += section.clearance_m
+            wide = np.flatnonzero(discs[:, 2])  # upright lines, without area, bar nothing
+            discs, labels = discs[wide], [labels[i] for i in wide]
             local = [(x - x0, y - y0) for x, y in (start, target)]
             _check_free({"start": local[0], "target": local[1]}, discs, labels)
             return Planning(
@@ -282,7 +284,10 @@ class Scenario(Section):
                 place = np.subtract(entry.centre, scene.origin[:2])
                 rows[f"planning.obstacles[{number}]"] = [*place, entry.radius_m]
                 continue
-            found = [i for i, name in enumerate(scene.names) if fnmatchcase(name, entry.object)]
+            # Brackets and all, a name is that object; else it is a pattern.
+            found = [i for i, name in enumerate(scene.names) if name == entry.object] or [
+                i for i, name in enumerate(scene.names) if fnmatchcase(name, entry.object)
+            ]
             if not found:
                 hint = did_you_mean(entry.object, scene.names)
                 raise LidarpoolError(

@@ -33,7 +33,8 @@ class Sensor:
     step_deg
         Degrees turned in one time step, in (0, 360].
     min_range_m, max_range_m
-        Returns nearer or farther than this, in metres, are not seen.
+        Returns nearer or farther than this, in metres, are not seen. A ray goes on through
+        what is nearer.
 
     Raises
     ------
