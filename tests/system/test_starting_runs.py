@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import dask
 import pytest
 from distributed import Client
 
-from lidarpool import Scene, Sensor, Survey, simulate
+from lidarpool import LidarpoolError, Scene, Sensor, Survey, simulate
+from lidarpool.checks import common_backend
 from poolpart import Pool
 
 SURVEY = Survey(Sensor(rays_per_revolution=180, layers=16, step_deg=10), [(0, 0, 1)], steps=36)
@@ -50,3 +52,23 @@ def test_a_run_starts_without_a_worker_that_breaks_off(client, break_off, questi
     break_off(question)
     result = simulate(Scene.seed(), SURVEY, client=client, backend="numpy")
     assert result.hits > 0
+
+
+def test_a_cluster_that_is_lost_before_the_run_has_begun_is_named(outside, monkeypatch):
+    cluster = outside()
+    cluster.add("GPU")
+    cluster.add("LIDAR", slots=4)
+    cluster.wait()
+
+    def lose(client, *rest):
+        cluster.kill("scheduler")
+        return common_backend(client, *rest)
+
+    monkeypatch.setattr("lidarpool.run.common_backend", lose)
+    lost = pytest.raises(LidarpoolError, match=f"{cluster.address} cannot be reached any more")
+    with (
+        dask.config.set({"distributed.comm.timeouts.connect": "2s"}),
+        Client(cluster.address, set_as_default=False) as client,
+        lost,
+    ):
+        simulate(Scene.seed(), SURVEY, client=client, backend="numpy")

@@ -63,22 +63,36 @@ class Run:
         self, client: Client, kept: Deliveries, wants_pause: Callable[[], bool] = lambda: False
     ) -> None:
         job = kept.job
-        pool = survey_pool(client, job.collectors, job.planning is not None)
         self.client, self.job, self.kept = client, job, kept
-        self.address: str = client.scheduler.address  # for when it is lost
+        # For when it is lost; a client that was never connected is refused in a moment.
+        self.address: str = getattr(client.scheduler, "address", "")
+        try:
+            pool = survey_pool(client, job.collectors, job.planning is not None)
+            casting = [worker for worker in pool if worker.resources.get(GPU)]
+            kept.backend = common_backend(client, kept.backend or job.backend, casting, kept.advice)
+            assign_devices(client, casting)  # all at once: those that see few of them choose first
+        except LidarpoolError:
+            raise
+        except Exception as error:  # which one, depends on what was being asked
+            if client.status != "running" or isinstance(error, CommClosedError):
+                raise self._told_lost() from error
+            raise
         self.partitions: dict[str, Partition] = pool.partitions()
-        casting = [worker for worker in pool if worker.resources.get(GPU)]
-        kept.backend = common_backend(client, kept.backend or job.backend, casting, kept.advice)
         self.notes: list[str] = []
         if not any(worker.gpus for worker in casting):
             self.notes.append(
                 f"no GPU in partition GPU: {len(casting)} CPU worker{'s' * (len(casting) > 1)} "
                 f"cast{'s' * (len(casting) == 1)} the rays with {kept.backend}"
             )
-        assign_devices(client, casting)  # all at once: those that see few of them choose first
         self.setup = SurveySetup(job.scene, job.survey.sensor, kept.backend)
         self.callers_error: BaseException | None = None  # raised by a callback
         self.standstill = Standstill(wants_pause, kept.sync)
+
+    def _told_lost(self) -> LidarpoolError:
+        return LidarpoolError(
+            f"The cluster at {self.address} cannot be reached any more, or somebody cancelled "
+            "the tasks of this run; it has ended without a result."
+        )
 
     def drive(
         self,
@@ -114,10 +128,7 @@ class Run:
             if isinstance(error, PoolError) and not lost:
                 raise LidarpoolError(str(error)) from error
             if isinstance(error, _CLUSTER_LOST) or (lost and isinstance(error, Exception)):
-                raise LidarpoolError(
-                    f"The cluster at {self.address} cannot be reached any more, "
-                    "or somebody cancelled the tasks of this run; it has ended without a result."
-                ) from error
+                raise self._told_lost() from error
             raise
         self.kept.save()
         return make_result(
