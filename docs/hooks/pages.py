@@ -23,6 +23,7 @@ _ELSEWHERE = {
     "README.md": "index.md",
     "ARCHITECTURE.md": "architecture.md",
     "CHANGELOG.md": "changelog.md",
+    "CONTRIBUTING.md": "contributing.md",
 }
 _LINK = re.compile(r"(\]\()([^)#\s]+)([^)]*\))")
 # What a browser would fetch by itself, from elsewhere.
