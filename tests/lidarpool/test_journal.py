@@ -3,6 +3,7 @@
 import json
 import os
 import random
+import re
 import struct
 import subprocess
 import sys
@@ -456,6 +457,31 @@ def outcome(path, expected):
     assert content(journal) == expected
     journal.close()
     return "resumed"
+
+
+@pytest.mark.parametrize(
+    ("harm", "what"),
+    [
+        (lambda file: (file.seek(900), file.write(b"\xff" * 40)), "the record at byte .* damaged"),
+        (lambda file: file.truncate(700), "the file ends at byte 700, before its records do"),
+        (lambda file: (file.truncate(0), file.truncate(9000)), "the record at byte 0 is damaged"),
+    ],
+    ids=["written over", "cut", "zeros"],
+)
+def test_a_journal_that_others_write_to_makes_no_result(harm, what, path):
+    journal = Journal(path, make_job(), COMMAND_TERMS)
+    with pytest.raises(LidarpoolError) as ended, journal.kept_on_error():
+        deliver(journal)
+        journal.check()  # it is whole
+        with (path / RECORDS).open("r+b") as file:
+            harm(file)
+        before = files(path)
+        journal.check()
+    assert re.search(
+        rf"was changed while this run wrote to it \(.*{what}.*--fresh", str(ended.value)
+    )
+    assert not hasattr(ended.value, "__notes__")  # there is nothing to go on from
+    assert files(path) == before
 
 
 @pytest.mark.parametrize("orderly", [True, False])

@@ -284,3 +284,22 @@ def test_a_backend_that_is_not_to_be_had_any_more(cluster, tmp_path, monkeypatch
             r"were cast with it: continue where it is to be had, or drop them",
         ):
             simulate(Scene.seed(), SURVEY, client=client, journal=journal, resume=True)
+
+
+def test_a_journal_that_others_write_to_makes_no_result(cluster, tmp_path):
+    def meddle(frame):
+        if frame.scan == 30:
+            with (tmp_path / "journal" / "records").open("r+b") as file:
+                file.truncate(40)  # what comes behind it leaves a gap of zeros
+
+    survey = Survey(Sensor(rays_per_revolution=360, layers=8, step_deg=10), [(0, 0, 1)], steps=36)
+    refused = pytest.raises(LidarpoolError, match="was changed while this run wrote to it")
+    with Client(cluster, set_as_default=False) as client, refused:
+        simulate(
+            Scene.seed(),
+            survey,
+            client=client,
+            backend="numpy",
+            on_frame=meddle,
+            journal=tmp_path / "journal",
+        )

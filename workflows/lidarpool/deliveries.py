@@ -73,6 +73,9 @@ class Deliveries:
     def sync(self) -> None:
         """Make sure of what there is: for a while nothing may come."""
 
+    def check(self) -> None:
+        """See that what a result is to be made of is as it was delivered."""
+
     def save(self) -> None:
         """Make sure of everything, at the end."""
 

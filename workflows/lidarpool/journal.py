@@ -33,7 +33,7 @@ from .journal_format import (
 )
 from .journal_store import JournalStore
 from .plan import Trial
-from .records import Record, RecordFile
+from .records import DamagedFileError, Record, RecordFile
 from .totals_file import TotalsFile
 from .trial_record import trial_from_json, trial_to_json
 
@@ -110,7 +110,7 @@ class Journal(Deliveries):
         self.path, self.terms = path, terms
         self._store = JournalStore(path, Identity.of(job.scene, job.survey, job.planning))
         super().__init__(job, self._store)
-        self._gone = False  # removed, and not needed any more
+        self._gone = False  # removed and not needed any more, or of no use
         self._totals_file = TotalsFile(path, self.totals)
 
     # -- what is in it -----------------------------------------------------------------
@@ -235,6 +235,22 @@ class Journal(Deliveries):
                 self._totals_file.write()
 
     # -- the end -----------------------------------------------------------------------
+
+    def check(self) -> None:
+        """See that nobody else has written to the file; on some network disks no lock keeps them.
+
+        Raises
+        ------
+        LidarpoolError
+            If it does not hold any more what was delivered.
+        """
+        if (file := self._store.file) is not None:
+            try:
+                file.check()
+            except (OSError, DamagedFileError) as error:
+                self.close()
+                self._gone = True
+                raise self._refusal(f"was changed while this run wrote to it ({error})") from error
 
     def save(self) -> None:
         """Write everything to the disk, with a mark at the end; nothing more will come.

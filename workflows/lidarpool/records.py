@@ -110,6 +110,22 @@ class RecordFile:
             )
         self.end, self._ragged = at, at < size
 
+    def check(self) -> None:
+        """Read all records once more, and change nothing.
+
+        Raises
+        ------
+        DamagedFileError, OSError
+            If one is not there as it was written: somebody else has written to the file, or
+            cut it.
+        """
+        at = 0
+        while at < self.end:
+            record = self._record_at(at, self.end)
+            if record is None:
+                raise DamagedFileError(f"the record at byte {at:,} is damaged")
+            at = record.offset + len(record.payload)
+
     def clear(self) -> None:
         """Drop all that is in the file; OSError if that cannot be done."""
         self._file.truncate(0)

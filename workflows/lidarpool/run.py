@@ -130,6 +130,7 @@ class Run:
             if isinstance(error, _CLUSTER_LOST) or (lost and isinstance(error, Exception)):
                 raise self._told_lost() from error
             raise
+        self.kept.check()
         self.kept.save()
         return make_result(
             self.kept,
