@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import re
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -139,9 +140,10 @@ def write(tmp_path: Path, planning: Planning) -> Callable[..., tuple[str, dict[s
         tasks: Sequence[TaskRecord] = tuple(records()),
         plan: Planning | None = planning,
         recipe: Recipe | None = RECIPE,
+        origin: tuple[float, float, float] = (0, 0, 0),
         **changes: Any,
     ) -> tuple[str, dict[str, Any]]:
-        scene = scene_of(names)
+        scene = replace(scene_of(names), origin=np.array(origin))
         survey = Survey(Sensor(layers=16), poses=[(0, 0, 1), (1, 0, 2)], steps=60)
         trials = tuple(run_trial(plan, number) for number in range(plan.trials)) if plan else ()
         book = TaskBook()
@@ -433,6 +435,16 @@ def test_tasks_of_lost_workers_are_told_to_be_missing(write, replayed):
 
 def test_the_same_run_gives_the_same_page(write):
     assert write()[0] == write()[0]
+
+
+def test_a_path_far_from_zero_is_told_in_world_coordinates(write, planning):
+    _, near = write()
+    _, far = write(origin=(500_000.0, 4_000_000.0, 100.0))
+    for place in ("start", "target"):
+        assert far["planning"][place] == np.add(near["planning"][place], (5e5, 4e6)).tolist()
+    shift = np.subtract(far["planning"]["path"], near["planning"]["path"])
+    np.testing.assert_allclose(shift, np.full(shift.shape, (5e5, 4e6)), atol=1e-8)
+    assert far["planning"]["best_length"] == near["planning"]["best_length"]
 
 
 # -- how to have it once more --------------------------------------------------------------------

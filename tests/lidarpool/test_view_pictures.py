@@ -1,4 +1,5 @@
 import inspect
+import re
 
 import numpy as np
 import pytest
@@ -234,6 +235,20 @@ def test_the_path_plot_has_equal_axes(tmp_path, planned, monkeypatch):
     )
     shown = axes.get_xlim()[0] <= -30 and axes.get_xlim()[1] >= 25
     assert shown and axes.get_xlabel() == "x (m)" and axes.get_ylabel() == "y (m)"
+
+
+def test_the_path_plot_tells_world_coordinates(tmp_path, planned, monkeypatch):
+    from lidarpool.view.page import Page
+
+    kept = []
+    monkeypatch.setattr(Page, "save", lambda page, path: kept.append(page.figure))
+    draw_path(tmp_path / "a.png", *planned, origin=(500_003, 4_000_000))
+    (axes,) = kept[0].axes
+    ticks = axes.xaxis.get_ticklocs()
+    labels = [axes.xaxis.get_major_formatter()(tick, k) for k, tick in enumerate(ticks)]
+    offset = int(re.sub(r"\D", "", axes.get_xlabel()))  # x − 499 970 (m)
+    assert [offset + float(label) for label in labels] == (500_003 + ticks).tolist()
+    assert axes.get_xlim()[0] <= -30 and axes.get_xlim()[1] >= 25
 
 
 @pytest.mark.parametrize("length", [NAN, INF, 0.0])

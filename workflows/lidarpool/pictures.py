@@ -68,6 +68,6 @@ def picture_makers(
     planning, plan = shown.planning, shown.plan
     if planning is not None and plan is not None:
         makers["path"] = lambda path: draw_path(
-            path, planning, plan, shown.trials, size=size, dark=dark
+            path, planning, plan, shown.trials, origin=scene.origin[:2], size=size, dark=dark
         )
     return {name: makers[name] for name in names if name in makers}

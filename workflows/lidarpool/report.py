@@ -82,7 +82,7 @@ def make_report(
         "replayed": result.replayed,
         "duplicates_dropped": result.duplicates_dropped,
         "resumed_scans": result.resumed,
-        "planning": _planning(result, planning),
+        "planning": _planning(result, planning, scene),
         "files": list(files),
     }
 
@@ -139,13 +139,15 @@ def overlap_seconds(totals: Iterable[StageTotals]) -> float:
     return sum(max(0.0, min(a[1], b[1]) - max(a[0], b[0])) for a in casting for b in planning)
 
 
-def _planning(result: Result, planning: Planning | None) -> dict[str, Any] | None:
+def _planning(result: Result, planning: Planning | None, scene: Scene) -> dict[str, Any] | None:
+    """Tell what was planned and found; places are in world coordinates, as in the scenario."""
     plan = result.plan
     if plan is None or planning is None:
         return None
+    origin = scene.origin[:2]
     return {
-        "start": list(planning.start),
-        "target": list(planning.target),
+        "start": (planning.start + origin).tolist(),
+        "target": (planning.target + origin).tolist(),
         "obstacles": len(planning.radii),
         "trials": plan.trials,
         "collision_free_trials": sum(trial.collision_free for trial in result.trials),
@@ -158,7 +160,7 @@ def _planning(result: Result, planning: Planning | None) -> dict[str, Any] | Non
         "excess": _finite(plan.excess),
         "clearance": _finite(plan.clearance),
         "collision_free": plan.collision_free,
-        "path": plan.path.tolist(),
+        "path": (plan.path + origin).tolist(),
     }
 
 

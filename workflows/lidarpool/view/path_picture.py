@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..choice import one_of_each_part
 from ..plan import Plan, Planning
@@ -45,6 +45,7 @@ def draw_path(
     plan: Plan,
     trials: Iterable[HasWaypoints] = (),
     *,
+    origin: ArrayLike = (0.0, 0.0),
     size: tuple[int, int] = SIZE,
     dark: bool = False,
 ) -> Path:
@@ -60,6 +61,8 @@ def draw_path(
         The best path.
     trials
         What it was chosen from; of more than 1000 an even choice is drawn.
+    origin
+        x and y of the local origin: the axes tell world coordinates, local + origin.
     size
         Width and height in pixels.
     dark
@@ -76,7 +79,7 @@ def draw_path(
     every = _trial_paths(best, trials)
     others = [every[k] for k in one_of_each_part(len(every), MOST_TRIALS)]
     axes = page.figure.add_axes(FRAME)
-    _frame(axes, page, _limits(best, others, planning, size))
+    _frame(axes, page, _limits(best, others, planning, size), np.asarray(origin))
     discs = [
         Circle((x, y), radius)
         for (x, y), radius in zip(planning.centres, planning.radii, strict=True)
@@ -140,12 +143,13 @@ def _limits(
     return np.stack([middle - half, middle + half])
 
 
-def _frame(axes: Axes, page: Page, limits: Floats) -> None:
-    """Set limits, grid and round ticks, the same on both axes."""
+def _frame(axes: Axes, page: Page, limits: Floats, origin: Floats) -> None:
+    """Set local limits, grid and round ticks of the world, the same on both axes."""
     theme = page.theme
     step = nice_step(float(np.ptp(limits[:, 0])) / 8)
     (x0, y0), (x1, y1) = limits.tolist()
-    across, up = axis("x", x0, x1, step, 0.0), axis("y", y0, y1, step, 0.0)
+    across = axis("x", x0, x1, step, float(origin[0]))
+    up = axis("y", y0, y1, step, float(origin[1]))
     axes.set(xlim=(x0, x1), ylim=(y0, y1), facecolor=theme.ground)
     axes.set_aspect("equal")
     axes.grid(color=theme.line, lw=0.5 * page.unit)
