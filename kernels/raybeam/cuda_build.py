@@ -137,7 +137,8 @@ def _crown(
     pairs, rounds = ploc.crown(low, high, bits[:, 7] >> 1, cp.asnumpy(ids), made)
     n = len(children)
     if len(pairs):
-        children[made - n : made - n + len(pairs)].set(pairs)
+        # Not by `set`, which may read them when they are gone already (cuda_scene.sent).
+        children[made - n : made - n + len(pairs)] = cp.asarray(pairs)
     for start, stop in rounds:
         nodes = (np.int32(start), np.int32(stop - start), np.int32(n))
         kernels.run("join_children", stop - start, children, *nodes, boxes)

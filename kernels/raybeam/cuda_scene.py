@@ -57,7 +57,10 @@ def free(cupy: Any) -> int:
 
 
 def sent(cupy: Any, array: NDArray[Any]) -> Any:
-    """Copy an array to the current device, in the order of the current stream.
+    """Copy an array to the current device, and wait for that.
+
+    A device that reads ordinary memory itself, as Grace Hopper does, may still be about to read
+    when `set` returns: the caller may let go of the array once this has returned.
 
     Not by `asarray`, which copies by way of page-locked memory as large as the array and keeps
     that: right for the rays of a chunk, too much for a scene.
@@ -65,6 +68,7 @@ def sent(cupy: Any, array: NDArray[Any]) -> Any:
     copy = cupy.empty(array.shape, array.dtype)
     if array.size:
         copy.set(array)
+        cupy.cuda.get_current_stream().synchronize()
     return copy
 
 

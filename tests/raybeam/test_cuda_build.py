@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import weakref
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
-from raybeam import RayCaster, cuda_build, cuda_scene, ploc
+from raybeam import Pattern, RayCaster, cuda_build, cuda_scene, ploc
 from raybeam.layout import lay_out
 from raybeam.mesh import local_mesh
 
@@ -144,3 +147,29 @@ def test_casts_do_not_depend_on_who_builds(source_backend, shapes, monkeypatch):
         got = source_backend(local).cast(check_rays([0, 0, 0], directions, 0, np.inf))
         np.testing.assert_array_equal(got.distance, want.distance)
         np.testing.assert_array_equal(got.triangle, want.triangle)
+
+
+@pytest.mark.parametrize("least", [1, 1 << 20], ids=["device builds", "host builds"])
+def test_arrays_are_kept_until_the_device_has_read_them(source_backend, shapes, monkeypatch, least):
+    """Some devices read the host's memory only when the stream comes to it."""
+    mesh = local_mesh(*shapes["soup"]("random", count=3000))
+    unread, read = [], []
+
+    def synchronize():
+        read.extend(given() is not None for given in unread)
+        unread.clear()
+
+    def copy(self, values):
+        unread.append(weakref.ref(values))
+        self[...] = values
+
+    cuda = source_backend._library().cuda
+    monkeypatch.setattr(type(source_backend._library().empty(1)), "set", copy)
+    stream = SimpleNamespace(synchronize=synchronize)
+    monkeypatch.setattr(cuda, "get_current_stream", lambda: stream)
+    monkeypatch.setattr(source_backend, "device_build", least)
+    engine = source_backend(mesh)
+    engine.scan(Pattern(np.eye(3)), (0, 3), np.zeros((1, 3)), None, (0.0, np.inf))
+    assert len(read) > 1
+    assert all(read)
+    assert not unread
