@@ -205,4 +205,5 @@ def _bundle(origins: Float, directions: Float, entry: Float, t_max: float) -> _B
 
 def _limit(t: Float, entry: Float) -> Single:
     """Distances from `entry` in float32, never less than the exact ones."""
-    return np.minimum((t - entry) * (1 + _SLACK) + _SLACK, _ACROSS).astype(np.float32)
+    left = (t - entry) * (1 + _SLACK) + _SLACK
+    return np.clip(left, -_ACROSS, _ACROSS).astype(np.float32)

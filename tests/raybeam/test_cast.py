@@ -289,6 +289,7 @@ def test_absurd_distances_do_no_harm(caster, shapes, far):
     towards = cube.cast(far * axes, -axes)
     assert not np.isnan(towards.distance).any()
     assert cube.cast([0, 0, 0], axes, 0, far).hit.all()
+    assert not cube.count(far * axes, -axes, 0, 1, every=True).any()
 
 
 @pytest.mark.parametrize("size", [1e-30, 1e-6, 1e6, 1e30])
