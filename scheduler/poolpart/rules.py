@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from .errors import PoolError
-from .selection import NO_GPU, by_gpu, by_host, check_name, check_slots
+from .selection import NO_GPU, by_gpu, by_host, check_name, check_slots, left_alone
 from .wording import counted
 from .worker_info import WorkerInfo
 
@@ -220,7 +220,7 @@ def divide(
             raise PoolError(
                 f"Partition {name!r} would have {counted(len(chosen[name]), 'worker')} of the "
                 f"{rule.minimum} that it needs: {len(free)} of {len(pool)} are left for it. "
-                "Start more workers, or put it before others."
+                f"Start more workers, or put it before others.{left_alone(name, pool)}"
             )
         if isinstance(rule, PerGpu) and free and not any(worker.gpus for worker in free):
             notes[name] = NO_GPU

@@ -74,11 +74,11 @@ def choose(
     free = [worker for worker in pool if worker.partitions == {partition}]
     free += [worker for worker in pool if not worker.partitions]
     if n_workers is not None:
-        return by_count(partition, free, n_workers), ""
+        return by_count(partition, pool, free, n_workers), ""
     if not free:
         raise PoolError(
             f"No worker is left for partition {partition!r}: all {len(pool)} of this pool "
-            "belong to others. Start more workers."
+            f"belong to others. Start more workers.{left_alone(partition, pool)}"
         )
     if max_workers_per_host is not None:
         return by_host(free, max_workers_per_host), ""
@@ -116,12 +116,23 @@ def by_name(partition: str, pool: Sequence[WorkerInfo], wanted: Sequence[str]) -
     return chosen
 
 
-def by_count(partition: str, free: Sequence[WorkerInfo], n_workers: int) -> list[WorkerInfo]:
-    """Take so many workers."""
+def left_alone(partition: str, pool: Sequence[WorkerInfo]) -> str:
+    """Say, for a message, which workers cannot be had because of what they declare."""
+    others = Counter(name for worker in pool for name in worker.partitions - {partition})
+    if not others:
+        return ""
+    declare = ", ".join(f"{name} by {count}" for name, count in sorted(others.items()))
+    return f" A worker that declares another resource is not taken: {declare}."
+
+
+def by_count(
+    partition: str, pool: Sequence[WorkerInfo], free: Sequence[WorkerInfo], n_workers: int
+) -> list[WorkerInfo]:
+    """Take so many workers of those that are free."""
     if len(free) < n_workers:
         raise PoolError(
             f"Partition {partition!r} asks for {counted(n_workers, 'worker')}; the pool has "
-            f"{counted(len(free), 'worker')} in no other partition."
+            f"{counted(len(free), 'worker')} in no other partition.{left_alone(partition, pool)}"
         )
     return list(free[:n_workers])
 

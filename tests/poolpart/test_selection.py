@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from poolpart import PoolError, WorkerInfo
+from poolpart import PoolError, WorkerInfo, n_workers
+from poolpart.rules import divide
 from poolpart.selection import NO_GPU, check_request, choose
 
 NONE = dict.fromkeys(("max_workers_per_gpu", "max_workers_per_host", "n_workers", "workers"))
@@ -67,6 +68,15 @@ def test_a_resource_of_quantity_0_does_not_bind_a_worker():
 def test_too_few():
     with pytest.raises(PoolError, match="3 workers; the pool has 1 worker in no other partition"):
         choose("P", [worker("a"), worker("b", Q=1)], n_workers=3)
+
+
+@pytest.mark.parametrize("selector", ["n_workers", "max_workers_per_host"])
+def test_workers_that_cannot_be_had_are_told_by_what_they_declare(selector):
+    pool = [worker("a", memory=1e9), worker("b", memory=1e9, disk=1)]
+    with pytest.raises(PoolError, match="another resource is not taken: disk by 1, memory by 2"):
+        choose("P", pool, **{selector: 1})
+    with pytest.raises(PoolError, match="another resource is not taken: disk by 1, memory by 2"):
+        divide({"P": n_workers(1)}, pool)
 
 
 @pytest.mark.parametrize("selector", ["max_workers_per_host", "max_workers_per_gpu"])
