@@ -377,6 +377,38 @@ def test_copies_with_one_part_number_are_all_there_or_refused(tmp_path):
         load_meshes(path)
 
 
+@pytest.mark.parametrize(
+    ("placed", "readable"),
+    [
+        ([("a", 7)], 1),
+        ([("a", 7), ("b", 8)], 2),
+        ([("a", 7), ("b", 7)], 0),  # the numbers of a file are its own
+        ([("a", 1)], 0),  # that of an object of the model
+        ([("a", 7), ("a", 7)], 0),  # two copies
+        ([("two", 7), ("two", 8)], 0),  # an object of two parts, as slicers write it
+    ],
+)
+def test_parts_in_other_files_of_a_3mf_are_told_apart_or_refused(tmp_path, placed, readable):
+    components = "".join(
+        f'<component path="/3D/Objects/{file}.model" objectid="{number}"/>'
+        for file, number in placed
+    )
+    assembled = f'<object id="2"><components>{components}</components></object>'
+    second = model().partition("<resources>")[2].partition("</resources>")[0]
+    files = {
+        "3D/3dmodel.model": model(objects=assembled, items='<item objectid="2"/>'),
+        "3D/Objects/a.model": model(),
+        "3D/Objects/b.model": model(),
+        "3D/Objects/two.model": model(objects=second.replace('id="1"', 'id="2"')),
+    }
+    path = write(tmp_path / "s.3mf", packed(**files))
+    if readable:
+        assert [len(mesh.faces) for mesh in load_meshes(path)] == [1] * readable
+    else:
+        with pytest.raises(LidarpoolError, match="cannot be told apart"):
+            load_meshes(path)
+
+
 def test_nodes_of_a_dae_library_stand_where_they_are_named(tmp_path):
     path = write(tmp_path / "m.dae", dae(nodes=doubled(3), here=NODE.format(3)))
     assert len(load_meshes(path)) == 8
