@@ -14,6 +14,7 @@ from raybeam import available_backends
 from ._version import __version__
 from .complaints import did_you_mean
 from .errors import LidarpoolError
+from .interrupts import deferred_interrupts
 from .scan import COLLECT, GENERATE, GPU, LIDAR, OTHER, SORT
 from .scene import Scene
 from .survey import Survey
@@ -130,7 +131,7 @@ def common_backend(
 
 def check_backend_name(wanted: str) -> None:
     """Refuse a backend that there is nowhere."""
-    names = ("auto", *available_backends())
+    names = ("auto", *_backends_here())
     if wanted not in names:
         hint = did_you_mean(wanted, names) or f" There are {', '.join(names)}."
         raise LidarpoolError(f"There is no backend {wanted!r}.{hint}")
@@ -139,9 +140,18 @@ def check_backend_name(wanted: str) -> None:
 def check_backend_here(wanted: str, advice: str = AUTO_TAKES) -> None:
     """Refuse a backend that this machine lacks, before a local cluster is started for it."""
     check_backend_name(wanted)
-    reason = available_backends().get(wanted)
+    reason = _backends_here().get(wanted)
     if reason:
         raise LidarpoolError(f"Backend {wanted!r} cannot be used here: {reason}. {advice}")
+
+
+def _backends_here() -> dict[str, str]:
+    """Backends of this machine; an interrupt waits until they are loaded.
+
+    Within an extension module's first lines, it would pass for one that cannot be loaded.
+    """
+    with deferred_interrupts():
+        return available_backends()
 
 
 def check_precision(scene: Scene, survey: Survey) -> None:

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from .choice import one_of_each_part
 from .cloud import CHUNK_POINTS, Cloud, CloudLike
 from .errors import LidarpoolError
+from .interrupts import deferred_interrupts
 from .ply_format import header, layout, row_type
 
 # Single precision positions are kept where they err by less than this part of the precision.
@@ -208,7 +209,10 @@ def _write(temporary: Path, path: Path, cloud: CloudLike, real: np.dtype[np.floa
 
 def _write_open3d(path: Path, cloud: Cloud) -> None:
     """Write `cloud` to `path`; whether it worked is for the reading back to say."""
-    import open3d  # takes a second, and read_cloud needs none of it
+    # It takes a second, and read_cloud needs none of it. Interrupted in its extension module, it
+    # would pass for one that cannot be loaded, and cannot be loaded again.
+    with deferred_interrupts():
+        import open3d
 
     o3d: Any = open3d  # its stubs do not know which arguments its functions take
     points = o3d.t.geometry.PointCloud()
