@@ -262,3 +262,10 @@ def test_reading_what_is_not_a_cloud(tmp_path):
         read_cloud(tmp_path / "missing.ply")
     with pytest.raises(LidarpoolError, match="cannot be read"):
         read_cloud(tmp_path)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+def test_a_pipe_is_refused_instead_of_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "cloud.ply")
+    with pytest.raises(LidarpoolError, match="it is a pipe"):
+        read_cloud(tmp_path / "cloud.ply")

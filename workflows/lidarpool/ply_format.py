@@ -43,6 +43,8 @@ def layout(path: Path) -> tuple[int, int, np.dtype[np.void]]:
     ValueError
         If it is not a whole binary PLY file with our properties; the message is a clause.
     """
+    if path.is_fifo():  # waits for a writer, and cannot be read anywhere but in order
+        raise ValueError("it is a pipe")
     with path.open("rb") as file:
         head, found, _ = file.read(_HEADER_LIMIT).partition(b"end_header\n")
     text = head.decode("ascii", errors="replace")
