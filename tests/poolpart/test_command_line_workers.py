@@ -9,7 +9,7 @@ import time
 import pytest
 from distributed import Client, get_worker
 
-from poolpart import Pool, n_workers, named, rest
+from poolpart import Pool, n_workers, named, rest, worker_identities
 
 LONG_S = 60.0
 
@@ -51,7 +51,7 @@ def command_line():
 
 def declared(client):
     """What workers declare, by number of their process."""
-    workers = client.scheduler_info(n_workers=-1)["workers"]
+    workers = worker_identities(client)
     return {w["name"]: w["resources"] for w in workers.values()}
 
 
@@ -91,7 +91,7 @@ def test_live_late_killed_and_undone(command_line, wait_until):
         address = next(w.address for w in parts["B"].workers if w.name == "late")
         os.kill(client.run(os.getpid, workers=[address])[address], signal.SIGKILL)
         waiting = [parts["B"].submit(here) for _ in range(9)]
-        wait_until(lambda: address not in client.scheduler_info(n_workers=-1)["workers"], LONG_S)
+        wait_until(lambda: address not in worker_identities(client), LONG_S)
         parts["B"].wait(3, timeout_s=LONG_S)
         assert {future.result(LONG_S) for future in waiting} <= {w.name for w in parts["B"].workers}
         assert "late" in {worker.name for worker in parts["B"].workers}

@@ -11,6 +11,7 @@ import pytest
 from distributed import Client
 from distributed.diagnostics.plugin import SchedulerPlugin
 
+from poolpart import worker_identities
 from poolpart.current_client import own_client
 
 
@@ -82,7 +83,7 @@ def status_on_worker() -> str:
 def test_one_that_was_told_too_much_at_once_is_made_again(nannies):
     """Without a second try the task fails with an AssertionError."""
     nannies.register_plugin(TellAtOnce())
-    worker = next(iter(nannies.scheduler_info()["workers"]))
+    worker = next(iter(worker_identities(nannies)))
     futures = [nannies.submit(status_on_worker, workers=[worker], pure=False) for _ in range(3)]
     assert nannies.gather(futures) == ["running"] * 3
     told = nannies.run_on_scheduler(

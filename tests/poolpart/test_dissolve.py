@@ -22,6 +22,7 @@ from poolpart import (
     rest,
     settling,
     steward,
+    worker_identities,
 )
 from poolpart import nannies as their
 
@@ -82,7 +83,7 @@ def _on_nanny(dask_worker):
 
 
 def declared(client):
-    workers = client.scheduler_info(n_workers=-1)["workers"].values()
+    workers = worker_identities(client).values()
     return {str(worker["name"]): worker["resources"] for worker in workers}
 
 
@@ -115,11 +116,11 @@ def test_everything_is_as_before(start, wait_until):
 def test_nannies_are_as_before(nannies, wait_until):
     before = known(nannies)
     Pool.from_client(nannies).divide({"A": per_host(1), "B": rest()})
-    addresses = set(nannies.scheduler_info(n_workers=-1)["workers"])
+    addresses = set(worker_identities(nannies))
     victim = nannies.run(os.getpid).popitem()
     os.kill(victim[1], signal.SIGKILL)
     # While one is starting again, too.
-    wait_until(lambda: victim[0] not in nannies.scheduler_info(n_workers=-1)["workers"])
+    wait_until(lambda: victim[0] not in worker_identities(nannies))
     assert Pool(nannies, []).dissolve() == ["A", "B"]
     assert victim[0] in addresses
     assert known(nannies) == before

@@ -20,6 +20,7 @@ from poolpart import (
     rest,
     settling,
     trace_to,
+    worker_identities,
 )
 from poolpart.placing import wake
 
@@ -46,13 +47,13 @@ def hold_on(event):
 
 def declared(client):
     """Resources by worker, as the scheduler knows them."""
-    workers = client.scheduler_info(n_workers=-1)["workers"].values()
+    workers = worker_identities(client).values()
     return {str(worker["name"]): worker["resources"] for worker in workers}
 
 
 def declared_by_themselves(client):
     answers = client.run(lambda dask_worker: dict(dask_worker.state.total_resources))
-    names = {w["name"]: a for a, w in client.scheduler_info(n_workers=-1)["workers"].items()}
+    names = {w["name"]: a for a, w in worker_identities(client).items()}
     return {str(name): answers[address] for name, address in names.items()}
 
 
@@ -420,7 +421,7 @@ def test_whoever_helps_and_is_killed_goes_back(nannies, wait_until):
     tasks = [parts["A"].submit(wait_for, "helper") for _ in range(4)]
     wait_until(lambda: len(parts["A"]) == 2)
     os.kill(nannies.run(os.getpid, workers=[helper.address])[helper.address], signal.SIGKILL)
-    wait_until(lambda: len(nannies.scheduler_info(n_workers=-1)["workers"]) == 1)
+    wait_until(lambda: len(worker_identities(nannies)) == 1)
     assert pool.stop_rebalancing("B", helps="A") == [helper.name]
     assert members(parts["B"]) == [helper.name]
     event.set()
@@ -455,7 +456,7 @@ def test_a_worker_that_is_killed_while_it_moves(nannies, wait_until, point):
     finally:
         trace_to(None)
     assert len(killed) == 1
-    wait_until(lambda: killed[0] not in nannies.scheduler_info(n_workers=-1)["workers"])
+    wait_until(lambda: killed[0] not in worker_identities(nannies))
     parts["A"].wait(2, timeout_s=LONG_S)
     assert members(parts["A"]) == sorted([target, moving])
     assert declared(nannies) == declared_by_themselves(nannies) == {"0": {"A": 1}, "1": {"A": 1}}

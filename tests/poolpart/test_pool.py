@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 from distributed import Client, LocalCluster, get_worker
 
-from poolpart import Partition, Pool, PoolError, n_workers, probe
+from poolpart import Partition, Pool, PoolError, n_workers, probe, worker_identities
 from poolpart import rest as rest_of_them
 
 PLAIN = {name: {} for name in ("a", "b", "c")}
@@ -18,7 +18,7 @@ def here():
 
 def declared(client):
     """Resources by worker, as the scheduler knows them."""
-    workers = client.scheduler_info(n_workers=-1)["workers"].values()
+    workers = worker_identities(client).values()
     return {str(worker["name"]): worker["resources"] for worker in workers}
 
 

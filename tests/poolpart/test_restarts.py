@@ -8,7 +8,7 @@ import sys
 import pytest
 from distributed import Client, get_worker
 
-from poolpart import Partition, Pool
+from poolpart import Partition, Pool, worker_identities
 
 LONG_S = 60.0
 
@@ -19,7 +19,7 @@ def here():
 
 def addresses(client):
     """Addresses of the workers by name."""
-    workers = client.scheduler_info(n_workers=-1)["workers"].items()
+    workers = worker_identities(client).items()
     return {str(worker["name"]): address for address, worker in workers}
 
 

@@ -17,6 +17,7 @@ from poolpart import (
     probe,
     rest,
     steward,
+    worker_identities,
 )
 from poolpart.rules import check_rules, divide, partition_for
 from poolpart.selection import NO_GPU
@@ -164,7 +165,7 @@ def test_whoever_joins_finds_a_place_and_no_rule_gets_more_than_it_wants(gpus, o
 
 
 def declared(client):
-    workers = client.scheduler_info(n_workers=-1)["workers"].values()
+    workers = worker_identities(client).values()
     return {str(worker["name"]): worker["resources"] for worker in workers}
 
 

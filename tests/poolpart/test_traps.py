@@ -16,7 +16,7 @@ import distributed.queues
 import pytest
 from distributed import Queue, wait
 
-from poolpart import Partition, Pipe, Pool, fetch_available
+from poolpart import Partition, Pipe, Pool, fetch_available, worker_identities
 
 LONG_S = 60.0
 
@@ -28,7 +28,7 @@ def slowly(number: int) -> int:
 
 def addresses(client) -> dict[str, str]:
     """Addresses of the workers by name."""
-    workers = client.scheduler_info(n_workers=-1)["workers"].items()
+    workers = worker_identities(client).items()
     return {str(worker["name"]): address for address, worker in workers}
 
 

@@ -20,7 +20,7 @@ from distributed import Client, Scheduler, SpecCluster, Worker
 import lidarpool.pictures
 from lidarpool import Cloud
 from lidarpool.cli import main
-from poolpart import local_cluster
+from poolpart import local_cluster, worker_identities
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def kill(client: Client) -> Callable[[str], None]:
     """Kill the first worker of a partition with SIGKILL."""
 
     def kill(partition: str) -> None:
-        workers = client.scheduler_info(n_workers=-1)["workers"]
+        workers = worker_identities(client)
         address = next(a for a, w in workers.items() if partition in w["resources"])
         pid = client.run(os.getpid, workers=[address])[address]
         os.kill(pid, signal.SIGKILL)

@@ -15,6 +15,7 @@ import lidarpool.watch
 from lidarpool import LidarpoolError, Planning, Scene, Sensor, Survey, simulate
 from lidarpool.scan import SurveyPump
 from lidarpool.trials import TrialPump
+from poolpart import worker_identities
 from poolpart.local import _NannyCluster
 
 SURVEY = Survey(
@@ -166,7 +167,7 @@ def test_a_slot_lost_for_good_ends_the_run(monkeypatch, left_over):
         def on_frame(frame) -> None:
             if frame.scan == 300:
                 address = worker_of(client, "sort")
-                workers = client.scheduler_info(n_workers=-1)["workers"]
+                workers = worker_identities(client)
                 nanny = cluster.workers[workers[address]["name"]]
                 threading.Thread(target=client.sync, args=(nanny.close,)).start()
 
@@ -187,7 +188,7 @@ def test_numbers_below_one_are_refused(wrong):
 def test_workers_of_others_are_left_alone(undisturbed):
     """A worker of no partition need not even have lidarpool."""
     with cluster_of_slots(foreign=1) as cluster, Client(cluster) as client:
-        workers = client.scheduler_info(n_workers=-1)["workers"]
+        workers = worker_identities(client)
         foreign = [address for address, w in workers.items() if not w["resources"]]
         client.run(_hide_lidarpool, workers=foreign)
         cloud = simulate(Scene.seed(), SURVEY, client=client).cloud

@@ -8,7 +8,7 @@ from distributed import Client
 
 from lidarpool import LidarpoolError, Scene, Sensor, Survey, simulate
 from lidarpool.checks import common_backend
-from poolpart import Pool
+from poolpart import Pool, worker_identities
 
 SURVEY = Survey(Sensor(rays_per_revolution=180, layers=16, step_deg=10), [(0, 0, 1)], steps=36)
 
@@ -32,7 +32,7 @@ def break_off(client: Client):
 
             dask_worker.handlers["run"] = run
 
-        workers = client.scheduler_info(n_workers=-1)["workers"]
+        workers = worker_identities(client)
         address = next(a for a, worker in workers.items() if "GPU" in worker["resources"])
         client.run(arm, workers=[address])
         return address
@@ -43,7 +43,7 @@ def break_off(client: Client):
 def test_a_worker_that_does_not_answer_is_not_in_the_pool(client, break_off):
     address = break_off(1)
     pool = Pool.from_client(client)
-    everybody = client.scheduler_info(n_workers=-1)["workers"]
+    everybody = worker_identities(client)
     assert {worker.address for worker in pool} == everybody.keys() - {address}
 
 
