@@ -217,6 +217,23 @@ def test_a_second_ctrl_c_ends_it_at_once():
     assert ended.stderr.startswith(b"lidarpool: stopped at once")
 
 
+def test_a_ctrl_c_where_python_drops_what_is_raised_comes_again():
+    script = (
+        "import signal, time\n"
+        "from lidarpool.interrupts import interrupt_on_signals\n"
+        "class Future:\n"
+        "    def __del__(self): signal.raise_signal(signal.SIGINT)\n"
+        "interrupt_on_signals()\n"
+        "interrupt_on_signals()\n"
+        "try:\n"
+        "    Future()\n"
+        "    time.sleep(50)\n"
+        "except KeyboardInterrupt: print('interrupted')\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, check=False)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (0, b"interrupted\n", b"")
+
+
 def test_workers_follow_a_driver_that_was_killed(start, untouched):
     run = start(LONG).wait_for(SURVEYING)
     assert len(run.processes) >= 4

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import _thread
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
 from types import FrameType
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
+
+if TYPE_CHECKING:
+    from sys import UnraisableHookArgs
 
 INTERRUPTED = 130  # exit code, as shells give it to whatever Ctrl-C ended
 STOPPED = "interrupted; everything was stopped"
@@ -20,6 +25,7 @@ UNTOUCHED = f"{STOPPED}, and the output folder is as it was."
 _NAMES = ("SIGINT", "SIGTERM", "SIGHUP")
 _SIGNALS = tuple(getattr(signal, name) for name in _NAMES if hasattr(signal, name))
 _IMPATIENT_S = 1.0  # a second signal sooner than this is the first one's twin
+_AGAIN_S = 0.01
 
 
 class _Interrupt:
@@ -36,6 +42,36 @@ class _Interrupt:
             _exit(b"lidarpool: stopped at once; workers of this machine end by themselves.\n")
 
 
+class _AgainIfLost:
+    """Has an interrupt come once more that came where Python drops what is raised.
+
+    That is while an object is let go of, in its `__del__`: those of futures run often.
+    """
+
+    def __init__(
+        self, interrupt: _Interrupt, otherwise: Callable[[UnraisableHookArgs], object]
+    ) -> None:
+        self._interrupt, self.otherwise = interrupt, otherwise
+
+    def __call__(self, lost: UnraisableHookArgs) -> None:
+        if not issubclass(lost.exc_type, KeyboardInterrupt) or self._interrupt.first_at is None:
+            self.otherwise(lost)
+            return
+        self._interrupt.first_at = None
+        # From a thread, a little later: raised in here, it would be lost again.
+        again = threading.Timer(_AGAIN_S, _interrupt_main_thread)
+        again.daemon = True
+        again.start()
+
+
+def _interrupt_main_thread() -> None:
+    main = threading.main_thread().ident
+    if hasattr(signal, "pthread_kill") and main is not None:
+        signal.pthread_kill(main, signal.SIGINT)  # also out of a lock that it waits for
+    else:
+        _thread.interrupt_main()
+
+
 def end_on_signals() -> None:
     """Let these signals end the process at once: as long as nothing has been started."""
     _on_signals(lambda number, frame: _exit(f"lidarpool: {UNTOUCHED}\n".encode()))
@@ -43,7 +79,11 @@ def end_on_signals() -> None:
 
 def interrupt_on_signals() -> None:
     """Turn these signals into KeyboardInterrupt; a second one ends the process at once."""
-    _on_signals(_Interrupt())
+    interrupt, otherwise = _Interrupt(), sys.unraisablehook
+    _on_signals(interrupt)
+    if isinstance(otherwise, _AgainIfLost):  # of an earlier call
+        otherwise = otherwise.otherwise
+    sys.unraisablehook = _AgainIfLost(interrupt, otherwise)
 
 
 def _on_signals(handler: Callable[[int, FrameType | None], object]) -> None:
