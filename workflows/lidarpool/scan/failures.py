@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 
 from distributed import Client, Future, KilledWorker
+from distributed.scheduler import NoValidWorkerError
 
 from poolpart import WorkerLeft
 
@@ -44,10 +45,19 @@ def raise_if_failed(future: Future, what: str) -> None:
     if future.status == "error":
         error = future.exception(timeout=ASK_S)
         error.__traceback__ = future.traceback(timeout=ASK_S)
-        # Some of Dask's errors have no words.
-        raise LidarpoolError(f"{what} failed: {str(error) or type(error).__name__}") from error
+        raise LidarpoolError(f"{what} failed: {_words(error)}") from error
     if future.status == "cancelled":  # "lost" passes: a worker died and the task runs again
         raise LidarpoolError(f"{what} was cancelled from outside this run.")
+
+
+def _words(error: BaseException) -> str:
+    """Text of an error of Dask's or of a task's, in a line."""
+    if isinstance(error, NoValidWorkerError):  # its own text is a list of all restrictions
+        return (
+            f"no worker of {' and '.join(error.resource_restrictions or ['its kind'])} came within "
+            f"{error.timeout:g} s, the cluster's no-workers-timeout; start some."
+        )
+    return str(error) or type(error).__name__  # some of Dask's have no words
 
 
 def words_on_memory(client: Client, workers: Collection[str]) -> str:
