@@ -7,7 +7,7 @@ task there, but decides anew where it goes.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
 from typing import Any
 
 from distributed.core import Status
@@ -35,11 +35,20 @@ def ask_back(scheduler: Any, worker: Any, tasks: Iterable[Any]) -> list[Any]:
     return asked
 
 
-def requests_under_way(scheduler: Any, thieves: Collection[Any]) -> bool:
-    """Whether workers have yet to answer to `ask_back`, or to what these thieves ask for."""
+def requests_under_way(
+    scheduler: Any, workers: Collection[Any], concerns: Callable[[Any], bool]
+) -> bool:
+    """Whether workers have yet to answer to `ask_back`.
+
+    Or to whoever steals tasks from these workers, or for them, of those that it `concerns`.
+    """
     stealing = scheduler.extensions.get("stealing")
-    moves = stealing.in_flight.values() if stealing else ()
-    return any(move["thief"] in thieves or move["thief"].server_id == _NAME for move in moves)
+    moves = stealing.in_flight.items() if stealing else ()
+    return any(
+        move["thief"].server_id == _NAME
+        or (concerns(task) and not {move["thief"], move["victim"]}.isdisjoint(workers))
+        for task, move in moves
+    )
 
 
 def forget_requests(scheduler: Any) -> None:

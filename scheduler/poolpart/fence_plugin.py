@@ -187,8 +187,9 @@ class Fences(SchedulerPlugin):
         while time.monotonic() < deadline:
             for worker in self.closed:
                 self._turn_out(worker, asked)
-            # Also what somebody behind a fence steals just now; it is turned out then.
-            if not requests_under_way(self.scheduler, self.closed):
+            # Also what is just being stolen from somebody behind a fence, which is not asked for
+            # twice, or by somebody there; that is turned out then.
+            if not requests_under_way(self.scheduler, self.closed, self.stop):
                 return
             await asyncio.sleep(0.005)
 

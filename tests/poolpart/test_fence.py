@@ -6,6 +6,7 @@ import threading
 import time
 import warnings
 from collections import Counter
+from functools import partial
 
 import dask
 import dask.array
@@ -14,7 +15,7 @@ from distributed import get_worker, wait, worker_client
 
 from poolpart import Partition, Pool, PoolError
 from poolpart.fence import lower_fence, raise_fence, raised_fences
-from poolpart.fence_plugin import NAME, kept_out
+from poolpart.fence_plugin import NAME, kept_out, raise_
 from poolpart.override import Overrides
 
 LONG_S = 30.0
@@ -189,23 +190,49 @@ def held(number):
     return here()
 
 
-def test_what_has_not_started_leaves_when_a_fence_is_raised(client, wait_until):
+def hold_eight(client, wait_until):
+    """Eight tasks, halves of which Dask gives A-0 and plain; of each, the first one runs."""
     ran.clear()
     go.clear()
-    address = state_of(client, "A-0").address
-    # These may run elsewhere, but Dask puts them here at first.
-    futures = [
-        client.submit(held, i, workers=[address, state_of(client, "plain").address], pure=False)
-        for i in range(8)
-    ]
-    wait_until(lambda: len(ran) == 2)
+    addresses = [state_of(client, name).address for name in ("A-0", "plain")]
+    futures = [client.submit(held, i, workers=addresses, pure=False) for i in range(8)]
+    wait_until(lambda: len(ran) == 2 and len(scheduler_of(client).tasks) == 8)
     assert len(state_of(client, "A-0").processing) > 1
+    return futures
+
+
+def test_what_has_not_started_leaves_when_a_fence_is_raised(client, wait_until):
+    futures = hold_eight(client, wait_until)
     raise_fence(client, "A")
     assert len(state_of(client, "A-0").processing) == 1  # what runs goes on
     go.set()
     names = Counter(client.gather(futures))
     assert names == {"plain": 7, "A-0": 1}
     assert sorted(ran) == list(range(8))  # each once
+
+
+async def steal_and_raise(victim, thief, dask_scheduler):
+    """Raise a fence while tasks are being stolen from behind it; how many there are then."""
+    by_name = {worker.name: worker for worker in dask_scheduler.workers.values()}
+    victim, thief = by_name[victim], by_name[thief]
+    for task in list(victim.processing):  # also the one that runs, of which Dask knows nothing
+        dask_scheduler.extensions["stealing"].move_task_request(task, victim, thief)
+    await raise_(dask_scheduler, "A")
+    return len(victim.processing)
+
+
+def test_what_is_being_stolen_has_left_when_a_fence_is_raised(client, wait_until):
+    client.sync(scheduler_of(client).extensions["stealing"].stop)  # it steals when told to
+    worker = client.cluster.workers["A-0"]
+    answer = worker.stream_handlers["steal-request"]
+    worker.stream_handlers["steal-request"] = lambda **asked: worker.loop.call_later(
+        0.1, partial(answer, **asked)
+    )
+    futures = hold_eight(client, wait_until)
+    left = client.run_on_scheduler(steal_and_raise, victim="A-0", thief="plain")
+    assert left == 1  # what runs goes on
+    go.set()
+    assert Counter(client.gather(futures)) == {"plain": 7, "A-0": 1}
 
 
 async def steal(dask_scheduler):
