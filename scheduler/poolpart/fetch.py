@@ -22,8 +22,9 @@ def fetch_available(
     connection to it is tried for half a minute, and nothing else is delivered meanwhile; and
     a future for a key that was released since makes the scheduler wait for ever for a task
     that nobody submits. This asks where the keys are, takes them from there, and gives up on
-    a worker after `patience_s`: the next call asks anew, and finds them where they were
-    computed again. It takes no reference to the keys: whoever submitted them must hold theirs.
+    a worker that is silent for `patience_s`: the next call asks anew, and finds them where they
+    were computed again. It takes no reference to the keys: whoever submitted them must hold
+    theirs.
 
     Parameters
     ----------
@@ -32,8 +33,8 @@ def fetch_available(
     keys
         Keys of tasks, finished or not.
     patience_s
-        Longest time to wait for an answer of the scheduler, and then of each worker, in
-        seconds.
+        Longest time to wait for an answer of the scheduler, and then for a sign of life of each
+        worker, in seconds. What a worker sends may take longer.
 
     Returns
     -------
@@ -43,10 +44,17 @@ def fetch_available(
 
     async def take(address: str, held: list[str]) -> dict[str, Any]:
         who_has = {key: [address] for key in held}
+        taking = asyncio.ensure_future(gather_from_workers(who_has, rpc=client.rpc))
         try:
-            data, *_ = await wait_for(gather_from_workers(who_has, rpc=client.rpc), patience_s)
-        except TimeoutError:
-            return {}
+            # To give up one that answers would throw away what has come, and all would come again
+            # with the next call, as slowly: on a busy machine that went on for ever. And a worker
+            # keeps each message that nobody reads to its end (the error holds its own stream).
+            while not (await asyncio.wait([taking], timeout=patience_s))[0]:
+                if not await _answers(client, address, patience_s):
+                    return {}
+            data, *_ = taking.result()
+        finally:
+            taking.cancel()
         return data
 
     async def fetch() -> dict[str, Any]:
@@ -63,3 +71,11 @@ def fetch_available(
         return {key: result for data in taken for key, result in data.items()}
 
     return client.sync(fetch)
+
+
+async def _answers(client: Client, address: str, patience_s: float) -> bool:
+    try:
+        await wait_for(client.rpc(address).ping(), patience_s)
+    except (TimeoutError, OSError):
+        return False
+    return True

@@ -1,5 +1,6 @@
 """Fetching what is there, without waiting for what is not."""
 
+import asyncio
 import os
 import signal
 import uuid
@@ -51,6 +52,26 @@ def test_tasks_fetch_for_themselves(client, partition):
     wait([future], timeout=30)
     fetched = Partition(partition, client).submit(fetch, [future.key]).result(30)
     assert fetched == {future.key: 6}
+
+
+def answer_late(seconds, dask_worker):
+    """Have a worker take longer to send results."""
+    send = dask_worker.handlers["get_data"]
+
+    async def send_late(comm, **asked):
+        await asyncio.sleep(seconds)
+        return await send(comm, **asked)
+
+    dask_worker.handlers["get_data"] = send_late
+
+
+def test_a_worker_that_is_slow_is_waited_for(nannies):
+    """Else it would send the same again with each call, and nothing would ever come."""
+    futures = [nannies.submit(os.getpid, workers=[name], pure=False) for name in (0, 1)]
+    pids = [future.result(30) for future in futures]
+    nannies.run(answer_late, 1.0)
+    fetched = fetch_available(nannies, [future.key for future in futures], patience_s=0.2)
+    assert fetched == {future.key: pid for future, pid in zip(futures, pids, strict=True)}
 
 
 def test_a_worker_that_does_not_answer_keeps_only_its_own_results(nannies):
