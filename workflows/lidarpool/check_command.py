@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from poolpart.wording import counted
+
 from .completion import complete_backend
 from .connection import connected
 from .errors import LidarpoolError
@@ -90,18 +92,16 @@ def told(made: Forecast) -> Iterator[str]:
     job, needs, sample = made.job, made.needs, made.sample
     survey, planning = job.survey, job.planning
     sensor = survey.sensor
-    objects = len(job.scene.names)
-    yield (
-        f"scene       {objects:,} object{'s' * (objects != 1)}, {len(job.scene.faces):,} triangles"
-    )
+    objects = counted(len(job.scene.names), "object")
+    yield f"scene       {objects}, {len(job.scene.faces):,} triangles"
     low, high = job.scene.bounds + job.scene.origin
     yield f"size        {' x '.join(map(in_metres, high - low))} m; " + ", ".join(
         f"{axis} {in_metres(a)} to {in_metres(b)}"
         for axis, a, b in zip("xyz", low, high, strict=True)
     )
     yield (
-        f"survey      {survey.scan_count:,} scan{'s' * (survey.scan_count != 1)} from "
-        f"{len(survey.poses):,} pose{'s' * (len(survey.poses) != 1)}, "
+        f"survey      {counted(survey.scan_count, 'scan')} from "
+        f"{counted(len(survey.poses), 'pose')}, "
         f"{survey.ray_count:,} rays ({sensor.rays_per_revolution:,} x {sensor.layers:,} a turn)"
     )
     if sample is not None:
@@ -112,7 +112,7 @@ def told(made: Forecast) -> Iterator[str]:
     yield f"planning    {f'{planning.trials:,} trials' if planning else 'none'}"
     yield f"backend     {made.backend or 'none yet'}" + (" (auto)" if job.backend == "auto" else "")
     for name, (needed, there) in made.slots.items():
-        yield f"{name:<10}  {there:,} slot{'s' * (there != 1)}, at least {needed:,} needed"
+        yield f"{name:<10}  {counted(there, 'slot')}, at least {needed:,} needed"
     if needs is not None:
         limit = f" of {in_bytes(made.memory)}" if made.memory else ""
         whole = f"memory      about {in_bytes(made.memory_needed)}{limit}"

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING
 import click
 from distributed import Client
 
+from poolpart.wording import counted
+
 from .checks import check_backend_here, check_backend_name
 from .connection import connected, local_client
 from .deliveries import Deliveries
@@ -226,10 +228,9 @@ def _local_client(scenario: Scenario, options: RunOptions) -> Iterator[Client]:
 def _tell(out: Path, result: Result, job: Job, files: list[str]) -> None:
     for note in result.notes:
         click.echo(f"note: {note}")
-    objects = len(job.scene.names)
     click.echo(
         f"{job.survey.scan_count:,} scans, {result.rays:,} rays, {result.hits:,} hits on "
-        f"{objects:,} object{'s' * (objects != 1)}, {len(result.points):,} points in the cloud "
+        f"{counted(len(job.scene.names), 'object')}, {len(result.points):,} points in the cloud "
         f"({result.backend}, {result.survey_seconds:.1f} s)"
     )
     if result.plan is not None:
