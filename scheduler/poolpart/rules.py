@@ -250,6 +250,8 @@ def partition_for(
 
 def check_rules(rules: Mapping[str, Rule]) -> None:
     """Check rules as they were given; PoolError unless they make sense."""
+    if not isinstance(rules, Mapping):
+        raise PoolError(f'The rules are {rules!r}; give a dict, such as {{"NAME": rest()}}.')
     if not rules:
         raise PoolError('There are no rules to divide by; give {"NAME": rest()}, for example.')
     for name, rule in rules.items():

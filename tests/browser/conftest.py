@@ -64,7 +64,7 @@ class Tab:
         number = next(self._numbers)
         self._socket.send(json.dumps({"id": number, "method": method, "params": params}))
         while True:
-            message = json.loads(self._socket.recv(timeout=60))
+            message = json.loads(self._socket.recv(timeout=120))
             if message.get("id") == number:
                 assert "error" not in message, message
                 return message["result"]
@@ -111,7 +111,7 @@ class Tab:
         """Whatever can be read on the page."""
         return self.value("document.body ? document.body.innerText : ''") or ""
 
-    def wait_for(self, condition: Callable[[str], object], seconds: float = 60.0):
+    def wait_for(self, condition: Callable[[str], object], seconds: float = 120.0):
         """Wait until something is true of the page's text; returns what it was."""
         deadline = time.monotonic() + seconds
         while not (found := condition(self.text)):
@@ -156,7 +156,7 @@ def chromium(tmp_path_factory):
     )
     try:
         told = profile / "DevToolsActivePort"
-        deadline = time.monotonic() + 60
+        deadline = time.monotonic() + 120
         while not (told.exists() and told.read_text().strip()):
             assert process.poll() is None, f"{program} ended with {process.returncode}"
             assert time.monotonic() < deadline, f"{program} does not answer"
@@ -166,7 +166,7 @@ def chromium(tmp_path_factory):
     finally:
         process.send_signal(signal.SIGTERM)
         try:
-            process.wait(20)
+            process.wait(120)
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
@@ -182,7 +182,7 @@ def new_tab(chromium):
         with connect(chromium.browser) as browser:
             params = {"url": "about:blank", "newWindow": True}
             browser.send(json.dumps({"id": 1, "method": "Target.createTarget", "params": params}))
-            name = json.loads(browser.recv(timeout=60))["result"]["targetId"]
+            name = json.loads(browser.recv(timeout=120))["result"]["targetId"]
         tab = Tab(f"ws://{chromium.host}/devtools/page/{name}")
         tabs.append((tab, name))
         tab.open(url)
@@ -191,4 +191,4 @@ def new_tab(chromium):
     yield open_tab
     for tab, name in tabs:
         tab.close()
-        urllib.request.urlopen(f"http://{chromium.host}/json/close/{name}", timeout=30).close()
+        urllib.request.urlopen(f"http://{chromium.host}/json/close/{name}", timeout=120).close()

@@ -109,7 +109,7 @@ def test_stop_ends_the_run_as_an_interrupt_does(client, live, new_tab):
         tab.wait_for(points_in)
         tab.click("Stop")
     finally:
-        run.thread.join(60)
+        run.thread.join(120)
         live.control.stop()
     assert isinstance(run.error, KeyboardInterrupt)
     assert not kept.complete

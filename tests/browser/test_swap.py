@@ -70,7 +70,7 @@ def swapped(tab, show):
 
 
 def wait_for_colour(tab, which):
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 120
     while not (tab.value("window.seen.at(-1)") or [0, 0])[which] > 50:
         assert time.monotonic() < deadline, "the ball was not shown"
         time.sleep(0.02)
@@ -108,7 +108,7 @@ def test_the_sampler_sees_a_mesh_vanish(page, new_tab):
     node.show(ball(RED), "same")
     wait_for_colour(tab, 0)
     node.visible = False
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 120
     while np.array(tab.value("window.seen")).sum(axis=1)[-1] > GONE:
         assert time.monotonic() < deadline, "the ball is still there"
         time.sleep(0.02)

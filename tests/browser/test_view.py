@@ -33,7 +33,7 @@ def served(cloud):
         thread = view.painter.start()
         yield page, view
         view.painter.end()
-        thread.join(30)
+        thread.join(120)
         assert view.painter.error is None
 
 

@@ -76,7 +76,7 @@ class Driver:
             raise TimeoutError(f"The driver has reported nothing for {timeout_s} s.")
         answer: Delivered = self._answers.recv()
         self._answers.close()
-        self.process.join(30)
+        self.process.join(120)
         self.process.close()
         return answer
 

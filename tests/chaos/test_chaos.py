@@ -78,4 +78,5 @@ def test_whoever_dies_each_scan_arrives_once(arena, what, known, faults):
     assert outcome.sound, outcome.error or outcome.verdict
     assert {point for _, point in outcome.done} == {fault.point for fault in faults}
     assert outcome.done.total() == len(faults)
-    assert outcome.verdict.recovered
+    if all(fault.point != RANDOM for fault in faults):  # else they may have been idle just then
+        assert outcome.verdict.recovered

@@ -17,7 +17,7 @@ from tests.chaos.events import STOP
 from tests.chaos.nemesis import Fault
 from tests.chaos.survey import PAUSES, disturbed, reference, survey
 
-JOIN_S = 60.0
+JOIN_S = 120.0
 TIME_TO_LIVE_S = 6
 STOP_S = 2.1 * TIME_TO_LIVE_S
 SLOTS = {"GPU": 1, "LIDAR": 12}  # so many that all long stages go to the one that has them

@@ -32,8 +32,8 @@ class Foreigner(threading.Thread):
                 count = len(self.results)
                 queue.put(count)
                 future = client.submit(pow, count, 2, pure=False)
-                self.results.append(future.result(timeout=60))
-                self.taken.append(queue.get(timeout=60))
+                self.results.append(future.result(timeout=120))
+                self.taken.append(queue.get(timeout=120))
             queue.close()
 
 
@@ -51,7 +51,7 @@ def test_two_surveys_and_a_foreign_user_do_not_see_each_other():
         ]
         delivered = [driver.delivered() for driver in drivers]
         foreigner.over.set()
-        foreigner.join(60)
+        foreigner.join(120)
         assert not foreigner.is_alive()
         spans = [
             (min(times), max(times))

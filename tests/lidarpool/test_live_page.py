@@ -48,7 +48,7 @@ def test_it_is_there_while_the_run_is(client, capsys):
         show(PROGRESS)  # too soon for the page
         said = capsys.readouterr()
         [url] = re.findall(r"^live page: (\S+)$", said.err, re.M)
-        with urllib.request.urlopen(f"{url}/data", timeout=30) as answer:
+        with urllib.request.urlopen(f"{url}/data", timeout=120) as answer:
             totals = json.load(answer)["totals"]
     assert said.out == ""
     assert shown == [PROGRESS, PROGRESS]
@@ -60,7 +60,7 @@ def test_it_is_there_while_the_run_is(client, capsys):
         "replayed": "7",
     }
     with pytest.raises(urllib.error.HTTPError, match="404"):
-        urllib.request.urlopen(url, timeout=30)
+        urllib.request.urlopen(url, timeout=120)
 
 
 def test_one_that_was_there_stays(client):

@@ -120,7 +120,7 @@ def test_painter_draws_the_latest_once_however_often_it_is_asked():
 
     def draw():
         drawn.append(state["value"])
-        may.wait(30)
+        may.wait(120)
 
     painter = Painter(draw, every_s=0.0)
     thread = painter.start()
@@ -132,7 +132,7 @@ def test_painter_draws_the_latest_once_however_often_it_is_asked():
         painter.ask()
     may.set()
     painter.end()
-    thread.join(30)
+    thread.join(120)
     assert not thread.is_alive()
     assert drawn[0] == 0
     assert drawn[-1] == 999
@@ -146,5 +146,5 @@ def test_painter_keeps_what_ended_it():
     painter = Painter(draw, every_s=0.0)
     thread = painter.start()
     painter.ask()
-    thread.join(30)
+    thread.join(120)
     assert str(painter.error) == "no paint"

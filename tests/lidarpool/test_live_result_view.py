@@ -78,7 +78,7 @@ def drawn(page, file):
     """Return the view of a file, with all that there is drawn."""
     view = ResultView(page, file)
     if view._scene is not None:
-        view._scene._prepared.result(timeout=60)
+        view._scene._prepared.result(timeout=120)
     view._draw()
     return view
 

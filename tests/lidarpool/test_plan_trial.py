@@ -220,7 +220,7 @@ def test_another_process_without_wide_vector_instructions_gives_the_same_bits():
     environment = {**os.environ, "NPY_DISABLE_CPU_FEATURES": " ".join(found)}
     done = subprocess.run(
         [sys.executable, "-c", script],
-        env=environment, capture_output=True, text=True, timeout=60, check=False,
+        env=environment, capture_output=True, text=True, timeout=120, check=False,
     )  # fmt: skip
     assert done.stdout.strip() == fingerprint(), done.stderr
 

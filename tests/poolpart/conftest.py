@@ -102,7 +102,7 @@ def make_pipe():
         pipe.delete()
 
 
-def wait_until(condition, timeout_s=20.0):
+def wait_until(condition, timeout_s=120.0):
     """Wait for something that happens by itself; fail the test when it does not."""
     deadline = time.monotonic() + timeout_s
     while not condition():

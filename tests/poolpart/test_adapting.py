@@ -7,7 +7,7 @@ from distributed import Client, Event, LocalCluster, get_worker
 
 from poolpart import Pool, n_workers, per_host, rest
 
-LONG_S = 60.0
+LONG_S = 120.0
 QUIET = 50
 
 

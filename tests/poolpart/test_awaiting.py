@@ -9,7 +9,7 @@ from distributed import Client
 
 from poolpart import Pipe, await_news
 
-LONG_S = 30.0  # nobody waits so long: a test that does has failed
+LONG_S = 120.0  # nobody waits so long: a test that does has failed
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from distributed import Client, get_worker
 
 from poolpart import Pool, n_workers, named, rest, worker_identities
 
-LONG_S = 60.0
+LONG_S = 120.0
 
 
 def here():

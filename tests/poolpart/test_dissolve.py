@@ -26,7 +26,7 @@ from poolpart import (
 )
 from poolpart import nannies as their
 
-LONG_S = 60.0
+LONG_S = 120.0
 
 
 def here():

@@ -59,7 +59,7 @@ def test_whichever_worker_is_killed_the_file_is_the_same(tmp_path, wait_until):
             killed = client.run(os.getpid, workers=[worker.address])[worker.address]
             assert path.stat().st_size < 3600 * total  # it is not too late
             os.kill(killed, signal.SIGKILL)
-        driver.join(60)
+        driver.join(120)
         assert not driver.is_alive()
         assert path.read_bytes() == thumbnails(total)
         assert not cluster.scheduler.extensions["queues"].queues
@@ -75,7 +75,7 @@ def test_a_writer_goes_on_where_one_has_died(start, tmp_path):
 
 def test_news_of_a_writer_may_come_all_at_once(start, tmp_path, monkeypatch):
     # «Again» and, behind it, what was written of keys that were sent before it was read.
-    polled, held, until = Pipe.poll, [], time.monotonic() + 10
+    polled, held, until = Pipe.poll, [], time.monotonic() + 120
 
     def poll(pipe):
         held.extend(polled(pipe))

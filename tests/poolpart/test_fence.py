@@ -18,7 +18,7 @@ from poolpart.fence import lower_fence, raise_fence, raised_fences
 from poolpart.fence_plugin import NAME, kept_out, raise_
 from poolpart.override import Overrides
 
-LONG_S = 30.0
+LONG_S = 120.0
 CLUSTER = {
     "A-0": {"resources": {"A": 1}},
     "A-1": {"resources": {"A": 1}},

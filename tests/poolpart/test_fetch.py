@@ -16,14 +16,14 @@ def twice(x):
 
 
 def wait_for(event):
-    return Event(event).wait(30)
+    return Event(event).wait(120)
 
 
 def test_only_what_is_finished_comes(client):
     gate = Event(f"gate-{uuid.uuid4().hex}", client=client)
     part = Partition("A", client)
     done, pending = part.submit_many(twice, range(5)), part.submit(wait_for, gate.name)
-    wait(done, timeout=30)
+    wait(done, timeout=120)
     keys = [future.key for future in done]
     fetched = fetch_available(client, [*keys, pending.key, "never-submitted"])
     assert fetched == {key: 2 * number for number, key in enumerate(keys)}
@@ -33,7 +33,7 @@ def test_only_what_is_finished_comes(client):
 
 def test_it_takes_no_reference(client, wait_until):
     future = Partition("A", client).submit(twice, 4)
-    wait([future], timeout=30)
+    wait([future], timeout=120)
     key = future.key
     assert fetch_available(client, [key]) == {key: 8}
     del future
@@ -49,8 +49,8 @@ def test_tasks_fetch_for_themselves(client, partition):
         return fetch_available(get_client(), keys)
 
     future = Partition("A", client).submit(twice, 3)
-    wait([future], timeout=30)
-    fetched = Partition(partition, client).submit(fetch, [future.key]).result(30)
+    wait([future], timeout=120)
+    fetched = Partition(partition, client).submit(fetch, [future.key]).result(120)
     assert fetched == {future.key: 6}
 
 
@@ -68,7 +68,7 @@ def answer_late(seconds, dask_worker):
 def test_a_worker_that_is_slow_is_waited_for(nannies):
     """Else it would send the same again with each call, and nothing would ever come."""
     futures = [nannies.submit(os.getpid, workers=[name], pure=False) for name in (0, 1)]
-    pids = [future.result(30) for future in futures]
+    pids = [future.result(120) for future in futures]
     nannies.run(answer_late, 1.0)
     fetched = fetch_available(nannies, [future.key for future in futures], patience_s=0.2)
     assert fetched == {future.key: pid for future, pid in zip(futures, pids, strict=True)}
@@ -76,7 +76,7 @@ def test_a_worker_that_is_slow_is_waited_for(nannies):
 
 def test_a_worker_that_does_not_answer_keeps_only_its_own_results(nannies):
     futures = [nannies.submit(os.getpid, workers=[name], pure=False) for name in (0, 1)]
-    answering, stopped = (future.result(30) for future in futures)
+    answering, stopped = (future.result(120) for future in futures)
     os.kill(stopped, signal.SIGSTOP)
     try:
         fetched = fetch_available(nannies, [future.key for future in futures], patience_s=0.5)

@@ -10,7 +10,7 @@ from distributed import get_client, get_worker, secede, worker_client
 from poolpart import Partition, Pool
 from poolpart.inherit import disinherit, inherit
 
-LONG_S = 30.0
+LONG_S = 120.0
 CLUSTER = {"A-0": {"resources": {"A": 1}}, "B-0": {"resources": {"B": 1}}, "plain": {}}
 
 

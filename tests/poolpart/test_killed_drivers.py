@@ -11,7 +11,7 @@ from distributed import Client, Scheduler, SpecCluster, Worker
 
 from poolpart import Partition, Pool, n_workers, raise_fence, rest, trace_to
 
-LONG_S = 60.0
+LONG_S = 120.0
 QUIET = 50
 
 # Says that it is ready, does one thing when it is told to, and stays.

@@ -152,21 +152,21 @@ def test_no_worker_outlives_a_driver_that_is_killed(driver, wait_until):
     assert not gone(pids)
     process.send_signal(signal.SIGKILL)
     process.wait()
-    wait_until(lambda: gone(pids), timeout_s=20)
+    wait_until(lambda: gone(pids), timeout_s=120)
 
 
 def test_ctrl_c_ends_driver_and_workers(tmp_path, wait_until):
     driver = script(tmp_path, body="time.sleep(600)")
     pids = [int(pid) for pid in driver.stdout.readline().split()]
     driver.send_signal(signal.SIGINT)
-    _, errors = driver.communicate(timeout=30)
+    _, errors = driver.communicate(timeout=120)
     assert errors.rstrip().endswith("KeyboardInterrupt")
-    wait_until(lambda: gone(pids), timeout_s=20)
+    wait_until(lambda: gone(pids), timeout_s=120)
 
 
 def test_a_script_without_a_main_guard_is_told_so(tmp_path):
     driver = script(tmp_path, call="main()")
-    output, errors = driver.communicate(timeout=60)
+    output, errors = driver.communicate(timeout=120)
     assert (driver.returncode, output) == (1, "")
     last = errors.rstrip().splitlines()[-1]
     assert last.startswith("poolpart.errors.PoolError: The workers did not start (")

@@ -20,5 +20,5 @@ def test_a_worker_that_is_slow_to_come_back_is_not_given_up():
         address = partition.workers[0].address
         pid = client.run(os.getpid, workers=[address])[address]
         os.kill(pid, signal.SIGKILL)
-        assert partition.submit(os.getpid).result(timeout=30) != pid
+        assert partition.submit(os.getpid).result(timeout=120) != pid
         assert "OTHER-0" in cluster.workers

@@ -16,7 +16,7 @@ from distributed import CancelledError, Client, Event, wait
 
 from poolpart import Partition, Pool
 
-LONG_S = 60
+LONG_S = 120.0
 
 
 def twice(x):
@@ -63,7 +63,7 @@ def fail_unpicklably(x):
 
 
 def wait_for(event):
-    return Event(event).wait(30)
+    return Event(event).wait(120)
 
 
 def pid_slowly(_):
@@ -120,7 +120,7 @@ def test_unordered_gives_each_once(a):
 
 def test_unordered_does_not_wait_for_a_slow_item(a, gate):
     def function(item):
-        return (Event(gate.name).wait(30) and item) if item == 0 else item
+        return (Event(gate.name).wait(120) and item) if item == 0 else item
 
     results = a.map(function, range(4), window=4, ordered=False)
     assert sorted(next(results) for _ in range(3)) == [1, 2, 3]

@@ -24,7 +24,7 @@ from poolpart import (
 )
 from poolpart.placing import wake
 
-LONG_S = 60.0
+LONG_S = 120.0
 
 
 def here():

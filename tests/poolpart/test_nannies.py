@@ -38,7 +38,7 @@ def test_the_place_of_a_worker_that_was_stopped_goes_to_the_next(
     waiting = parts["A"].submit(pow, 2, 6)
     nannies.cluster.worker_spec["next"] = spec
     nannies.sync(nannies.cluster._correct_state)
-    assert waiting.result(30) == 64
+    assert waiting.result(120) == 64
     (stayed,) = declared(nannies).keys() - {"next"}
     assert declared(nannies) == {"next": {"A": 1}, stayed: {"B": 1}}
 

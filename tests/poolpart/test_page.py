@@ -23,7 +23,7 @@ from poolpart.page_server import snapshot
 from poolpart.stats import statistics_of
 from poolpart.stats_plugin import Ran
 
-LONG_S = 30.0
+LONG_S = 120.0
 NASTY = "<script>alert('x')</script>&\"'"
 PAGE = files("poolpart").joinpath("page.html").read_text(encoding="utf-8")
 

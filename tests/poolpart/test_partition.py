@@ -28,7 +28,7 @@ def options(key=None, priority=None, workers=None):
 
 
 def wait_for(event):
-    return Event(event).wait(30)
+    return Event(event).wait(120)
 
 
 def stamp(_):

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from poolpart import Partition, Pipe, PipeClosed, PipeFailed, forget_pipes, pipe_parts
 from poolpart import pipe as pipe_module
 
-LONG_S = 30.0  # for what happens at once, or the test fails
+LONG_S = 120.0  # for what happens at once, or the test fails
 
 
 def again(pipe):

@@ -14,7 +14,7 @@ from distributed import Client, Queue
 
 from poolpart import Partition, Pipe, PipeFailed
 
-LONG_S = 60.0
+LONG_S = 120.0
 
 
 def consume(pipe):

@@ -187,7 +187,7 @@ def test_workers_that_join_later_with_the_resource_belong(start, wait_until):
     options = client.cluster.worker_spec["a"]
     client.cluster.worker_spec["late"] = options
     client.sync(client.cluster._correct_state)
-    part.wait(2, timeout_s=20)
+    part.wait(2, timeout_s=120)
     assert [worker.name for worker in part.workers] == ["a", "late"]
 
 

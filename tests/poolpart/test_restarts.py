@@ -10,7 +10,7 @@ from distributed import Client, get_worker
 
 from poolpart import Partition, Pool, worker_identities
 
-LONG_S = 60.0
+LONG_S = 120.0
 
 
 def here():

@@ -79,6 +79,7 @@ def test_fewer_than_the_minimum():
     ("rules", "message"),
     [
         ({}, "no rules to divide by"),
+        ([rest()], r"rules are \[.*\]; give a dict"),
         ({"": rest()}, "name of a partition is ''; give one such as 'GPU'"),
         ({3: rest()}, "name of a partition is 3; give one such as 'GPU'"),
         ({"P": 3}, r"rule of partition 'P' is 3; give one, such as per_host\(2\)"),
@@ -295,7 +296,7 @@ def test_a_late_worker_that_declares_a_partition_belongs_to_it(start, wait_until
     parts = Pool.from_client(client).divide({"A": n_workers(1), "B": rest()})
     join(client, "c", resources={"A": 5})
     join(client, "d", resources={"DISK": 1})
-    parts["A"].wait(2, timeout_s=20)
+    parts["A"].wait(2, timeout_s=120)
     wait_until(lambda: len(declared(client)) == 4)
     assert [declared(client)[name] for name in "cd"] == [{"A": 5}, {"DISK": 1}]
 
@@ -307,7 +308,7 @@ def test_a_selector_of_partition_holds_as_a_rule_does(start, wait_until):
     wait_until(lambda: len(part) == 1)
     join(client, "c")
     join(client, "d")
-    part.wait(2, timeout_s=20)
+    part.wait(2, timeout_s=120)
     wait_until(lambda: len(declared(client)) == 3)
     assert sorted(map(str, declared(client).values())) == ["{'P': 4}", "{'P': 4}", "{}"]
 

@@ -10,7 +10,7 @@ from poolpart import Partition
 from poolpart.stats import StageStats, partition_stats, unwatch, watch
 from poolpart.stats_plugin import MOST_STAGES, NAME, OTHER_STAGES, RECENT_TASKS, Statistics
 
-LONG_S = 30.0
+LONG_S = 120.0
 CLUSTER = {"A-0": {"resources": {"A": 2}, "nthreads": 2}, "B-0": {"resources": {"B": 1}}}
 
 go = threading.Event()  # the workers are threads of this process

@@ -18,7 +18,7 @@ from distributed import Queue, wait
 
 from poolpart import Partition, Pipe, Pool, fetch_available, worker_identities
 
-LONG_S = 60.0
+LONG_S = 120.0
 
 
 def slowly(number: int) -> int:

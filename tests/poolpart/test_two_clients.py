@@ -9,7 +9,7 @@ from distributed import Client, Event
 
 from poolpart import Partition, Pool, PoolError, making, n_workers, rest, trace_to
 
-LONG_S = 60.0
+LONG_S = 120.0
 
 
 def wait_for(event):

@@ -77,7 +77,7 @@ def left_over() -> Callable[[Client], tuple[list[str], list[str], list[str]]]:
         return [str(key) for key in dask_scheduler.tasks], list(queues), list(variables)
 
     def left_over(client: Client) -> tuple[list[str], list[str], list[str]]:
-        until = time.monotonic() + 15  # cancelling is told to the scheduler, not asked
+        until = time.monotonic() + 120  # cancelling is told to the scheduler, not asked
         while any(found := client.run_on_scheduler(look)) and time.monotonic() < until:
             time.sleep(0.05)
         return found
@@ -140,7 +140,7 @@ class OutsideCluster:
     def kill(self, name: str) -> None:
         """Kill a process, without goodbye."""
         self.processes[name].kill()
-        self.processes.pop(name).wait(60)
+        self.processes.pop(name).wait(120)
 
     def log(self) -> str:
         """What all processes have logged."""
@@ -166,7 +166,7 @@ class OutsideCluster:
         for process in self.processes.values():
             process.kill()
         for process in self.processes.values():
-            process.wait(60)
+            process.wait(120)
 
 
 @pytest.fixture(scope="module")
@@ -231,7 +231,7 @@ def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 
 # -- the command as a process of its own ---------------------------------------------------------
 
-ENDS_WITHIN_S = 60  # on a busy machine; a second or two on an idle one
+ENDS_WITHIN_S = 180  # on a busy machine; a second or two on an idle one
 
 
 class RunningCommand:
@@ -306,7 +306,7 @@ class RunningCommand:
     def close(self) -> None:
         for process in self.processes:
             os.kill(process, signal.SIGKILL)
-        self.process.wait(60)
+        self.process.wait(120)
 
 
 @pytest.fixture

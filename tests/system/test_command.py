@@ -237,7 +237,7 @@ def on_a_terminal(arguments: list[str], **environment: str) -> tuple[int, str]:
     )
     os.close(slave)
     drawn = b""
-    stop = time.monotonic() + 90
+    stop = time.monotonic() + 120
     while time.monotonic() < stop:
         if select.select([master], [], [], 0.2)[0]:
             try:
@@ -245,7 +245,7 @@ def on_a_terminal(arguments: list[str], **environment: str) -> tuple[int, str]:
             except OSError:  # as Linux says that the other end was closed
                 break
     os.close(master)
-    return process.wait(60), drawn.decode()
+    return process.wait(120), drawn.decode()
 
 
 @pytest.mark.parametrize("colour", [True, False])

@@ -54,7 +54,7 @@ def test_simulate_leaves_nothing_when_it_is_interrupted_twice(word, pauses, tmp_
         out, err = run.communicate(timeout=120)
     assert "interrupted" in out or err.rstrip().endswith("KeyboardInterrupt")
     # Python's own helper process ends a moment after its parent.
-    _, alive = psutil.wait_procs(started, timeout=60)
+    _, alive = psutil.wait_procs(started, timeout=120)
     assert alive == []
 
 

@@ -26,7 +26,7 @@ from lidarpool.live import LiveRun, live_run
 from lidarpool.progress import Progress
 from lidarpool.run import Run
 
-LONG_S = 30.0
+LONG_S = 120.0
 POSES = [(0, 0, 1 + step / 40) for step in range(10)]
 
 

@@ -83,7 +83,7 @@ def kill_at_random(run: Any, journal: Path, dice: random.Random) -> None:
             assert time.monotonic() < deadline, run.said
             time.sleep(0.002)
     run.process.kill()
-    run.process.wait(60)
+    run.process.wait(120)
 
 
 def kill_and_resume(

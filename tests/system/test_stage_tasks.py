@@ -54,7 +54,7 @@ def connected(cluster):
 @pytest.fixture
 def client(cluster, connected):
     """Client of the cluster once all workers are there that an earlier test has killed."""
-    connected.wait_for_workers(len(cluster.worker_spec), timeout=60)
+    connected.wait_for_workers(len(cluster.worker_spec), timeout=120)
     return connected
 
 

@@ -345,7 +345,7 @@ def test_a_survey_on_an_encrypted_outside_cluster(lidarpool, outside, ours, tmp_
         cluster.add(name, slots=slots)
     security = security_for(cluster.address, files)
     with Client(cluster.address, security=security, set_as_default=False) as client:
-        client.wait_for_workers(3, timeout=60)
+        client.wait_for_workers(3, timeout=120)
     (tmp_path / "s.yaml").write_text("sensor: {layers: 4}\nplanning: {trials: 2}\n")
     mine = ours.signed("me")
     given = ["--scheduler", cluster.address]
