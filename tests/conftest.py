@@ -2,7 +2,13 @@
 
 import signal
 
+import dask
+
 # A shell starts jobs in the background with interrupts ignored, and whatever they start inherits
 # that: programs that tests interrupt would not notice.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# Dask's own clusters look this long after each death whether the worker is there, and give it up
+# when it is not: also one that has come back since and was killed again by the same test.
+dask.config.set({"distributed.deploy.lost-worker-timeout": "1h"})

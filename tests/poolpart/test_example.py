@@ -9,7 +9,6 @@ import threading
 import time
 from pathlib import Path
 
-import dask
 import numpy as np
 import pytest
 from distributed import Client, LocalCluster
@@ -32,7 +31,7 @@ def thumbnails(count):
 def test_thumbnails_come_in_order(tmp_path):
     path = tmp_path / "out.bin"
     command = [sys.executable, EXAMPLE, path]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert (done.returncode, "Traceback" in done.stderr) == (0, False), done.stderr
     assert path.read_bytes() == thumbnails(24)
 
@@ -41,8 +40,6 @@ def test_whichever_worker_is_killed_the_file_is_the_same(tmp_path, wait_until):
     path, total = tmp_path / "out.bin", 150
     run = runpy.run_path(str(EXAMPLE))["run"]
     with (
-        # Else it gives up a worker that is not back in 15 seconds, or dies twice within them.
-        dask.config.set({"distributed.deploy.lost-worker-timeout": "300s"}),
         LocalCluster(
             n_workers=4,
             threads_per_worker=1,

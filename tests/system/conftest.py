@@ -100,7 +100,7 @@ class OutsideCluster:
         self._start(
             "scheduler", "scheduler", "--port", "0", "--no-dashboard", "--scheduler-file", str(file)
         )
-        _wait(file.exists)
+        _wait(lambda: file.exists() and file.read_text().endswith("}"))  # it is written in pieces
         self.address = json.loads(file.read_text())["address"]
 
     def _start(self, name: str, *arguments: str) -> None:
@@ -166,7 +166,7 @@ class OutsideCluster:
         for process in self.processes.values():
             process.kill()
         for process in self.processes.values():
-            process.wait(120)
+            process.wait(300)
 
 
 @pytest.fixture(scope="module")
@@ -306,7 +306,7 @@ class RunningCommand:
     def close(self) -> None:
         for process in self.processes:
             os.kill(process, signal.SIGKILL)
-        self.process.wait(120)
+        self.process.wait(300)
 
 
 @pytest.fixture

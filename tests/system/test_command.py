@@ -245,7 +245,7 @@ def on_a_terminal(arguments: list[str], **environment: str) -> tuple[int, str]:
             except OSError:  # as Linux says that the other end was closed
                 break
     os.close(master)
-    return process.wait(120), drawn.decode()
+    return process.wait(300), drawn.decode()
 
 
 @pytest.mark.parametrize("colour", [True, False])

@@ -137,7 +137,7 @@ def test_files_may_not_grow(cluster, start_command, run, expected, tmp_path):
     """A limit on the size of files is as good as a full disk, and needs no root."""
     command = (SCENARIO, "--scheduler", cluster, "--resume", "-q")
     first = start_command(*command, prelude=NO_PICTURES + LIMIT.format(40_000))
-    assert first.process.wait(120) == 2
+    assert first.process.wait(300) == 2
     assert re.fullmatch(
         r"lidarpool: The journal out/journal cannot be written \(File too large\): make room on "
         r"its disk, or give another folder\. \d+ of 108 scans are kept in out/journal: continue "
@@ -147,8 +147,8 @@ def test_files_may_not_grow(cluster, start_command, run, expected, tmp_path):
     run(journal=tmp_path / "out" / "journal", resume=True)
     # All is there but the files, of which none larger than this can be written.
     second = start_command(*command, prelude=NO_PICTURES + LIMIT.format(60_000))
-    assert second.process.wait(120) == 2
+    assert second.process.wait(300) == 2
     assert "cloud.ply" in second.said and "108 of 108 scans are kept" in second.said
     last = start_command(*command, prelude=NO_PICTURES)
-    assert last.process.wait(120) == 0, last.said
+    assert last.process.wait(300) == 0, last.said
     assert (tmp_path / "out" / "cloud.ply").read_bytes() == expected

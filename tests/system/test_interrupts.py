@@ -165,7 +165,7 @@ def test_ctrl_c_when_the_result_is_whole(moment, start_command, cluster, tmp_pat
     """It is not said that nothing has happened, and there is nothing to resume."""
     options = ("--scheduler", cluster, "-q", "--no-plan")
     run = start_command(SHORT, *options, prelude=INTERRUPT_AT + MOMENTS[moment] + "\n")
-    assert run.process.wait(120) == 130, run.said
+    assert run.process.wait(300) == 130, run.said
     assert run.said.splitlines()[-1] == (
         "lidarpool: interrupted; everything was stopped. The result in out is complete."
     )
@@ -249,13 +249,13 @@ def test_the_run_after_one_that_was_killed_while_writing(start, untouched, tmp_p
     killed.wait_until_alone()
     assert (tmp_path / "out" / "cloud.ply").read_text() == "an earlier cloud"
     refused = start(SHORT)
-    assert refused.process.wait(120) == 2
+    assert refused.process.wait(300) == 2
     assert refused.said == (
         "lidarpool: out/journal holds an unfinished run, 108 of 108 scans: continue it with "
         "--resume, or drop it with --fresh.\n"
     )
     run = start(SHORT, "--resume")
-    assert run.process.wait(120) == 0, run.said
+    assert run.process.wait(300) == 0, run.said
     assert "starting the workers" not in run.said
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert names == {
@@ -271,7 +271,7 @@ def test_the_scheduler_of_an_outside_cluster_is_killed(start, untouched, outside
     cluster.wait()
     run = start(LONG, "--scheduler", cluster.address).wait_for(SURVEYING)
     cluster.kill("scheduler")
-    assert run.process.wait(120) == 2
+    assert run.process.wait(300) == 2
     (message,) = said_besides_progress(run)
     assert message.startswith(
         f"lidarpool: The cluster at {cluster.address} cannot be reached any more"
@@ -288,7 +288,7 @@ def test_the_last_worker_of_a_partition_is_killed(start, untouched, outside):
     patience = "import lidarpool.watch; lidarpool.watch.PATIENCE_S = 2\n"
     run = start(LONG, "--scheduler", cluster.address, prelude=patience).wait_for(SURVEYING)
     cluster.kill(next(name for name in cluster.processes if name.startswith("GPU")))
-    assert run.process.wait(120) == 2
+    assert run.process.wait(300) == 2
     (message,) = said_besides_progress(run)
     assert "Partition 'GPU' has had no workers for 2 s" in message
     assert '--resources "GPU=1"' in message

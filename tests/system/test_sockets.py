@@ -116,7 +116,7 @@ def test_the_demo_listens_on_loopback_only(options, tag, tmp_path):
         seen, most = seen | set(now), max(most, len(now))
     finally:
         process.send_signal(signal.SIGTERM)
-        process.wait(120)
+        process.wait(300)
     # Scheduler and dashboard, and of each of three partitions at least a nanny and a worker.
     assert most >= 2 + 3 * 2
     assert all(address.is_loopback for address in seen), seen
