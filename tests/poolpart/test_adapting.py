@@ -2,6 +2,7 @@
 
 from contextlib import ExitStack
 
+import dask
 import pytest
 from distributed import Client, Event, LocalCluster, get_worker
 
@@ -103,15 +104,17 @@ def test_what_waits_is_counted_by_partition(workers, wait_until):
     client = workers(4)
     parts = Pool.from_client(client).divide({"A": n_workers(3, minimum=3), "B": rest()})
     event = Event("counted", client)
-    # Dask takes half a second for a task that it does not know: B has 10 s of work, A none.
-    tasks = [parts["B"].submit(wait_for, "counted") for _ in range(20)]
-    wait_until(lambda: any(len(w.processing) == 20 for w in states(client)))
-    assert ask(client, "adaptive_target", target_duration="5s") == 4 + 1
-    assert ask(client, "adaptive_target", target_duration="2s") == 4 + 4
+    # What Dask guesses grows with the time that a task takes; what it is told does not.
+    told = {"distributed.scheduler.default-task-durations": {"wait_for": "100s"}}
+    with dask.config.set(told):  # B has 2000 s of work, A none
+        tasks = [parts["B"].submit(wait_for, "counted") for _ in range(20)]
+        wait_until(lambda: any(len(w.processing) == 20 for w in states(client)))
+    assert ask(client, "adaptive_target", target_duration="1000s") == 4 + 1
+    assert ask(client, "adaptive_target", target_duration="400s") == 4 + 4
     tasks += [parts["A"].submit(wait_for, "counted") for _ in range(60)]
     wait_until(lambda: sum(len(w.processing) for w in states(client)) == 80)
     # A has as many workers as its rule allows: none of them would be for it.
-    assert ask(client, "adaptive_target", target_duration="10s") == 4
+    assert ask(client, "adaptive_target", target_duration="2000s") == 4
     event.set()
     assert all(client.gather(tasks))
 
