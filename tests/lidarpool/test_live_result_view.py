@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -182,7 +183,9 @@ def test_pictures_of_another_run_are_noted(folder, pictured):
 
 def test_a_mesh_is_never_gone_while_another_comes_and_none_is_left_over(page, monkeypatch):
     now = [0.0]
-    monkeypatch.setattr("lidarpool.live.mesh_node.time.monotonic", lambda: now[0])
+    # Not in the module `time` itself, which the page's own threads go by.
+    clock = SimpleNamespace(monotonic=lambda: now[0])
+    monkeypatch.setattr("lidarpool.live.mesh_node.time", clock)
     node = MeshNode(page, "/mesh")
 
     def shown():

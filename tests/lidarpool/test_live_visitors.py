@@ -46,20 +46,34 @@ def served():
         yield page, [msgspec.msgpack.encode(message) for message in (CAMERA, press)], pressed
 
 
-def visit(page, origin, messages=()):
-    """Connect, say something, and return what was said before the connection was closed."""
+def connected(page, origin):
+    """Connect to a page as a browser does that shows a page of this origin."""
     url = page.url.replace("http", "ws", 1)
-    with connect(url, origin=origin, subprotocols=[PROTOCOL], max_size=None) as visitor:
-        said = []
+    return connect(url, origin=origin, subprotocols=[PROTOCOL], max_size=None)
+
+
+def turned_away(page, origin, messages):
+    """Say something; return what was said, and why, before the connection was closed."""
+    said = []
+    with connected(page, origin) as visitor:
         try:
             for message in messages:
                 visitor.send(message)
             while True:
-                said.append(visitor.recv(timeout=1.0))
-        except TimeoutError:  # it has said all it has to say
-            return said, None
+                said.append(visitor.recv(timeout=120))
         except ConnectionClosed as closed:
             return said, closed.rcvd.code
+
+
+def see_and_press(page, origin, messages, pressed):
+    """Stay until the page's secret was seen and its button was pressed."""
+    with connected(page, origin) as visitor:
+        for message in messages:
+            visitor.send(message)
+        while b"a secret" not in unpacked(visitor.recv(timeout=120)):
+            pass
+        pressed.get(timeout=120)
+        assert visitor.ping().wait(120)  # it was not closed
 
 
 @pytest.mark.parametrize("origin", STRANGERS)
@@ -75,18 +89,14 @@ def test_pages_of_this_machine(origin):
 
 @pytest.mark.parametrize("origin", [OWN[1], None], ids=["own", "no browser"])
 def test_whoever_is_of_this_machine_sees_the_page_and_may_press(served, origin):
-    page, messages, pressed = served
-    said, closed = visit(page, origin, messages)
-    assert any(b"a secret" in text for text in map(unpacked, said))
-    assert closed is None
-    pressed.get(timeout=120)
+    see_and_press(served[0], origin, *served[1:])
 
 
 @pytest.mark.parametrize("origin", ["http://example.com:8080", "null"])
 def test_a_stranger_sees_nothing_and_presses_nothing(served, origin, caplog):
     page, messages, pressed = served
     for _ in range(3):
-        assert visit(page, origin, messages) == ([], 1008)
+        assert turned_away(page, origin, messages) == ([], 1008)
     settle(page)
     assert pressed.empty()
     assert page.get_clients() == {}
@@ -121,10 +131,9 @@ def test_what_comes_with_the_first_bytes_is_not_taken_either(served):
 
 def test_a_page_is_served_to_many_after_a_stranger_was_sent_away(served):
     page, messages, pressed = served
-    visit(page, "http://example.com", messages)
+    turned_away(page, "http://example.com", messages)
     for _ in range(2):
-        visit(page, OWN[0], messages)
-        pressed.get(timeout=120)
+        see_and_press(page, OWN[0], messages, pressed)
     assert pressed.empty()
 
 

@@ -105,6 +105,7 @@ def test_unused_vertices_do_not_count_in_bounds():
     np.testing.assert_array_equal(Scene.from_meshes([mesh]).bounds, [[0, 0, 0], [1, 1, 0]])
 
 
+@settings(deadline=None)
 @given(st.lists(st.sampled_from(["a", "b", "a.2", "a.3", "b.2.2"]), max_size=12))
 def test_unique_names(names):
     unique = unique_names(names)

@@ -10,6 +10,7 @@ from lidarpool.view.labels import axis_labels
 from lidarpool.view.stage import Stage, axis, nice_step, robust_bounds
 
 
+@settings(deadline=None)
 @given(st.floats(1e-6, 1e9))
 def test_a_nice_step_is_1_2_or_5_and_just_large_enough(length):
     step = nice_step(length)

@@ -1,5 +1,7 @@
 """Partitions whose workers stay away, or take no tasks."""
 
+from types import SimpleNamespace
+
 import pytest
 
 from lidarpool import LidarpoolError, watch
@@ -9,7 +11,7 @@ from lidarpool.watch import Watch
 @pytest.fixture
 def look(monkeypatch):
     """Looks at workers, given as partition and status, so many seconds after the first look."""
-    monkeypatch.setattr("time.monotonic", lambda: 1000.0)
+    monkeypatch.setattr(watch, "time", SimpleNamespace(monotonic=lambda: 1000.0))
     watching = Watch(None, ["GPU", "OTHER"], lasting=["LIDAR"])
 
     def look(seconds, *workers):
