@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import os
+import signal
+from collections.abc import Callable
+
 import dask
 import pytest
 from distributed import Client
 
+import lidarpool.checks
 from lidarpool import LidarpoolError, Scene, Sensor, Survey, simulate
 from lidarpool.checks import common_backend
-from poolpart import Pool, worker_identities
+from poolpart import Pool, local_cluster, worker_identities
 
 SURVEY = Survey(Sensor(rays_per_revolution=180, layers=16, step_deg=10), [(0, 0, 1)], steps=36)
 
@@ -54,6 +59,47 @@ def test_a_run_starts_without_a_worker_that_breaks_off(client, break_off, questi
     assert result.hits > 0
 
 
+@pytest.fixture
+def lose_gpu(monkeypatch) -> Callable[[Callable[[], object]], None]:
+    """Do something, once, when the casting workers are about to be asked for their backends."""
+
+    def lose_gpu(act: Callable[[], object]) -> None:
+        acts = [act]
+
+        def ask(*arguments):
+            if acts:
+                acts.pop()()
+            return common_backend(*arguments)
+
+        monkeypatch.setattr(lidarpool.checks, "common_backend", ask)
+
+    return lose_gpu
+
+
+def test_workers_that_die_when_a_run_starts_are_waited_for(lose_gpu):
+    with local_cluster(gpu_workers=1, other_workers=1) as cluster, Client(cluster) as client:
+        address = Pool.from_client(client).partitions()["GPU"].workers[0].address
+        pid = client.run(os.getpid, workers=[address])[address]
+        lose_gpu(lambda: os.kill(pid, signal.SIGKILL))
+        result = simulate(Scene.seed(), SURVEY, client=client, backend="numpy")
+    assert result.hits > 0
+
+
+def test_workers_that_do_not_come_back_are_named(outside, lose_gpu, monkeypatch):
+    monkeypatch.setattr(lidarpool.checks, "RETURN_S", 0.5)
+    cluster = outside()
+    cluster.add("GPU")
+    cluster.add("LIDAR", slots=4)
+    cluster.wait()
+    name = next(name for name in cluster.processes if name.startswith("GPU"))
+    lose_gpu(lambda: cluster.kill(name))
+    with (
+        Client(cluster.address, set_as_default=False) as client,
+        pytest.raises(LidarpoolError, match="GPU"),
+    ):
+        simulate(Scene.seed(), SURVEY, client=client, backend="numpy")
+
+
 def test_a_cluster_that_is_lost_before_the_run_has_begun_is_named(outside, monkeypatch):
     cluster = outside()
     cluster.add("GPU")
@@ -64,7 +110,7 @@ def test_a_cluster_that_is_lost_before_the_run_has_begun_is_named(outside, monke
         cluster.kill("scheduler")
         return common_backend(client, *rest)
 
-    monkeypatch.setattr("lidarpool.run.common_backend", lose)
+    monkeypatch.setattr(lidarpool.checks, "common_backend", lose)
     lost = pytest.raises(LidarpoolError, match=f"{cluster.address} cannot be reached any more")
     with (
         dask.config.set({"distributed.comm.timeouts.connect": "2s"}),

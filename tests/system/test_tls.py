@@ -322,13 +322,13 @@ def test_without_cryptography_one_is_told_what_to_install(monkeypatch):
 
 def test_simulate_with_tls(monkeypatch):
     seen: list[str] = []
-    before = lidarpool.run.survey_pool
+    before = lidarpool.checks.survey_pool
 
     def look(client: Client, *rest: Any) -> Any:
         seen.append(client.scheduler.address)
         return before(client, *rest)
 
-    monkeypatch.setattr(lidarpool.run, "survey_pool", look)
+    monkeypatch.setattr(lidarpool.checks, "survey_pool", look)
     survey = Survey(poses=[(0, 0, 1)], sensor=lidarpool.Sensor(layers=2, step_deg=30))
     result = lidarpool.simulate(Scene.seed(), survey, gpu_workers=1, other_workers=1, tls=True)
     assert result.rays > 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -93,6 +94,8 @@ def survey_pool(client: Client, collectors: int, planning: bool) -> Pool:
 
 
 AUTO_TAKES = "Backend 'auto' takes what works."
+RETURN_S = 30.0  # for workers that die while they are asked; a nanny needs a second or two
+LOOK_EVERY_S = 0.2
 
 
 def common_backend(
@@ -115,7 +118,9 @@ def common_backend(
         if isinstance(answer, BaseException):
             raise answer
     if not answers:
-        raise LidarpoolError("The workers of partition 'GPU' left before the run started.")
+        raise LidarpoolError(
+            "The workers of partition 'GPU' left before the run started: see in their logs why."
+        )
     names = list(next(iter(answers.values())))
     if wanted == "auto":
         return next(n for n in names if not any(reasons[n] for reasons in answers.values()))
@@ -127,6 +132,33 @@ def common_backend(
                 f"{reasons[wanted]}. {advice}"
             )
     return wanted
+
+
+def find_workers(
+    client: Client, collectors: int, planning: bool, wanted: str, advice: str = AUTO_TAKES
+) -> tuple[Pool, list[WorkerInfo], str]:
+    """Find all workers, those that cast among them, and the backend that these have.
+
+    Workers that die while they are asked are likely to come back: what is lacking without them
+    is looked for again, for a while.
+
+    Raises
+    ------
+    LidarpoolError
+        What `survey_pool` and `common_backend` raise.
+    """
+    until, left = time.monotonic() + RETURN_S, False
+    while True:
+        known = set() if client.asynchronous else worker_identities(client).keys()
+        try:
+            pool = survey_pool(client, collectors, planning)
+            casting = [worker for worker in pool if worker.resources.get(GPU)]
+            return pool, casting, common_backend(client, wanted, casting, advice)
+        except LidarpoolError:
+            left = left or bool(known and known - worker_identities(client).keys())
+            if not left or time.monotonic() > until:
+                raise
+        time.sleep(LOOK_EVERY_S)
 
 
 def check_backend_name(wanted: str) -> None:

@@ -18,7 +18,7 @@ from poolpart.local import default_workers, usable_cores
 from poolpart.probe import visible_gpus
 from raybeam import available_backends
 
-from .checks import check_backend_here, common_backend, survey_pool
+from .checks import check_backend_here, find_workers
 from .doubts import doubts
 from .errors import LidarpoolError
 from .job import Job
@@ -189,10 +189,9 @@ def _look_there(made: Forecast, client: Client) -> None:
     everybody = Pool.from_client(client)
     there = {name: sum(w.resources.get(name, 0) for w in everybody) for name in needed}
     made.slots = {name: (needed[name], int(there[name])) for name in needed}
-    pool = survey_pool(client, made.job.collectors, made.job.planning is not None)
-    casting = [worker for worker in pool if worker.resources.get(GPU)]
+    planning = made.job.planning is not None
+    _, casting, made.backend = find_workers(client, made.job.collectors, planning, made.job.backend)
     made.memory = min((worker.memory for worker in casting if worker.memory), default=0)
-    made.backend = common_backend(client, made.job.backend, casting)
     if not any(worker.gpus for worker in casting):
         made.notes.append(f"no GPU in partition GPU: CPU workers cast the rays with {made.backend}")
 

@@ -36,8 +36,10 @@ class _Interrupt:
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
         if self.first_at is None:
-            self.first_at = time.monotonic()
-            raise KeyboardInterrupt
+            if not _AgainIfLost.is_at_work(frame):
+                self.first_at = time.monotonic()
+                raise KeyboardInterrupt
+            return
         if time.monotonic() - self.first_at > _IMPATIENT_S:
             _exit(b"lidarpool: stopped at once; workers of this machine end by themselves.\n")
 
@@ -59,9 +61,24 @@ class _AgainIfLost:
             return
         self._interrupt.first_at = None
         # From a thread, a little later: raised in here, it would be lost again.
-        again = threading.Timer(_AGAIN_S, _interrupt_main_thread)
-        again.daemon = True
-        again.start()
+        threading.Thread(target=self._interrupt_again, daemon=True).start()
+
+    @classmethod
+    def is_at_work(cls, frame: FrameType | None) -> bool:
+        """Whether a signal has come while this runs: a thread may be late to leave it."""
+        while frame is not None and frame.f_code is not cls.__call__.__code__:
+            frame = frame.f_back
+        return frame is not None
+
+    def _interrupt_again(self) -> None:
+        """Interrupt the main thread until that has heard it, or another handler has come."""
+        while True:
+            time.sleep(_AGAIN_S)
+            _interrupt_main_thread()
+            time.sleep(_AGAIN_S)
+            heard = self._interrupt.first_at is not None
+            if heard or signal.getsignal(signal.SIGINT) is not self._interrupt:
+                return
 
 
 def _interrupt_main_thread() -> None:

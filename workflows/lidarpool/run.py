@@ -20,7 +20,7 @@ from poolpart import (
     assign_devices,
 )
 
-from .checks import common_backend, survey_pool
+from .checks import find_workers
 from .deliveries import Deliveries
 from .errors import LidarpoolError
 from .plan import best
@@ -67,9 +67,10 @@ class Run:
         # For when it is lost; a client that was never connected is refused in a moment.
         self.address: str = getattr(client.scheduler, "address", "")
         try:
-            pool = survey_pool(client, job.collectors, job.planning is not None)
-            casting = [worker for worker in pool if worker.resources.get(GPU)]
-            kept.backend = common_backend(client, kept.backend or job.backend, casting, kept.advice)
+            planning, backend = job.planning is not None, kept.backend or job.backend
+            pool, casting, kept.backend = find_workers(
+                client, job.collectors, planning, backend, kept.advice
+            )
             assign_devices(client, casting)  # all at once: those that see few of them choose first
         except LidarpoolError:
             raise
