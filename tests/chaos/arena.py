@@ -90,9 +90,25 @@ class Arena:
         return pid if pid and _is_there(pid) else None
 
     def address(self, name: str) -> str | None:
-        """Address of a worker, None while the scheduler does not have it."""
-        address = getattr(self.cluster.workers.get(name), "worker_address", None)
+        """Address of a worker, None while the scheduler or its nanny does not have it."""
+        # The scheduler hears of it first. A nanny whose first worker dies before it has heard
+        # of that one gives up.
+        nanny = self.cluster.workers.get(name)
+        if nanny is None or nanny.status.name != "running":
+            return None
+        address = getattr(nanny, "worker_address", None)
         return address if address in self.cluster.scheduler.workers else None
+
+    def give_up(self, pid: int) -> None:
+        """Have the scheduler do with the worker of a process as when it is not heard of."""
+        scheduler = self.cluster.scheduler
+        workers = list(scheduler.workers.items())
+        self.cluster.sync(
+            scheduler.restart_workers,
+            [address for address, worker in workers if worker.pid == pid],
+            wait_for_workers=False,
+            stimulus_id="chaos",
+        )
 
     def revive(self, name: str) -> None:
         """Start a worker anew whose nanny has left with it."""
@@ -114,9 +130,9 @@ class Arena:
     def wait_until_whole(self, timeout_s: float = 120.0) -> None:
         """Wait until every worker is there."""
         deadline = time.monotonic() + timeout_s
-        for name in self.deserted:
-            self.revive(name)
         while absent := [name for name in self.cluster.worker_spec if not self.address(name)]:
+            for name in self.deserted:  # also one that was killed while it came back
+                self.revive(name)
             if time.monotonic() > deadline:
                 raise TimeoutError(f"{', '.join(absent)} did not come back in {timeout_s} s.")
             time.sleep(0.02)

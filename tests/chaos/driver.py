@@ -13,6 +13,7 @@ from pathlib import Path
 from distributed import Client
 
 from lidarpool import Planning, Survey, simulate
+from lidarpool.scan import caster, pump
 from poolpart import placement_violations, trace_to
 
 from .events import Board, Sink
@@ -45,7 +46,9 @@ class Driver:
     folder
         Of the board to log to.
     start
-        Where to wait for others before the survey starts.
+        Where to wait for others before the survey starts, and once more when it has its first
+        scans: so these surveys run at a time. They are not disturbed, and nothing that is only
+        slow is taken for lost.
     """
 
     def __init__(
@@ -89,14 +92,19 @@ def _drive(
     folder: Path,
     start: Barrier | None,
 ) -> None:
-    run = ""
+    run, waited = "", start is None
     log = Sink(Board(folder), "driver", lambda _: None)
 
     def note(point: str, fields: Mapping[str, object]) -> None:
-        nonlocal run
+        nonlocal run, waited
         run = str(fields.get("run", ""))
         log(point, fields)
+        if start is not None and not waited:
+            waited = True
+            start.wait(START_S)
 
+    if start is not None:
+        pump.STALL_SECONDS = caster.LATE_S = float("inf")
     trace_to(note)
     try:
         with Client(address) as client:

@@ -22,8 +22,9 @@ from .nemesis import Fault, Nemesis
 STOP = -1
 BATCH = 4
 CASTERS = COLLECTORS = 2
-IDLE_MOST_S = 5.0  # without anything arriving; then the run is given up
+IDLE_MOST_S = 5.0  # without anything arriving; then a disturbed run is given up
 START_MOST_S = 30.0  # the same before the first scan
+UNDISTURBED_MOST_S = 120.0  # the same where nothing can be lost, so that it ends by itself
 
 
 def generate(run: str, scans: int, outlet: str) -> None:
@@ -66,7 +67,9 @@ def collect(run: str, inlet: str, outlet: str) -> None:
     sink.put([STOP])
 
 
-def survey(client: Client, scans: int) -> list[int]:
+def survey(
+    client: Client, scans: int, start_most_s: float = START_MOST_S, idle_most_s: float = IDLE_MOST_S
+) -> list[int]:
     """Run it; returns the scans that arrived, as they came."""
     run = uuid.uuid4().hex[:8]
     names = [f"naive-{run}-{number}" for number in range(3)]
@@ -76,10 +79,10 @@ def survey(client: Client, scans: int) -> list[int]:
     tasks += [_submit(client, "GPU", cast, run, *names[:2]) for _ in range(CASTERS)]
     tasks += [_submit(client, "LIDAR", collect, run, *names[1:]) for _ in range(COLLECTORS)]
     ends = 0
-    deadline = time.monotonic() + START_MOST_S
+    deadline = time.monotonic() + start_most_s
     while ends < COLLECTORS and time.monotonic() < deadline:
         for item in queues[-1].get(batch=True):
-            deadline = time.monotonic() + IDLE_MOST_S
+            deadline = time.monotonic() + idle_most_s
             if list(item) == [STOP]:
                 ends += 1
                 continue
@@ -102,7 +105,8 @@ def disturbed(arena: Arena, scans: int, faults: Sequence[Fault]) -> Verdict:
     """Run it under the nemesis, and judge what arrived: one row a scan, in order."""
     arena.wait_until_whole()
     arena.board.forget_events()
+    patience = () if faults else (UNDISTURBED_MOST_S, UNDISTURBED_MOST_S)
     with Nemesis(arena, faults) as nemesis:
-        arrived = survey(arena.client, scans)
+        arrived = survey(arena.client, scans, *patience)
     rows = sorted(arrived)
     return judge(arena.board.events(nemesis.run), scans, rows, range(scans))

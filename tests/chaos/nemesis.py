@@ -13,6 +13,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 
+import psutil
+
 from poolpart import trace_to
 
 from .arena import TIME_TO_LIVE_S, Arena
@@ -25,6 +27,7 @@ SHORT_STOPS_S = 0.1, 2.0
 LONG_STOP_S = 2.1 * TIME_TO_LIVE_S
 LONG_STOPS = 0.1  # part of them
 LOOK_EVERY_S = 0.005
+WAKE_MOST_S = 30.0  # for those who are to stop to have stopped, when all is over
 
 
 @dataclass(frozen=True)
@@ -49,6 +52,9 @@ class Fault:
         Which of the workers, from 0 to 1.
     stop_s
         Until SIGCONT.
+    given_up
+        Whether the scheduler is to give up the stopped worker meanwhile, at once: its time to
+        live can then be so long that no other worker is given up for being slow.
     worker
         At a named point: the worker that is to come to it; "" for any.
     """
@@ -62,6 +68,7 @@ class Fault:
     pick: float = 0.0
     stop_s: float = 0.5
     worker: str = ""
+    given_up: bool = False
 
     @property
     def order(self) -> Order:
@@ -168,11 +175,18 @@ class Nemesis:
         self._looker.join()
         self.arena.board.disarm()
         for fired in self.arena.board.fired():
-            self._note(self.faults[fired.order.number])
+            fault = self.faults[fired.order.number]
+            if not fault.given_up:  # nobody has done that
+                self._note(fault)
             fired.path.unlink()
+            if fault.kind == STOP and not fault.partition:
+                self._stopped[fired.pid] = 0.0
         for helper in self._helpers:
             helper.join()
-        self._wake(float("inf"))
+        deadline = time.monotonic() + WAKE_MOST_S
+        while self._stopped and time.monotonic() < deadline:
+            self._wake(float("inf"))
+            time.sleep(LOOK_EVERY_S)
         self.left = [f for number, f in self.faults.items() if number not in self._carried_out]
 
     # -- in the nemesis' own thread ----------------------------------------------------
@@ -200,6 +214,10 @@ class Nemesis:
         self._note(fault)
         fired.path.unlink()
         if fault.kind == STOP:
+            if fault.given_up:
+                while _is_going(fired.pid):
+                    time.sleep(LOOK_EVERY_S)
+                self.arena.give_up(fired.pid)
             with self._lock:
                 self._stopped[fired.pid] = time.monotonic() + fault.stop_s
         elif fault.kind in (RETIRE, RESTART):
@@ -209,6 +227,8 @@ class Nemesis:
         """Let those go on that have been stopped for long enough."""
         with self._lock:
             over = [pid for pid, until in self._stopped.items() if until <= now]
+            # A process that is slow to stop itself would not hear it, and stay stopped.
+            over = [pid for pid in over if not _is_going(pid)]
             for pid in over:
                 del self._stopped[pid]
         for pid in over:
@@ -252,7 +272,11 @@ class Nemesis:
 
     def _retire(self, name: str, address: str) -> None:
         self.arena.client.retire_workers([address], close_workers=True)
-        self.arena.revive(name)
+        there = False
+        while not there:
+            with suppress(RuntimeError):  # the new one was struck before its nanny had heard of it
+                self.arena.revive(name)
+            there = name not in self.arena.deserted
 
     def _restart(self, name: str, address: str) -> None:
         with suppress(KeyError, ValueError, TimeoutError):  # it left by another fault
@@ -279,6 +303,15 @@ class _DriverSink(Sink):
     def _strike(self, fired: Fired) -> None:
         fired.path.unlink(missing_ok=True)
         self._nemesis.strike(self._nemesis.faults[fired.order.number])
+
+
+def _is_going(pid: int) -> bool:
+    """Whether a process is there and not stopped."""
+    try:
+        status = psutil.Process(pid).status()
+    except psutil.NoSuchProcess:
+        return False
+    return status not in (psutil.STATUS_STOPPED, psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD)
 
 
 def _send(pid: int, number: signal.Signals) -> bool:

@@ -14,7 +14,6 @@ import time
 from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import psutil
@@ -27,12 +26,13 @@ from .driver import Delivered, Driver
 from .events import KILL, SEGV, TERM
 from .nemesis import PARTITIONS, RANDOM, Fault, Nemesis
 from .survey import STEPS, Reference, reference, survey
-from .traces import Footprint, differences, own_temporary_folder, scheduler_state
+from .traces import Footprint, own_temporary_folder, scheduler_state, settled_differences
 
 PACE_S = 0.02  # a scan
 SAMPLE_EVERY_S = 0.5
 EVERY_S = (1.0, 4.0)  # between two faults
-SETTLE_S = 10.0  # for a scheduler to have forgotten what it is told to forget
+SCANS_PER_FAULT = 20
+TIME_TO_LIVE_S = 60  # nobody is stopped here: a worker that is not heard of is only slow
 LETHAL = (KILL, KILL, TERM, SEGV)
 
 
@@ -89,16 +89,18 @@ def soak(scans: int, seed: int, pace_s: float = PACE_S) -> Soaked:
     """Survey at least so many scans while workers are killed all the time."""
     what = survey(-(-scans // STEPS))
     with own_temporary_folder() as temporary:
-        with Arena() as arena:  # of its own, so that all is imported when it begins
+        with Arena(
+            time_to_live_s=TIME_TO_LIVE_S
+        ) as arena:  # of its own, so that all is imported when it begins
             expected = reference(arena, what, None)
         before = Footprint.now(temporary)
         soaked = _soak(what, expected, seed, pace_s)
-        return replace(soaked, left_behind=before.left_in(Footprint.now(temporary)))
+        return replace(soaked, left_behind=before.left_in(temporary))
 
 
 def _soak(what: Survey, expected: Reference, seed: int, pace_s: float) -> Soaked:
     samples: list[Sample] = []
-    with Arena(pauses={"generate.put": pace_s}) as arena:
+    with Arena(pauses={"generate.put": pace_s}, time_to_live_s=TIME_TO_LIVE_S) as arena:
         known = scheduler_state(arena.client)
         with Nemesis(arena, _faults(random.Random(seed), what.scan_count), drives=False) as nemesis:
             driver = Driver(arena.client.scheduler.address, what, None, arena.board.folder)
@@ -110,7 +112,7 @@ def _soak(what: Survey, expected: Reference, seed: int, pace_s: float) -> Soaked
                 time.sleep(SAMPLE_EVERY_S)
             delivered = driver.delivered()
         arena.wait_until_whole()
-        left = _left_on_scheduler(arena, known)
+        left = settled_differences(arena.client, known)
         events = arena.board.events(delivered.run)
     rows = () if delivered.reference is None else delivered.reference.rows
     return Soaked(
@@ -125,7 +127,11 @@ def _soak(what: Survey, expected: Reference, seed: int, pace_s: float) -> Soaked
 
 
 def _faults(chance: random.Random, scans: int) -> list[Fault]:
-    """More at random times than any soak lasts, and some that are sure to interrupt scans."""
+    """Far more at random times than come to pass, and some that are sure to interrupt scans.
+
+    Where workers start more slowly than they are killed the last of them come to an end, so
+    that the survey does.
+    """
     timed = [
         Fault(
             number,
@@ -135,7 +141,7 @@ def _faults(chance: random.Random, scans: int) -> list[Fault]:
             partition=chance.choice(PARTITIONS),
             pick=chance.random(),
         )
-        for number in range(10_000)
+        for number in range(scans // SCANS_PER_FAULT)
     ]
     # At the pace of a soak workers are idle at most moments: on a slow machine, with few kills,
     # every one of those above has been seen to find nothing under way.
@@ -150,16 +156,6 @@ def _by_kind(done: Counter[tuple[str, str]]) -> Counter[str]:
     for (kind, _), number in done.items():
         kinds[kind] += number
     return kinds
-
-
-def _left_on_scheduler(arena: Arena, known: dict[str, Any]) -> list[str]:
-    """What the scheduler knows that it did not know, once it has settled."""
-    deadline = time.monotonic() + SETTLE_S
-    while (left := differences(known, scheduler_state(arena.client))) and (
-        time.monotonic() < deadline
-    ):
-        time.sleep(0.2)
-    return left
 
 
 def draw(soaked: Soaked, path: Path) -> None:

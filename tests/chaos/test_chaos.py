@@ -14,11 +14,12 @@ from lidarpool.scan.points import STAGE_POINTS
 SEED = 7
 FAULTS = 20
 PLANNED = 24  # some may find nobody to strike
+TIME_TO_LIVE_S = 60  # all stops of the plan are short: a worker that is not heard of is only slow
 
 
 @pytest.fixture(scope="module")
 def arena():
-    with Arena(pauses=PAUSES) as arena:
+    with Arena(pauses=PAUSES, time_to_live_s=TIME_TO_LIVE_S) as arena:
         yield arena
 
 

@@ -8,11 +8,12 @@ from tests.chaos.arena import Arena
 from tests.chaos.nemesis import Fault, make_plan
 
 SCANS = 200
+TIME_TO_LIVE_S = 300  # nobody is stopped here: a worker that is not heard of is only slow
 
 
 @pytest.fixture(scope="module")
 def arena():
-    with Arena(pauses={"generate.put": 0.003}) as arena:
+    with Arena(pauses={"generate.put": 0.003}, time_to_live_s=TIME_TO_LIVE_S) as arena:
         yield arena
 
 

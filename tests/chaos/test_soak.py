@@ -17,7 +17,7 @@ def test_a_thousand_scans_in_kills_leave_nothing_and_lose_nothing(tmp_path):
     # In a process of its own: what it holds, and what it leaves, is then the soak's alone.
     picture = tmp_path / "soak.png"
     command = [sys.executable, "-m", "tests.chaos.soak", "--scans", "1000", "--picture", picture]
-    soaked = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600)
+    soaked = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=1200)
     said = soaked.stdout
     assert soaked.returncode == 0, said + soaked.stderr
     assert said.endswith("sound\n")

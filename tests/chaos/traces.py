@@ -5,8 +5,9 @@ from __future__ import annotations
 import gc
 import os
 import tempfile
+import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing import resource_tracker
@@ -15,6 +16,8 @@ from typing import Any
 
 import psutil
 from distributed import Client
+
+SETTLE_S = 120.0  # for what was closed to be gone: connections and processes end a moment later
 
 
 def scheduler_state(client: Client) -> dict[str, Any]:
@@ -50,8 +53,9 @@ def _look(dask_scheduler: Any) -> dict[str, Any]:
         "resources": {
             str(worker.name): dict(worker.resources) for worker in dask_scheduler.workers.values()
         },
+        # Not what Dask counts: a stolen task stays with the worker that it was taken from.
         "resources used": {
-            str(worker.name): {k: v for k, v in worker.used_resources.items() if v}
+            str(worker.name): [task.resource_restrictions for task in worker.processing]
             for worker in dask_scheduler.workers.values()
         },
         "host restrictions": sorted(map(str, getattr(dask_scheduler, "host_restrictions", ()))),
@@ -70,6 +74,19 @@ def differences(before: dict[str, Any], after: dict[str, Any]) -> list[str]:
         for name in sorted(before.keys() | after.keys())
         if before.get(name) != after.get(name)
     ]
+
+
+def settled_differences(client: Client, before: dict[str, Any]) -> list[str]:
+    """Say what a scheduler knows that it did not, once it has heard of all that was closed."""
+    return _settled(lambda: differences(before, scheduler_state(client)))
+
+
+def _settled(look: Callable[[], list[str]]) -> list[str]:
+    """Look until there is nothing, or nothing will change any more."""
+    deadline = time.monotonic() + SETTLE_S
+    while (left := look()) and time.monotonic() < deadline:
+        time.sleep(0.2)
+    return left
 
 
 @dataclass(frozen=True)
@@ -101,8 +118,11 @@ class Footprint:
             ),
         )
 
-    def left_in(self, after: Footprint) -> list[str]:
-        """Say what there is later that there was not at first."""
+    def left_in(self, folder: Path) -> list[str]:
+        """Say what there is in the end that there was not at first."""
+        return _settled(lambda: self._more_in(Footprint.now(folder)))
+
+    def _more_in(self, after: Footprint) -> list[str]:
         left = [f"process {process}" for process in sorted(after.processes - self.processes)]
         left += [f"file {file}" for file in sorted(after.files - self.files)]
         left += [
