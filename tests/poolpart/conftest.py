@@ -73,8 +73,11 @@ def processes():
 
 
 @pytest.fixture
-def nannies():
+def nannies(monkeypatch):
     """Client of a cluster of two worker processes that belong to no partition."""
+    # A busy machine needs longer than that to start a worker again.
+    monkeypatch.setattr("poolpart.book.HOLD_S", 3600.0)
+    monkeypatch.setattr("poolpart.declare.PATIENCE_S", 120.0)
     options = {"nthreads": 1, "host": "127.0.0.1", "dashboard": False, "silence_logs": QUIET}
     spec = {name: {"cls": Nanny, "options": options} for name in (0, 1)}
     scheduler = {

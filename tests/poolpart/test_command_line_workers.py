@@ -98,7 +98,9 @@ def test_live_late_killed_and_undone(command_line, wait_until):
     with Client(command_line.address) as client:
         assert sorted(Pool.from_client(client).dissolve()) == ["A", "B", "C"]
         assert set(map(str, declared(client).values())) == {"{}"}
+        old = set(worker_identities(client))
         client.restart(wait_for_workers=False)
-        await_workers(client, 3)
+        # Those of nannies, and none of those that were there.
+        wait_until(lambda: len(worker_identities(client).keys() - old) == 3)
         time.sleep(0.1)
         assert set(map(str, declared(client).values())) == {"{}"}

@@ -121,7 +121,7 @@ def test_nannies_are_as_before(nannies, wait_until):
     os.kill(victim[1], signal.SIGKILL)
     # While one is starting again, too.
     wait_until(lambda: victim[0] not in worker_identities(nannies))
-    assert Pool(nannies, []).dissolve() == ["A", "B"]
+    assert Pool(nannies, []).dissolve(timeout_s=LONG_S) == ["A", "B"]
     assert victim[0] in addresses
     assert known(nannies) == before
     nannies.restart()
@@ -229,7 +229,7 @@ def test_whoever_was_lent_goes_home_first(start, wait_until):
     tasks = [parts["A"].submit(wait_for, "lent") for _ in range(6)]
     wait_until(lambda: len(parts["A"]) == 3)
     threading.Timer(0.3, event.set).start()
-    parts["A"].dissolve()
+    parts["A"].dissolve(timeout_s=LONG_S)
     assert all(client.gather(tasks))
     assert declared(client) == {"a": {}, "b": {"B": 1}, "c": {"B": 1}}
 
@@ -250,6 +250,8 @@ def test_tasks_that_have_not_ended_are_waited_for(start, wait_until):
     parts = pool.divide({"A": n_workers(1), "B": rest()})
     event = Event("dissolve", client)
     tasks = [parts["A"].submit(wait_for, "dissolve", key=f"t-{i}") for i in range(3)]
+    # They come by another connection than what follows.
+    wait_until(lambda: len(client.cluster.scheduler.tasks) == 3)
     before = declared(client)
     with pytest.raises(PoolError, match="After 0 s 3 tasks of A and B had not ended, such as t-"):
         pool.dissolve(timeout_s=0)
@@ -313,25 +315,28 @@ def test_a_scheduler_with_many_tasks_is_not_kept_from_them_by_looking(monkeypatc
     assert clock.looked < 0.1 * clock.now < 1.1
 
 
-def start_slowly(dask_worker):
-    """Have a nanny's worker need some seconds to start, from now on."""
-    slow = ["import time; time.sleep(4)"]
-    dask_worker.preload = dask_worker.process.worker_kwargs["preload"] = slow
+def start_once(path, dask_worker):
+    """Have a nanny's worker start no sooner than there is such a file, from now on."""
+    wait = f"import os, time\nwhile not os.path.exists({path!r}): time.sleep(0.05)"
+    dask_worker.preload = dask_worker.process.worker_kwargs["preload"] = [wait]
 
 
 def test_a_worker_that_comes_back_when_nobody_expects_it_is_as_it_was(
-    nannies, wait_until, monkeypatch
+    nannies, wait_until, monkeypatch, tmp_path
 ):
     """Its place has been given up by then, and there is no partition any more."""
     part = Pool.from_client(nannies).divide({"A": rest()})["A"]
-    victim = part.workers[0]
-    nannies.run(start_slowly, nanny=True)
-    monkeypatch.setattr("poolpart.book.HOLD_S", 1.0)
+    victim, gate = part.workers[0], tmp_path / "gate"
+    nannies.run(start_once, str(gate), nanny=True)
     monkeypatch.setattr(dissolve, "_PATIENCE_S", 0.2)
     os.kill(nannies.run(os.getpid, workers=[victim.address])[victim.address], signal.SIGKILL)
     wait_until(lambda: len(part.workers) == 1)
     with pytest.raises(PoolError, match="did not answer while A were dissolved; they become what"):
         part.dissolve(timeout_s=0.1)
+    monkeypatch.setattr("poolpart.book.HOLD_S", 0.0)  # from here on nobody expects it
+    nanny = next(n for n in nannies.cluster.workers.values() if str(n.name) == victim.name)
+    wait_until(lambda: nanny.resources is None)  # it was told, but its worker is on its way
+    gate.touch()
     nannies.wait_for_workers(2, timeout=LONG_S)
     wait_until(lambda: steward.NAME not in nannies.cluster.scheduler.plugins)
     assert set(map(str, declared(nannies).values())) == {"{}"}

@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -38,7 +39,14 @@ def test_thumbnails_come_in_order(tmp_path):
 
 def test_whichever_worker_is_killed_the_file_is_the_same(tmp_path, wait_until):
     path, total = tmp_path / "out.bin", 150
-    run = runpy.run_path(str(EXAMPLE))["run"]
+    run, all_killed = runpy.run_path(str(EXAMPLE))["run"], threading.Event()
+
+    def pause(seconds):
+        time.sleep(seconds)
+        if path.exists() and path.stat().st_size > 3600 * 100:  # let it not be too late to kill
+            all_killed.wait(120)
+
+    run.__globals__["time"] = SimpleNamespace(sleep=pause)
     with (
         LocalCluster(
             n_workers=4,
@@ -56,6 +64,7 @@ def test_whichever_worker_is_killed_the_file_is_the_same(tmp_path, wait_until):
             killed = client.run(os.getpid, workers=[worker.address])[worker.address]
             assert path.stat().st_size < 3600 * total  # it is not too late
             os.kill(killed, signal.SIGKILL)
+        all_killed.set()
         driver.join(120)
         assert not driver.is_alive()
         assert path.read_bytes() == thumbnails(total)

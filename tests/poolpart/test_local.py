@@ -8,7 +8,7 @@ import sys
 import psutil
 import pytest
 from distributed import Client
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from poolpart import Pool, PoolError, local_cluster
@@ -66,6 +66,7 @@ def children():
 
 
 @given(cores=st.integers(1, 256), gpus=st.integers(0, 16))
+@settings(deadline=None)
 def test_every_machine_gets_workers_and_no_more_than_cores_and_gpus(cores, gpus):
     workers = default_workers(cores, gpus)
     assert workers["GPU"] == gpus or gpus == 0
@@ -92,7 +93,7 @@ def test_a_number_of_workers_says_nothing_of_their_kinds(processes):
     assert len(Pool.from_client(processes)) == 3
 
 
-def test_no_dashboard_environment_and_nothing_left_after_an_error():
+def test_no_dashboard_environment_and_nothing_left_after_an_error(wait_until):
     before = children()
     with (
         pytest.raises(ZeroDivisionError),
@@ -108,7 +109,8 @@ def test_no_dashboard_environment_and_nothing_left_after_an_error():
         started = children() - before
         assert len(started) >= 4
         raise ZeroDivisionError
-    assert gone(started - {resource_tracker_pid()})
+    # Those that had to be killed may take a moment to die.
+    wait_until(lambda: gone(started - {resource_tracker_pid()}))
 
 
 def resource_tracker_pid():
@@ -124,7 +126,7 @@ def test_counts_that_cannot_be(name, count):
     before = children()
     with pytest.raises(PoolError, match=f"{name} is {count}; give a whole number"):
         local_cluster(**{name: count})
-    assert children() == before
+    assert children() <= before  # those of earlier tests may end meanwhile
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import queue
 import signal
 import threading
 import time
@@ -16,6 +17,7 @@ from poolpart import (
     PoolError,
     n_workers,
     per_host,
+    rebalancing,
     recorded,
     rest,
     settling,
@@ -38,6 +40,14 @@ def brief(_=None):
 
 def wait_for(event):
     return Event(event).wait(LONG_S)
+
+
+begun = queue.SimpleQueue()  # the workers are threads of this process
+
+
+def begin_and_wait_for(event):
+    begun.put(event)
+    return wait_for(event)
 
 
 def hold_on(event):
@@ -174,10 +184,9 @@ def test_partitions_that_are_dissolved_while_a_worker_moves(start, wait_until):
     parts = Pool.from_client(client).divide({"A": n_workers(1, minimum=0), "B": rest()})
     event = Event("late", client)
     address = parts["A"].workers[0].address
-    task = parts["A"].submit(wait_for, "late")
+    task = parts["A"].submit(begin_and_wait_for, "late")
     state = client.cluster.scheduler.workers[address]
-    wait_until(lambda: state.processing)
-    time.sleep(0.1)  # until it runs: nobody tells
+    assert begun.get(timeout=LONG_S) == "late"
     task.cancel()  # so that dissolving does not wait for it
     wait_until(lambda: not state.processing)
     moved = []
@@ -187,24 +196,28 @@ def test_partitions_that_are_dissolved_while_a_worker_moves(start, wait_until):
             parts["A"].shrink(1, timeout_s=1)
         moved.append(error)
 
+    def end_when_it_has_failed():
+        thread.join()
+        event.set()
+
     thread = threading.Thread(target=move)
     thread.start()
-    wait_until(lambda: not state.resources["A"])
-    threading.Timer(3, event.set).start()
-    Pool.from_client(client).dissolve()
-    thread.join()
+    # Where nobody looks for a second, it has failed by then.
+    wait_until(lambda: not thread.is_alive() or not state.resources["A"])
+    threading.Thread(target=end_when_it_has_failed).start()
+    Pool.from_client(client).dissolve(timeout_s=LONG_S)
     assert moved
     assert set(map(str, declared_by_themselves(client).values())) == {"{}"}
 
 
-def test_a_task_that_was_cancelled_but_runs_on_keeps_its_slot(divided, wait_until):
+def test_a_task_that_was_cancelled_but_runs_on_keeps_its_slot(divided):
     client, parts = divided
     event = Event("cancelled", client)
-    scheduler = client.cluster.scheduler
     workers = {w.address for w in parts["A"].workers}
-    tasks = [parts["A"].submit(wait_for, "cancelled", worker=address) for address in workers]
-    wait_until(lambda: all(len(scheduler.workers[a].processing) == 1 for a in workers))
-    time.sleep(0.1)  # until they run: nobody tells
+    tasks = [
+        parts["A"].submit(begin_and_wait_for, "cancelled", worker=address) for address in workers
+    ]
+    assert {begun.get(timeout=LONG_S) for _ in workers} == {"cancelled"}
     client.cancel(tasks)
     threading.Timer(1.5, event.set).start()
     left = parts["A"].shrink(1)
@@ -264,12 +277,12 @@ def test_a_cancelled_task_that_is_on_its_way_when_its_worker_leaves(start, monke
     send = stream.send
     monkeypatch.setattr(stream, "send", lambda *messages: on_the_way.extend(messages))
     task = parts["A"].submit(brief)
-    wait_until(lambda: any(message["op"] == "compute-task" for message in on_the_way))
+    wait_until(lambda: any(message["op"] == "compute-task" for message in on_the_way[:]))
     task.cancel()
     wait_until(lambda: not scheduler.tasks)
     with ThreadPoolExecutor(1) as thread:
         moved = thread.submit(parts["A"].shrink)
-        wait_until(lambda: on_the_way[-1]["op"] == "poolpart-mark")
+        wait_until(lambda: any(message["op"] == "poolpart-mark" for message in on_the_way[:]))
         time.sleep(0.1)
         assert not moved.done()
         monkeypatch.undo()
@@ -365,7 +378,8 @@ def test_whoever_helps_goes_back_when_needed(divided, wait_until):
     assert not any(record.misplaced for _, record in client.gather(tasks))
 
 
-def test_the_lender_keeps_its_minimum(start, wait_until):
+def test_the_lender_keeps_its_minimum(start, wait_until, monkeypatch):
+    monkeypatch.setattr(rebalancing, "SETTLE_IN_S", 3600.0)  # nobody goes back by itself
     client = start({name: {} for name in "abcd"})
     parts = Pool.from_client(client).divide({"A": n_workers(1), "B": rest(minimum=2)})
     pool = Pool.from_client(client)
@@ -381,7 +395,8 @@ def test_the_lender_keeps_its_minimum(start, wait_until):
     assert (len(parts["A"]), len(parts["B"])) == (1, 3)
 
 
-def test_a_borrower_keeps_its_minimum_when_its_helpers_go_back(divided, wait_until):
+def test_a_borrower_keeps_its_minimum_when_its_helpers_go_back(divided, wait_until, monkeypatch):
+    monkeypatch.setattr(rebalancing, "SETTLE_IN_S", 3600.0)  # nobody goes back by itself
     client, parts = divided
     pool = Pool.from_client(client)
     pool.rebalance("C", helps="A", idle_s=0.0)
@@ -421,8 +436,8 @@ def test_whoever_helps_and_is_killed_goes_back(nannies, wait_until):
     tasks = [parts["A"].submit(wait_for, "helper") for _ in range(4)]
     wait_until(lambda: len(parts["A"]) == 2)
     os.kill(nannies.run(os.getpid, workers=[helper.address])[helper.address], signal.SIGKILL)
-    wait_until(lambda: len(worker_identities(nannies)) == 1)
-    assert pool.stop_rebalancing("B", helps="A") == [helper.name]
+    wait_until(lambda: helper.address not in worker_identities(nannies))
+    assert pool.stop_rebalancing("B", helps="A", timeout_s=LONG_S) == [helper.name]
     assert members(parts["B"]) == [helper.name]
     event.set()
     nannies.gather(tasks)
@@ -452,7 +467,7 @@ def test_a_worker_that_is_killed_while_it_moves(nannies, wait_until, point):
     tasks += [parts["A"].submit(recorded, "s", "A", brief) for _ in range(20)]
     killed = kill_at(f"partition.{point}", nannies.run(os.getpid))
     try:
-        assert parts["A"].grow(1) == [moving]
+        assert parts["A"].grow(1, timeout_s=LONG_S) == [moving]
     finally:
         trace_to(None)
     assert len(killed) == 1

@@ -7,6 +7,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 import urllib.error
 import urllib.request
@@ -136,18 +137,31 @@ def test_what_it_tells(client, wait_until):
     assert data_of(url)["pipes"] == []
 
 
+go = threading.Event()  # the workers are threads of this process
+
+
+def hold():
+    go.wait(LONG_S)
+
+
 def test_running_tasks_are_told_by_heartbeat(client, wait_until):
-    url = partitions_page(client)
-    task = Partition("A", client).submit(time.sleep, 3.0, key="sleep-1")
+    url, before, told = partitions_page(client), time.time(), []
+    go.clear()
+    task = Partition("A", client).submit(hold, key="hold-1")
 
     def executing():
-        return [task for worker in data_of(url)["workers"] for task in worker["executing"]]
+        told[:] = [task for worker in data_of(url)["workers"] for task in worker["executing"]]
+        return told
 
-    wait_until(executing)
-    [(key, stage, start)] = executing()
-    assert (key, stage) == ("sleep-1", "sleep")
-    assert time.time() - 5 < start <= time.time()
-    task.cancel()
+    try:
+        wait_until(executing)
+    finally:
+        go.set()
+    [(key, stage, start)] = told
+    assert (key, stage) == ("hold-1", "hold")
+    # By two clocks, of the worker's message and of the task, read one after the other.
+    assert before - 1 < start <= time.time()
+    task.result(LONG_S)
 
 
 def test_the_page_needs_nothing_from_elsewhere():

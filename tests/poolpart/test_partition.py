@@ -100,7 +100,8 @@ def test_higher_priority_runs_first(b, client, wait_until):
     blocker = b.submit(wait_for, gate, priority=100)
     low = b.submit_many(stamp, range(3))
     high = b.submit_many(stamp, range(3), priority=5)
-    wait_until(lambda: len(client.cluster.workers["B-0"].state.tasks) == 7)
+    keys = {future.key for future in (blocker, *low, *high)}
+    wait_until(lambda: keys <= client.cluster.workers["B-0"].state.tasks.keys())
     Event(gate, client=client).set()
     assert blocker.result()
     assert max(future.result() for future in high) < min(future.result() for future in low)
@@ -121,10 +122,12 @@ def test_the_priority_of_the_partition_is_that_of_its_tasks(client, wait_until):
     later = partition.submit(stamp, 0)
     wait([later])
     assert priority(later) == 7
-    results = partition.map(wait_for, [f"gate-{uuid.uuid4().hex}"])
-    wait_until(lambda: any(key.startswith("map-") for key in tasks))
-    (mapped,) = (task for key, task in tasks.items() if key.startswith("map-"))
+    gate = Event(f"gate-{uuid.uuid4().hex}", client=client)
+    results = partition.map(wait_for, [gate.name])
+    wait_until(lambda: any(key.startswith("map-") for key in list(tasks)))
+    (mapped,) = (task for key, task in list(tasks.items()) if key.startswith("map-"))
     assert -mapped.priority[0] == 7
+    gate.set()  # else it may hold its worker for long
     results.close()
 
 

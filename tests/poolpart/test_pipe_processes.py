@@ -8,7 +8,6 @@ import sys
 import time
 import uuid
 
-import dask
 import pytest
 from distributed import Client, Queue
 
@@ -39,12 +38,14 @@ def greet_and_get_from_queue(greetings, name):
     return queue.get()
 
 
-def kill_a_waiting_consumer(client, function, greetings, what):
+def kill_a_waiting_consumer(client, function, greetings, what, waits=lambda: True):
     """Start a consumer on OTHER, kill its worker while it waits, and let nobody run it again."""
     other = Partition("OTHER", client)
     consumer = other.submit(function, greetings, what, key=f"consumer-{uuid.uuid4().hex}")
     pid = greetings.get(timeout_s=LONG_S)
     time.sleep(0.1)  # let it begin to wait
+    while not waits():
+        time.sleep(0.01)
     consumer.cancel()
     os.kill(pid, signal.SIGKILL)
     assert other.submit(os.getpid).result(LONG_S) != pid  # the nanny has started another
@@ -90,7 +91,12 @@ def test_a_consumer_that_is_killed_while_it_waits_swallows_nothing(processes, ma
 def test_a_consumer_of_a_bare_queue_does(processes, make_pipe):
     """The test above can fail: this is what it would see."""
     greetings, queue = make_pipe(processes), Queue(f"bare-{uuid.uuid4().hex}", client=processes)
-    kill_a_waiting_consumer(processes, greet_and_get_from_queue, greetings, queue.name)
+
+    def waits():
+        queues = processes.cluster.scheduler.extensions["queues"].queues
+        return bool(queues[queue.name]._getters)
+
+    kill_a_waiting_consumer(processes, greet_and_get_from_queue, greetings, queue.name, waits)
     for item in range(8):
         queue.put(item)
     assert len(queue.get(batch=True)) < 8
@@ -117,13 +123,11 @@ def test_a_pipe_whose_scheduler_has_died_raises():
     scheduler = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     try:
         address = next(line.split()[-1] for line in scheduler.stderr if "Scheduler at:" in line)
-        with (
-            dask.config.set({"distributed.comm.timeouts.connect": "1s"}),
-            Client(address) as client,
-        ):
+        with Client(address) as client:
             pipe = Pipe("orphan", 1, client).create()
             assert pipe.depth == 0
             scheduler.kill()
+            client.rpc.timeout = 1.0  # not before: a scheduler that lives may need longer
             with pytest.raises(OSError):
                 pipe.get(timeout_s=LONG_S)
             with pytest.raises((OSError, RuntimeError, PipeFailed)):
@@ -161,7 +165,7 @@ def test_a_pipe_ends_with_the_process_that_made_it(processes, make_pipe):
     time.sleep(0.2)
     assert consumer.status == "pending"
     maker.kill()
-    maker.wait(10)
+    maker.wait(LONG_S)
     maker.stdout.close()
     with pytest.raises(PipeFailed, match="does not exist"):
         consumer.result(LONG_S)

@@ -14,9 +14,9 @@ import types
 
 import distributed.queues
 import pytest
-from distributed import Queue, wait
+from distributed import Event, Queue, wait
 
-from poolpart import Partition, Pipe, Pool, fetch_available, worker_identities
+from poolpart import Partition, Pipe, Pool, fetch_available, own_client, worker_identities
 
 LONG_S = 120.0
 
@@ -24,6 +24,13 @@ LONG_S = 120.0
 def slowly(number: int) -> int:
     time.sleep(0.1)
     return number
+
+
+def slowly_after(number: int, event: str) -> int:
+    """Do the same; only the first does not wait for an event."""
+    if number:
+        Event(event, client=own_client()).wait(LONG_S)
+    return slowly(number)
 
 
 def addresses(client) -> dict[str, str]:
@@ -83,10 +90,13 @@ def test_two_deaths_condemn_a_pile_of_innocent_tasks_and_not_a_window(nannies, w
     nannies.cluster.scheduler.allowed_failures = 1
     partition, _ = Pool.from_client(nannies).partition("P", workers=["1"])
     count = 40
-    pile = partition.submit_many(slowly, range(count))
+    # What has ended is lost with the worker, but is not to blame: most are not to end before.
+    gate = Event("innocent", nannies)
+    pile = partition.submit_many(slowly_after, range(count), [gate.name] * count)
     for _ in range(2):
         wait_until(lambda: any(future.done() for future in pile))
         kill_and_wait(nannies, "1", wait_until)
+    gate.set()
     wait(pile, timeout=LONG_S)
     condemned = [future for future in pile if future.status == "error"]
     assert len(condemned) > count // 2
@@ -122,7 +132,7 @@ def test_a_future_put_at_once_keeps_the_scheduler_waiting_and_a_key_does_not(
     assert naps == []
     wait(futures, timeout=LONG_S)
     keys = pipe.poll()
-    assert sorted(fetch_available(client, keys).values()) == [2**n for n in range(20)]
+    assert sorted(fetch_available(client, keys, LONG_S).values()) == [2**n for n in range(20)]
     for future in queue.get(batch=True):
         future.cancel()
     queue.close()
@@ -136,10 +146,10 @@ def test_a_restart_leaves_lost_futures_in_a_queue_and_keys_that_say_so_in_a_pipe
         queue.put(future)
         pipe.put(future.key)
         nannies.restart()
-        lost = queue.get(timeout=5)
+        lost = queue.get(timeout=LONG_S)
         assert lost.status == "lost"
         with pytest.raises(TimeoutError):
             lost.result(timeout=0.5)  # and without a time-out never
-        key = pipe.get(timeout_s=5)
+        key = pipe.get(timeout_s=LONG_S)
         assert fetch_available(nannies, [key], patience_s=1.0) == {}
     queue.close()

@@ -7,7 +7,7 @@ from functools import partial
 import pytest
 from distributed import Client, Event
 
-from poolpart import Partition, Pool, PoolError, making, n_workers, rest, trace_to
+from poolpart import Partition, Pool, PoolError, making, n_workers, rest, steward, trace_to
 
 LONG_S = 120.0
 
@@ -112,7 +112,8 @@ def test_workers_that_are_under_way_are_not_counted_on(start, wait_until):
     wait_until(lambda: any(w.processing for w in client.cluster.scheduler.workers.values()))
     with ThreadPoolExecutor(1) as thread:
         growing = thread.submit(parts["A"].grow, 1, timeout_s=1.0)
-        wait_until(lambda: not any(d.get("B") for d in declared(client).values()))
+        # Where nobody looks for a second, it has turned back by then.
+        wait_until(lambda: growing.done() or not any(d.get("B") for d in declared(client).values()))
         with pytest.raises(PoolError, match="'A' cannot shrink by 1: it has 1 worker"):
             parts["A"].shrink(1)
         with pytest.raises(PoolError, match="1 of 1 worker could not be moved"):
@@ -128,11 +129,14 @@ def test_a_partition_that_is_dissolved_while_it_grows(start, wait_until):
     event = Event("overtaken", client)
     task = parts["B"].submit(wait_for, "overtaken")
     wait_until(lambda: any(w.processing for w in client.cluster.scheduler.workers.values()))
-    with ThreadPoolExecutor(1) as thread:
-        growing = thread.submit(parts["A"].grow, 1)
+    rules = client.cluster.scheduler.plugins[steward.NAME].book.rules
+    with ThreadPoolExecutor(2) as threads:
+        growing = threads.submit(parts["A"].grow, 1, timeout_s=LONG_S)
         wait_until(lambda: not any(d.get("B") for d in declared(client).values()))
-        threading.Timer(0.2, event.set).start()
-        parts["A"].dissolve()
+        dissolving = threads.submit(parts["A"].dissolve, timeout_s=LONG_S)
+        wait_until(lambda: "A" not in rules)
+        event.set()
+        dissolving.result()
         with pytest.raises(
             PoolError, match="did not arrive in partition 'A': somebody has dissolved it"
         ):
