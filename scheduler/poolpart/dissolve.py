@@ -55,16 +55,19 @@ def dissolve(client: Client, names: Collection[str] | None, timeout_s: float) ->
 
 async def _dissolve(steward: Steward, names: list[str] | None, timeout_s: float) -> list[str]:
     book, scheduler = steward.book, steward.scheduler
-    gone = [name for name in book.rules if names is None or name in names]
+
+    def those() -> list[str]:
+        return [name for name in book.rules if names is None or name in names]
+
     deadline = time.monotonic() + timeout_s
     # What the client submitted just before comes by another connection, after some milliseconds.
     await asyncio.sleep(2 * LOOK_EVERY_S)
     began = time.monotonic()
-    while tasks := _unfinished(scheduler, gone):
+    while tasks := _unfinished(scheduler, those()):
         now = time.monotonic()
         if now >= deadline:
             raise PoolError(
-                f"After {timeout_s:g} s {counted(len(tasks), 'task')} of {' and '.join(gone)} "
+                f"After {timeout_s:g} s {counted(len(tasks), 'task')} of {' and '.join(those())} "
                 f"had not ended, such as {tasks[0].key}: wait or cancel, then dissolve."
             )
         # To look at a hundred thousand tasks takes long; they are to end meanwhile.
@@ -72,8 +75,8 @@ async def _dissolve(steward: Steward, names: list[str] | None, timeout_s: float)
         await asyncio.sleep(min(pause, deadline - now))
         began = time.monotonic()
     # From here to the next await nothing else happens on the scheduler; up to here somebody else
-    # may have dissolved the same partitions.
-    gone = [name for name in gone if name in book.rules]
+    # may have dissolved the same partitions, or made some.
+    gone = those()
     for name in gone:  # whoever was lent is a member of its own partition again
         steward.rebalancing.drop_all(name)
     seats = [seat for seat in book.seats.values() if seat.partition in gone]

@@ -210,6 +210,25 @@ def test_two_who_dissolve_the_same_partition(start, wait_until):
     assert known(client) == before
 
 
+def test_what_somebody_makes_while_it_waits_is_undone_too(start, wait_until):
+    client = start({"a": {}, "b": {}})
+    before = known(client)
+    part, others = Pool.from_client(client).partition("A", workers=["a"])
+    event = Event("made", client)
+    task = part.submit(wait_for, "made")
+    wait_until(lambda: any(w.processing for w in client.cluster.scheduler.workers.values()))
+    with ThreadPoolExecutor(1) as other:
+        dissolved = other.submit(Pool(client, []).dissolve)
+        ticker = client.cluster.scheduler.plugins[steward.NAME]
+        wait_until(lambda: ticker.asked == 1)
+        others.partition("B", workers=["b"], exclusive=True)
+        event.set()
+    assert sorted(dissolved.result()) == ["A", "B"]
+    task.release()
+    wait_until(lambda: not client.cluster.scheduler.tasks)
+    assert known(client) == before
+
+
 def test_one_partition(start):
     client = start({name: {} for name in "abc"})
     parts = Pool.from_client(client).divide({"A": named("a"), "B": rest()})
