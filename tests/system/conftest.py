@@ -11,6 +11,7 @@ import time
 import uuid
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +19,10 @@ import pytest
 from distributed import Client, Scheduler, SpecCluster, Worker
 
 import lidarpool.pictures
+import lidarpool.scan.pump
 from lidarpool import Cloud
 from lidarpool.cli import main
-from poolpart import local_cluster, worker_identities
+from poolpart import fetch_available, local_cluster, worker_identities
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +43,23 @@ def kill(client: Client) -> Callable[[str], None]:
         os.kill(pid, signal.SIGKILL)
 
     return kill
+
+
+@pytest.fixture(scope="session")
+def wait_for_all() -> Callable[[Client, int], None]:
+    """Wait until so many workers are there and answer.
+
+    One that was killed may be listed for a moment yet, and a run that begins then is without it.
+    """
+
+    def wait_for_all(client: Client, count: int) -> None:
+        def all_answer() -> bool:
+            answers = client.run(os.getpid, on_error="return").values()
+            return len(answers) == count and all(isinstance(pid, int) for pid in answers)
+
+        _wait(all_answer)
+
+    return wait_for_all
 
 
 @pytest.fixture
@@ -227,6 +246,24 @@ def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lidarpool.pictures, "take_shot", lambda *_, **__: None)
     for name in ("draw_scene", "draw_intensity", "draw_cloud", "draw_path"):
         monkeypatch.setattr(lidarpool.pictures, name, lambda path, *_, **__: path.write_bytes(b"x"))
+
+
+@pytest.fixture
+def all_records(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wait for the records of the long stages: a run does without those that come too late."""
+    monkeypatch.setattr(lidarpool.scan.pump, "LAST_WORDS_S", 120.0)
+    patient = partial(fetch_available, patience_s=120.0)
+    monkeypatch.setattr(lidarpool.scan.pump, "fetch_available", patient)
+
+
+@pytest.fixture
+def small_batches(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Put ten scans into a batch, however long they take.
+
+    By default the machine's speed decides, and a survey of small scans may be under way as a
+    whole, or stage 1 have ended, when the driver sees the first frames.
+    """
+    monkeypatch.setattr(lidarpool.scan.pump, "wished_scans", lambda *_: 10)
 
 
 # -- the command as a process of its own ---------------------------------------------------------

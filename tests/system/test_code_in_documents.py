@@ -109,7 +109,7 @@ def test_python_runs(tmp_path, block):
         cwd=tmp_path,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=600,
         check=False,
     )
     assert done.returncode == 0, f"{block.where}\n{done.stderr}"

@@ -24,6 +24,7 @@ from distributed import Client
 
 import lidarpool.output
 from lidarpool import LidarpoolError, read_cloud, simulate
+from lidarpool.log_file import LOG
 from lidarpool.output import FILES, result_folder, write_result
 from lidarpool.scenario import Scenario
 
@@ -32,11 +33,35 @@ COMMAND = [sys.executable, "-c", "from lidarpool.cli import main; main()"]
 SHORT = "sensor: {layers: 8}\nplanning: {trials: 4}\n"
 
 
+# A run does without the records of stages that end too late on a busy machine.
+PATIENT = """
+from functools import partial
+import lidarpool.scan.pump as pump
+pump.LAST_WORDS_S = 120
+pump.fetch_available = partial(pump.fetch_available, patience_s=120)
+"""
+
+
 def command(*arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
     env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), **environment}
+    python, option, code = COMMAND
     return subprocess.run(
-        [*COMMAND, *map(str, arguments)], capture_output=True, text=True, env=env, check=False
-    )
+        [python, option, PATIENT + code, *map(str, arguments)],
+        capture_output=True, text=True, env=env, check=False,
+    )  # fmt: skip
+
+
+def without_log(folder: Path) -> set[str]:
+    """Names of the files, but for what libraries had to say on a busy machine."""
+    return {path.name for path in folder.iterdir()} - {LOG}
+
+
+def without_hint(said: str, folder: Path) -> list[str]:
+    """Lines that were said, but for the hint at that file where there is one."""
+    hint = f"messages of Dask and other libraries are in {folder / LOG}"
+    lines = said.splitlines()
+    assert lines.count(hint) == (folder / LOG).exists()
+    return [line for line in lines if line != hint]
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +75,7 @@ def demo(tmp_path_factory) -> tuple[Path, subprocess.CompletedProcess[str]]:
 def test_the_demo_makes_all_files_and_says_so(demo):
     out, ended = demo
     assert ended.returncode == 0, ended.stderr
-    assert sorted(path.name for path in out.iterdir()) == sorted(FILES)
+    assert without_log(out) == {*FILES}
     for name in FILES[1:5]:
         assert (out / name).read_bytes().startswith(b"\x89PNG")
     assert "108 scans, 120,000 rays" in ended.stdout
@@ -60,14 +85,15 @@ def test_the_demo_makes_all_files_and_says_so(demo):
 
 
 def test_progress_that_is_not_for_a_terminal_comes_as_short_lines(demo):
-    _, ended = demo
-    for line in ended.stderr.splitlines():
+    out, ended = demo
+    lines = without_hint(ended.stderr, out)
+    for line in lines:
         assert re.fullmatch(r"\d\d:\d\d:\d\d  [a-z].*", line), line  # and no log of a library
         assert len(line) <= 120
         assert not re.search(r"\bnan\b|\binf\b|\x1b", line)
     assert "survey  done: 108 scans" in ended.stderr
     assert "plan    done: 100 trials" in ended.stderr
-    assert "writing the cloud" in ended.stderr.splitlines()[-1]
+    assert "writing the cloud" in lines[-1]
 
 
 def test_the_report_has_all_that_is_promised(demo):
@@ -142,8 +168,7 @@ def test_without_planning_an_earlier_path_is_removed(run, tmp_path, no_pictures)
         (tmp_path / "out" / name).write_text("earlier")
     outcome = run(SHORT, "--no-plan", "--quiet")
     assert (outcome.code, outcome.err) == (0, "")
-    names = {path.name for path in (tmp_path / "out").iterdir()}
-    assert names == {*FILES, "mine.txt"} - {"path.png"}
+    assert without_log(tmp_path / "out") == {*FILES, "mine.txt"} - {"path.png"}
     assert "path of" not in outcome.out and "path.png" not in outcome.out
     assert json.loads((tmp_path / "out" / "report.json").read_text())["planning"] is None
 
@@ -172,8 +197,7 @@ def test_nobody_reads_the_output(deaf, tmp_path, cluster):
     assert (b"survey  done" if deaf == "stdout" else b"results in out") in said
     assert b"Traceback" not in said
     assert b"BrokenPipe" not in said
-    left = {path.name for path in (tmp_path / "out").iterdir()}
-    assert left - {"lidarpool.log"} == {*FILES} - {"path.png"}
+    assert without_log(tmp_path / "out") == {*FILES} - {"path.png"}
 
 
 def test_what_is_wanted_and_cannot_be_written_is_an_error(tmp_path, cluster):

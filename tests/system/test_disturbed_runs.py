@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import pytest
-from distributed import Client
 
 import lidarpool.scan.caster
 from lidarpool import Frame, LidarpoolError, Scene, Sensor, Survey, simulate
@@ -21,22 +18,6 @@ SURVEY = Survey(
 @pytest.fixture(scope="module")
 def undisturbed(client):
     return simulate(Scene.seed(), SURVEY, client=client)
-
-
-def scheduler_state(client: Client, expected=None) -> tuple[set[str], set[str], set[str]]:
-    """What the scheduler knows: tasks, queues, variables; waits a moment for what is expected."""
-
-    def look(dask_scheduler):
-        queues = dask_scheduler.extensions["queues"].queues
-        variables = dask_scheduler.extensions["variables"].variables
-        return set(map(str, dask_scheduler.tasks)), set(queues), set(variables)
-
-    until = time.monotonic() + 120  # cancelling is told to the scheduler, not asked
-    found = client.run_on_scheduler(look)
-    while expected is not None and found != expected and time.monotonic() < until:
-        time.sleep(0.05)
-        found = client.run_on_scheduler(look)
-    return found
 
 
 def test_frames_come_in_order_and_every_scan_once(client, undisturbed, same_cloud):
@@ -55,7 +36,9 @@ def test_frames_come_in_order_and_every_scan_once(client, undisturbed, same_clou
 
 @pytest.mark.parametrize("partition", ["GPU", "LIDAR"])
 @pytest.mark.parametrize("at_scan", [0, 200, 650])
-def test_a_killed_worker_changes_nothing(client, undisturbed, same_cloud, kill, partition, at_scan):
+def test_a_killed_worker_changes_nothing(
+    client, undisturbed, same_cloud, kill, wait_for_all, partition, at_scan
+):
     seen = []
 
     def on_frame(frame: Frame) -> None:
@@ -68,22 +51,20 @@ def test_a_killed_worker_changes_nothing(client, undisturbed, same_cloud, kill, 
     assert same_cloud(result.cloud, undisturbed.cloud)
     assert result.hits == undisturbed.hits
     assert placement_violations(result.records) == []
-    client.wait_for_workers(4, timeout=120)  # one killed near the end is not back yet
+    wait_for_all(client, 4)  # one killed near the end is not back yet
 
 
-def test_nothing_is_left_on_the_scheduler(client):
-    before = scheduler_state(client)
+def test_nothing_is_left_on_the_scheduler(client, left_over):
     simulate(Scene.seed(), SURVEY, client=client)
-    assert scheduler_state(client, before) == before
+    assert left_over(client) == ([], [], [])
 
 
-def test_a_failing_task_ends_the_run_with_stage_and_scan(client, monkeypatch):
-    before = scheduler_state(client)
+def test_a_failing_task_ends_the_run_with_stage_and_scan(client, monkeypatch, left_over):
     monkeypatch.setattr(lidarpool.scan.caster, "intersect", failing_intersect)
     message = r"stage intersect, scans \d+ to \d+ failed: .*the lens is dirty"
     with pytest.raises(LidarpoolError, match=message):
         simulate(Scene.seed(), SURVEY, client=client)
-    assert scheduler_state(client, before) == before
+    assert left_over(client) == ([], [], [])
 
 
 def failing_intersect(setup, wire, run):
@@ -91,16 +72,14 @@ def failing_intersect(setup, wire, run):
 
 
 @pytest.mark.parametrize("kind", [ZeroDivisionError, OSError])
-def test_an_error_in_the_callback_passes_through_and_stops_the_run(client, kind):
-    before = scheduler_state(client)
-
+def test_an_error_in_the_callback_passes_through_and_stops_the_run(client, kind, left_over):
     def on_frame(frame: Frame) -> None:
         if frame.scan == 100:
             raise kind("mine")
 
     with pytest.raises(kind, match="mine"):
         simulate(Scene.seed(), SURVEY, client=client, on_frame=on_frame)
-    assert scheduler_state(client, before) == before
+    assert left_over(client) == ([], [], [])
 
 
 def test_an_interrupt_stops_the_run_and_the_cluster_can_be_used_again(

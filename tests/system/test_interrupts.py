@@ -32,6 +32,22 @@ SHORT = "sensor: {layers: 4}\nplanning: {trials: 2}\n"
 SURVEYING = r"survey  [1-9]"
 WRITING = r"writing the cloud"
 
+# A run that is never over before whoever is to end it has its turn.
+STAYS_STARTING = """
+import time
+import lidarpool.run_command
+lidarpool.run_command.QuietWorkers = lambda log: time.sleep(600)
+"""
+STAYS_WRITING = """
+import time
+import lidarpool.pictures as pictures
+draw_cloud = pictures.draw_cloud
+def draw_and_stay(*arguments, **options):
+    draw_cloud(*arguments, **options)
+    time.sleep(600)
+pictures.draw_cloud = draw_and_stay
+"""
+
 
 @pytest.fixture
 def start(tmp_path: Path, start_command: Callable[..., Any]) -> Callable[..., Any]:
@@ -113,7 +129,7 @@ def test_ctrl_c_while_python_imports(after, start, untouched):
 
 
 def test_ctrl_c_while_the_workers_start(start, untouched):
-    run = start(LONG).wait_for("starting the workers")
+    run = start(LONG, prelude=STAYS_STARTING).wait_for("starting the workers")
     time.sleep(0.5)  # their Python has started, lidarpool is not yet imported
     check_interrupted(run, run.signal(signal.SIGINT, group=True))
     assert untouched()
@@ -135,7 +151,7 @@ def test_nohup_is_obeyed(when):
 
 
 def test_ctrl_c_while_pictures_are_written(start, untouched):
-    run = start(SHORT).wait_for(WRITING)
+    run = start(SHORT, prelude=STAYS_WRITING).wait_for(WRITING)
     check_interrupted(run, run.signal(signal.SIGINT, group=True))
     assert "stopped. 108 of 108 scans are kept in out/journal" in run.said
     assert untouched(journal=True)
@@ -169,7 +185,7 @@ def test_ctrl_c_when_the_result_is_whole(moment, start_command, cluster, tmp_pat
     assert run.said.splitlines()[-1] == (
         "lidarpool: interrupted; everything was stopped. The result in out is complete."
     )
-    names = {path.name for path in (tmp_path / "out").iterdir()}
+    names = {path.name for path in (tmp_path / "out").iterdir()} - {LOG}
     assert names == {*FILES} - {"path.png"}
 
 
@@ -217,9 +233,12 @@ def test_a_second_ctrl_c_ends_it_at_once():
     assert ended.stderr.startswith(b"lidarpool: stopped at once")
 
 
-def test_a_ctrl_c_where_python_drops_what_is_raised_comes_again():
+@pytest.mark.parametrize("again_s", [0.01, 0.0])  # sooner than the hook for it is left
+def test_a_ctrl_c_where_python_drops_what_is_raised_comes_again(again_s):
     script = (
         "import signal, time\n"
+        "from lidarpool import interrupts\n"
+        f"interrupts._AGAIN_S = {again_s}\n"
         "from lidarpool.interrupts import interrupt_on_signals\n"
         "class Future:\n"
         "    def __del__(self): signal.raise_signal(signal.SIGINT)\n"
@@ -244,7 +263,7 @@ def test_workers_follow_a_driver_that_was_killed(start, untouched):
 
 
 def test_the_run_after_one_that_was_killed_while_writing(start, untouched, tmp_path):
-    killed = start(SHORT).wait_for(WRITING)
+    killed = start(SHORT, prelude=STAYS_WRITING).wait_for(WRITING)
     killed.signal(signal.SIGKILL)
     killed.wait_until_alone()
     assert (tmp_path / "out" / "cloud.ply").read_text() == "an earlier cloud"
@@ -257,7 +276,7 @@ def test_the_run_after_one_that_was_killed_while_writing(start, untouched, tmp_p
     run = start(SHORT, "--resume")
     assert run.process.wait(300) == 0, run.said
     assert "starting the workers" not in run.said
-    names = {path.name for path in (tmp_path / "out").iterdir()}
+    names = {path.name for path in (tmp_path / "out").iterdir()} - {LOG}
     assert names == {
         "cloud.ply", "scene.png", "intensity.png", "cloud.png", "path.png", "pictures.npz",
         "report.html", "report.json",

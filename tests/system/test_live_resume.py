@@ -19,7 +19,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
-from lidarpool import Planning, Scene, Sensor, Survey, simulate
+from lidarpool import Planning, ScanSpec, Scene, Sensor, Survey, simulate
 from lidarpool.job import Job
 from lidarpool.journal import open_journal
 from lidarpool.live import LiveRun, live_run
@@ -42,7 +42,10 @@ def looked_at(live: LiveRun) -> Iterator[None]:
     """Have somebody look at a page: whatever is drawn is drawn for them."""
     protocol = Subprotocol(f"viser-v{version('viser')}")
     url = live.url.replace("http", "ws", 1)
-    with connect(url, subprotocols=[protocol], max_size=None, compression=None) as socket:
+    patient = {"open_timeout": LONG_S, "ping_timeout": LONG_S}
+    with connect(
+        url, subprotocols=[protocol], max_size=None, compression=None, **patient
+    ) as socket:
         socket.send(msgspec.msgpack.encode(CAMERA))
 
         def take() -> None:
@@ -112,9 +115,22 @@ def client(cluster: str) -> Iterator[Client]:
         yield client
 
 
-def test_a_resumed_run_shows_what_both_runs_have_done(client, tmp_path):
+def test_a_resumed_run_shows_what_both_runs_have_done(client, tmp_path, monkeypatch):
+    go_on, describe = threading.Event(), Survey.scan
+
+    def scan(survey: Survey, index: int) -> ScanSpec:
+        """Describe no more than so many scans yet: a driver that is held up would get them all."""
+        assert index < 250 or go_on.wait(LONG_S)
+        return describe(survey, index)
+
+    def enough(progress: Progress) -> bool:
+        if progress.collected > 150 and progress.framed > 50:
+            go_on.set()  # nothing more is taken, and stage 1 can end
+        return go_on.is_set()
+
+    monkeypatch.setattr(Survey, "scan", scan)
     with watched(tmp_path) as first, pytest.raises(KeyboardInterrupt):
-        first.drive(client, lambda progress: progress.collected > 150)
+        first.drive(client, enough)
     frames_before = first.frames
 
     with watched(tmp_path) as second:

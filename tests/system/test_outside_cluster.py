@@ -28,7 +28,9 @@ def seed(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def run(lidarpool, tmp_path, seed, no_pictures) -> Callable[..., tuple[bytes, dict[str, Any]]]:
+def run(
+    lidarpool, tmp_path, seed, no_pictures, all_records
+) -> Callable[..., tuple[bytes, dict[str, Any]]]:
     """Run the survey; the cloud's bytes and the report."""
 
     def run(name: str, *options: str) -> tuple[bytes, dict[str, Any]]:

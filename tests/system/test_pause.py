@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -14,32 +15,68 @@ import numpy as np
 import pytest
 from distributed import Client
 
-import poolpart.whereabouts
-from lidarpool import LidarpoolError, Planning, Scene, Sensor, Survey, simulate
+from lidarpool import LidarpoolError, Planning, ScanSpec, Scene, Sensor, Survey, simulate
 from lidarpool.job import Job
 from lidarpool.journal import Journal, open_journal
 from lidarpool.live.control import RunControl
 from lidarpool.progress import Progress
 from lidarpool.run import Run
-from lidarpool.scan import caster, pump
 
 LONG_S = 120.0
-LIMIT_S = 5.0  # that anything may take, in the test of a pause that is longer
 SENSOR = Sensor(rays_per_revolution=720, layers=8)
 POSES = [(0, 0, 1 + step / 40) for step in range(20)]
 
 
-def make_job() -> Job:
+def make_job(pace: float = 300.0) -> Job:
     """Make a survey that takes some seconds, and a planning beside it."""
     planning = Planning((25, 25), (-30, -20), [(0, 0)], 2.0, trials=30, iterations=40)
-    return Job(Scene.seed(), Survey(SENSOR, POSES), planning, "numpy", scans_per_second=300)
+    return Job(Scene.seed(), Survey(SENSOR, POSES), planning, "numpy", scans_per_second=pace)
+
+
+class Clock:
+    """The module `time`, with a clock that can be put forward."""
+
+    ahead_s = 0.0
+
+    def monotonic(self) -> float:
+        return time.monotonic() + self.ahead_s
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(time, name)
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    """Clock that all of lidarpool goes by."""
+    clock = Clock()
+    for name, module in list(sys.modules.items()):
+        if name.startswith("lidarpool.") and getattr(module, "time", None) is time:
+            monkeypatch.setattr(module, "time", clock)
+    return clock
+
+
+@pytest.fixture
+def all_due(monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
+    """Have stage 1 describe half of the scans until this is set.
+
+    The driver may be held up for as long as the survey takes, and be told to pause too late.
+    """
+    all_due, describe = threading.Event(), Survey.scan
+
+    def scan(survey: Survey, index: int) -> ScanSpec:
+        assert index < survey.scan_count // 2 or all_due.wait(LONG_S)
+        return describe(survey, index)
+
+    monkeypatch.setattr(Survey, "scan", scan)
+    yield all_due
+    all_due.set()
 
 
 class Driven:
     """A run with a journal, which is paused as soon as it has some points."""
 
-    def __init__(self, client: Client, folder: Path) -> None:
-        self.kept: Journal = open_journal(folder / "journal", make_job(), resume=True)
+    def __init__(self, client: Client, folder: Path, job: Job | None = None) -> None:
+        self.kept: Journal = open_journal(folder / "journal", job or make_job(), resume=True)
         self.control = RunControl()
         self.run = Run(client, self.kept, lambda: self.control.paused)
         self.seen: list[Progress] = []
@@ -87,22 +124,26 @@ def busy_tasks(client: Client) -> list[str]:
     return [name for name in client.run_on_scheduler(look) if name not in long]
 
 
-def test_a_paused_run_stands_still_for_long_and_then_goes_on(client, tmp_path, monkeypatch):
+def test_a_paused_run_stands_still_for_long_and_then_goes_on(client, tmp_path, clock, all_due):
     """Longer than anything may take: nothing is under way that could be late or silent."""
-    # No less: what is under way before and after the pause may take so long on a busy machine.
-    limits = (pump, "STALL_SECONDS"), (caster, "LATE_S"), (poolpart.whereabouts, "SILENT_S")
-    for module, name in limits:
-        monkeypatch.setattr(module, name, LIMIT_S)
     driven = Driven(client, tmp_path)
     found = {}
 
+    def wait_for_looks(count: int) -> None:
+        seen, stop = len(driven.seen), time.monotonic() + LONG_S
+        while len(driven.seen) < seen + count and time.monotonic() < stop:
+            time.sleep(0.05)
+
     def look_and_go_on() -> None:
+        all_due.set()
         found["busy"] = busy_tasks(client)
         before = driven.kept.cloud.ledger.delivered, driven.kept.totals.frames
         # As after a crash at this moment, and of the kind that loses what was not synced.
         found["unsynced"] = driven.kept._store.file.end - driven.kept._store.file._durable
         shutil.copytree(tmp_path / "journal", tmp_path / "crashed" / "journal")
-        time.sleep(LIMIT_S + 1)
+        wait_for_looks(5)
+        clock.ahead_s = 1000.0
+        wait_for_looks(10)  # of which each takes a tenth of a second
         found["stood"] = (driven.kept.cloud.ledger.delivered, driven.kept.totals.frames) == before
         driven.control.go_on()
 
@@ -127,9 +168,14 @@ def test_a_paused_run_stands_still_for_long_and_then_goes_on(client, tmp_path, m
 
 
 @pytest.mark.parametrize("how", ["stop", "interrupt"])
-def test_a_paused_run_can_be_ended_and_resumed(client, tmp_path, how, left_over):
+def test_a_paused_run_can_be_ended_and_resumed(client, tmp_path, how, left_over, all_due):
     driven = Driven(client, tmp_path)
-    end = driven.control.stop if how == "stop" else lambda: os.kill(os.getpid(), signal.SIGINT)
+    stop = driven.control.stop if how == "stop" else lambda: os.kill(os.getpid(), signal.SIGINT)
+
+    def end() -> None:
+        all_due.set()
+        stop()
+
     with pytest.raises(KeyboardInterrupt) as ended:
         driven.drive(end)
     delivered = driven.seen[-1].collected
@@ -150,7 +196,7 @@ def test_a_cluster_that_is_lost_during_a_pause_ends_the_run(outside, tmp_path):
     cluster.add("OTHER")
     cluster.wait()
     with Client(cluster.address, set_as_default=False) as client:
-        driven = Driven(client, tmp_path)
+        driven = Driven(client, tmp_path, make_job(pace=20.0))  # not to be over before the pause
         with pytest.raises(LidarpoolError, match="cannot be reached any more") as ended:
             driven.drive(lambda: cluster.kill("scheduler"))
     assert "continue with" in "".join(ended.value.__notes__)

@@ -41,10 +41,12 @@ def undisturbed(client):
 
 
 @pytest.fixture(autouse=True)
-def all_workers(client) -> Iterator[None]:
-    """Begin with all workers, also behind a test that killed some."""
-    client.wait_for_workers(4, timeout=120)
-    yield
+def all_workers(client, wait_for_all, small_batches) -> None:
+    """Begin with all workers, also behind a test that killed some.
+
+    A batch of ten scans costs a worker before the poison in it is alone, at any speed.
+    """
+    wait_for_all(client, 4)
 
 
 @pytest.fixture

@@ -76,19 +76,6 @@ def kept_in(journal: Path) -> int:
         return 0
 
 
-def kill_at_random(run: Any, journal: Path, dice: random.Random) -> None:
-    """Kill the driver once it has delivered something more, or at any time from its start on."""
-    enough, deadline = kept_in(journal) + dice.randrange(16_000), time.monotonic() + 120
-    if dice.random() < 0.2:
-        time.sleep(dice.uniform(0, 3))
-    else:
-        while kept_in(journal) < enough and run.process.poll() is None:
-            assert time.monotonic() < deadline, run.said
-            time.sleep(0.002)
-    run.process.kill()
-    run.process.wait(300)
-
-
 def kill_and_resume(
     start: Callable[..., Any], folder: Path, times: int, seed: int, *options: str
 ) -> list[int]:
@@ -96,12 +83,15 @@ def kill_and_resume(
     dice = random.Random(seed)
     sizes = []
     for _ in range(times):
-        run = start(SCENARIO, "--resume", *options, prelude=NO_PICTURES)
-        kill_at_random(run, folder / "out" / "journal", dice)
+        # Once it has delivered something more, or at any time from its start on.
+        enough = kept_in(folder / "out" / "journal") + dice.randrange(16_000)
+        run = start(SCENARIO, "--resume", *options, prelude=NO_PICTURES + dying(enough))
+        if dice.random() < 0.2:
+            time.sleep(dice.uniform(0, 3))
+            run.process.kill()
+        assert run.process.wait(300) == -signal.SIGKILL, run.said
         run.wait_until_alone()
         sizes.append(kept_in(folder / "out" / "journal"))
-        if (folder / "out" / "report.json").exists():  # it was done before it was killed
-            break
     last = start(SCENARIO, "--resume", *options, prelude=NO_PICTURES)
     assert last.process.wait(300) == 0, last.said
     assert "Traceback" not in last.said
@@ -111,8 +101,8 @@ def kill_and_resume(
 def dying(size: int) -> str:
     """Code that kills its own process when the journal has grown over so many bytes.
 
-    From outside it may come too late: here the workers are threads of this process, and the
-    survey can end before the one that waits for its journal has its turn.
+    From outside it may come too late: the survey can end before the one that waits for its
+    journal has its turn.
     """
     return f"""
 import os, signal
@@ -144,19 +134,17 @@ def test_a_driver_is_killed_three_times(cluster, start_command, undisturbed, tmp
 @pytest.mark.parametrize("seed", range(4))
 def test_a_driver_is_killed_twenty_times(seed, start_command, undisturbed, tmp_path):
     """Five times in each of four runs, with clusters of their own that end by themselves."""
-    assert len(kill_and_resume(start_command, tmp_path, 5, seed)) == 5
+    sizes = kill_and_resume(start_command, tmp_path, 5, seed)
+    assert sizes[-1] > 0
     assert same_result(tmp_path / "out", undisturbed)
 
 
 def test_an_unfinished_run_is_refused_resumed_or_dropped(
     cluster, start_command, lidarpool, undisturbed, tmp_path, no_pictures
 ):
-    run = start_command(SCENARIO, "--scheduler", cluster, prelude=NO_PICTURES)
+    run = start_command(SCENARIO, "--scheduler", cluster, prelude=NO_PICTURES + dying(60_000))
     journal = tmp_path / "out" / "journal"
-    while kept_in(journal) < 60_000:
-        assert run.process.poll() is None, run.said
-        time.sleep(0.002)
-    run.signal(signal.SIGKILL)
+    assert run.process.wait(300) == -signal.SIGKILL, run.said
     before = (journal / "records").read_bytes()
     arguments = ["run", tmp_path / "s.yaml", "--out", tmp_path / "out", "--scheduler", cluster]
 
@@ -189,7 +177,8 @@ def test_a_dropped_run_starts_anew(cluster, lidarpool, tmp_path, no_pictures):
     (tmp_path / "out").mkdir()
 
     def enough(frame: Any) -> None:
-        if frame.scan == 30:
+        # Frames may be ahead of the points, without which there is nothing to keep.
+        if frame.scan >= 30 and kept_in(tmp_path / "out" / "journal"):
             raise ZeroDivisionError
 
     with Client(cluster, set_as_default=False) as client, pytest.raises(ZeroDivisionError):
@@ -228,7 +217,7 @@ def test_frames_go_on_where_they_were(cluster, tmp_path):
 
     def fail(frame: Any) -> None:
         first.append(frame.scan)
-        if frame.scan == 50:
+        if frame.scan >= 50 and kept_in(journal):  # frames may be ahead of the points
             raise ZeroDivisionError("enough")
 
     with Client(cluster, set_as_default=False) as client:
@@ -245,8 +234,8 @@ def test_frames_go_on_where_they_were(cluster, tmp_path):
             Scene.seed(), SURVEY, client=client, journal=journal, resume=True,
             on_frame=lambda frame: second.append(frame.scan),
         )  # fmt: skip
-    assert first == list(range(51))
-    assert second == list(range(50, 144))  # the one that it failed on is handed out again
+    assert first == list(range(first[-1] + 1))
+    assert second == list(range(first[-1], 144))  # the one that it failed on is handed out again
     assert result.resumed > 0
     assert (result.hit_counts == whole.hit_counts).all() and result.hits == whole.hits
     assert (result.sample_rays == whole.sample_rays).all()
@@ -272,7 +261,7 @@ def test_a_backend_that_is_not_to_be_had_any_more(cluster, tmp_path, monkeypatch
     journal = tmp_path / "kept"
 
     def fail(frame: Any) -> None:
-        if frame.scan == 50:
+        if frame.scan >= 50 and kept_in(journal):
             raise ZeroDivisionError
 
     with Client(cluster, set_as_default=False) as client:
@@ -290,8 +279,11 @@ def test_a_backend_that_is_not_to_be_had_any_more(cluster, tmp_path, monkeypatch
 
 
 def test_a_journal_that_others_write_to_makes_no_result(cluster, tmp_path):
+    cut: list[int] = []  # at which frame
+
     def meddle(frame):
-        if frame.scan == 30:
+        if not cut and kept_in(tmp_path / "journal") > 40:
+            cut.append(frame.scan)
             with (tmp_path / "journal" / "records").open("r+b") as file:
                 file.truncate(40)  # what comes behind it leaves a gap of zeros
 

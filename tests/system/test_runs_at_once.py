@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from distributed import Client
 
-from lidarpool import LidarpoolError, Result, Scene, Sensor, Survey, simulate
+from lidarpool import Frame, LidarpoolError, Result, Scene, Sensor, Survey, simulate
+from lidarpool.progress import Progress
 from poolpart import Claim
 
 SURVEY = Survey(Sensor(rays_per_revolution=180, layers=4, step_deg=5), [(0, 0, 1)], steps=72)
@@ -19,13 +20,24 @@ def test_they_run_one_after_the_other(cluster, left_over):
     results: list[Result] = []
     waited: set[str] = set()
 
+    refused = threading.Event()
+
+    def told(progress: Progress) -> None:
+        waited.add(progress.waits_for)
+        if progress.waits_for:
+            refused.set()
+
+    def hold(_: Frame) -> None:
+        """Do not end before another has found the slots taken."""
+        assert refused.wait(120)
+
     def run(go: threading.Barrier) -> None:
         with Client(cluster, set_as_default=False) as client:
             go.wait()
             results.append(
                 simulate(
                     Scene.seed(), SURVEY, client=client, backend="numpy",
-                    on_progress=lambda progress: waited.add(progress.waits_for),
+                    on_frame=hold, on_progress=told,
                 )
             )  # fmt: skip
 

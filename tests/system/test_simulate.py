@@ -189,7 +189,7 @@ def raise_at(scan: int | None, scan_of=None):
         (
             "lidarpool.scan.setup.SurveySetup.cast",
             raise_at(None),
-            r"stage intersect, scans 0 to 0 failed: scan 0: FloatingPointError",
+            r"stage intersect, scans (\d+) to \d+ failed: scan \1: FloatingPointError",
         ),
         (
             "lidarpool.scan.setup.SurveySetup.prepare",

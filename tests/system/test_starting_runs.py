@@ -113,7 +113,7 @@ def test_a_cluster_that_is_lost_before_the_run_has_begun_is_named(outside, monke
     monkeypatch.setattr(lidarpool.checks, "common_backend", lose)
     lost = pytest.raises(LidarpoolError, match=f"{cluster.address} cannot be reached any more")
     with (
-        dask.config.set({"distributed.comm.timeouts.connect": "2s"}),
+        dask.config.set({"distributed.comm.timeouts.connect": "5s"}),
         Client(cluster.address, set_as_default=False) as client,
         lost,
     ):
