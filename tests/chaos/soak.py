@@ -89,9 +89,8 @@ def soak(scans: int, seed: int, pace_s: float = PACE_S) -> Soaked:
     """Survey at least so many scans while workers are killed all the time."""
     what = survey(-(-scans // STEPS))
     with own_temporary_folder() as temporary:
-        with Arena(
-            time_to_live_s=TIME_TO_LIVE_S
-        ) as arena:  # of its own, so that all is imported when it begins
+        # Of its own, so that all is imported when the soak begins.
+        with Arena(time_to_live_s=TIME_TO_LIVE_S) as arena:
             expected = reference(arena, what, None)
         before = Footprint.now(temporary)
         soaked = _soak(what, expected, seed, pace_s)

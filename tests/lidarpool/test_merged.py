@@ -53,7 +53,7 @@ def deliveries(draw):
     return counts, parts + draw(st.lists(st.sampled_from(parts), max_size=2))
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(deliveries(), st.integers(1, 20))
 def test_chunks_of_any_size_are_the_points_in_order(delivered, size):
     counts, parts = delivered

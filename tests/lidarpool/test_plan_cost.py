@@ -2,7 +2,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lidarpool.plan import cost as cost_module
@@ -38,7 +38,6 @@ def random_paths(cost, seed, spread=0.6):
     cost.waypoints[:] = random.uniform(-spread, spread, cost.waypoints.shape)
 
 
-@settings(deadline=None)
 @given(
     discs=st.lists(disc, max_size=6), waypoints=st.integers(1, 5), seed=st.integers(0, 2**32 - 1)
 )
@@ -58,7 +57,6 @@ def test_free_paths_cost_their_length_and_others_more_than_any_detour(discs, way
             assert room >= 0, "what is cheap passes the exact check"
 
 
-@settings(deadline=None)
 @given(discs=st.lists(disc, min_size=1, max_size=6))
 def test_the_price_of_entry_is_above_the_shortest_detour(discs):
     centres, radii = discs_of(discs)

@@ -2,7 +2,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lidarpool.plan.axes import PathAxes
@@ -21,7 +21,6 @@ def test_distance_is_to_the_closest_point_of_the_segment(centre, distance):
     assert found == pytest.approx(distance)
 
 
-@settings(deadline=None)
 @given(first=point, last=point, centre=point)
 def test_distance_is_below_and_close_to_that_of_any_sample(first, last, centre):
     share = np.linspace(0, 1, 401)[:, None]
@@ -56,7 +55,6 @@ def test_path_length():
     assert path_length(np.array([[0.0, 0], [3, 4], [3, 5], [3, 5]])) == 6
 
 
-@settings(deadline=None)
 @given(start=point, target=point, points=st.lists(point, min_size=1, max_size=5))
 def test_axes_put_the_ends_half_a_unit_from_the_middle(start, target, points):
     if math.dist(start, target) < 1e-3:

@@ -173,7 +173,7 @@ coordinate = st.integers(-40, 40).map(lambda n: n / 4)
 disc = st.tuples(coordinate, coordinate, st.integers(2, 24).map(lambda n: n / 4))
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(discs=st.lists(disc, min_size=1, max_size=4))
 @example(discs=[(0, 0, 3), (0, 4, 3), (0, -4, 3)])  # a wall
 @example(discs=[(-8, 3, 3), (-8, -3, 3), (-14, 0, 4)])  # the start in a bay

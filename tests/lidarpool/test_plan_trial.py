@@ -59,7 +59,7 @@ scene = st.lists(
 )
 
 
-@settings(deadline=None, max_examples=25, derandomize=True)
+@settings(max_examples=25, derandomize=True)
 @given(discs=scene)
 def test_random_scenes(discs):
     array = np.array(discs, float)

@@ -42,7 +42,7 @@ def test_round_trip(tmp_path, count):
     assert [p.name for p in tmp_path.iterdir()] == ["c.ply"]
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(
     npst.arrays(
         np.float64,

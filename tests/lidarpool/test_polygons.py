@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lidarpool.polygons import MOST_CORNERS, triangulated
@@ -74,7 +74,6 @@ def test_polygons_of_all_sizes_keep_their_order():
     np.testing.assert_array_equal(np.diff(vertices[faces][:, 0, 1]) >= 0, True)
 
 
-@settings(deadline=None)
 @given(
     st.lists(st.tuples(*[st.integers(-3, 3)] * 3), min_size=3, max_size=9),
     st.sampled_from([1.0, 1e-9, 1e8, float("nan")]),

@@ -343,7 +343,7 @@ YAML_VALUES = st.recursive(
 )
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(
     st.dictionaries(
         st.sampled_from(["scene", "sensor", "poses", "steps", "cloud", "planning", "pool", "x"]),

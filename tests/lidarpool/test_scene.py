@@ -4,7 +4,7 @@ import pickle
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lidarpool.errors import LidarpoolError
@@ -50,7 +50,6 @@ def test_arrays_cannot_be_changed():
             array[0] = 0
 
 
-@settings(deadline=None)
 @given(
     st.tuples(*[st.floats(-6e6, 6e6)] * 3),
     st.lists(st.tuples(*[st.floats(-500, 500)] * 3), min_size=1, max_size=5),
@@ -105,7 +104,6 @@ def test_unused_vertices_do_not_count_in_bounds():
     np.testing.assert_array_equal(Scene.from_meshes([mesh]).bounds, [[0, 0, 0], [1, 1, 0]])
 
 
-@settings(deadline=None)
 @given(st.lists(st.sampled_from(["a", "b", "a.2", "a.3", "b.2.2"]), max_size=12))
 def test_unique_names(names):
     unique = unique_names(names)

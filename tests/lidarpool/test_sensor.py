@@ -5,7 +5,7 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import lidarpool.sensor
@@ -16,7 +16,6 @@ def test_examples_in_the_docstrings():
     assert doctest.testmod(lidarpool.sensor).failed == 0
 
 
-@settings(deadline=None)
 @given(
     rays=st.integers(1, 5000),
     steps=st.integers(1, 720),

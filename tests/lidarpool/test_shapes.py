@@ -73,7 +73,7 @@ def test_sphere_has_the_volume_of_a_sphere():
     assert volume(seed_objects()[0]) == pytest.approx(4 / 3 * np.pi * 8, rel=3e-3)
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(
     st.lists(st.tuples(st.floats(0.01, 10), st.floats(0.01, 5)), min_size=1, max_size=12),
     st.integers(3, 40),

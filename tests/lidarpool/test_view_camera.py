@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lidarpool.view.camera import Camera, fit_camera
@@ -12,7 +12,6 @@ angles = st.floats(-180, 180)
 elevations = st.floats(5, 80)
 
 
-@settings(deadline=None)
 @given(azimuth=angles, elevation=elevations, u=st.floats(0, 640), v=st.floats(0, 400))
 def test_a_point_on_a_pixels_ray_is_seen_in_that_pixel(azimuth, elevation, u, v):
     camera = fit_camera(BOX, (640, 400), FRAME, azimuth, elevation)
@@ -23,7 +22,6 @@ def test_a_point_on_a_pixels_ray_is_seen_in_that_pixel(azimuth, elevation, u, v)
     np.testing.assert_allclose(distance, [12.5])
 
 
-@settings(deadline=None)
 @given(
     azimuth=angles,
     elevation=elevations,

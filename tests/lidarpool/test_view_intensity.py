@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lidarpool import LidarpoolError
@@ -25,7 +25,6 @@ SHEET = sheet(6)
 AREA = 1 / len(SHEET.faces)
 
 
-@settings(deadline=None)
 @given(st.lists(st.integers(0, 40), min_size=72, max_size=72))
 def test_sharing_hits_keeps_their_number(counts):
     hits = checked_counts(SHEET, counts)

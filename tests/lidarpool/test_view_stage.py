@@ -10,7 +10,6 @@ from lidarpool.view.labels import axis_labels
 from lidarpool.view.stage import Stage, axis, nice_step, robust_bounds
 
 
-@settings(deadline=None)
 @given(st.floats(1e-6, 1e9))
 def test_a_nice_step_is_1_2_or_5_and_just_large_enough(length):
     step = nice_step(length)
@@ -19,7 +18,6 @@ def test_a_nice_step_is_1_2_or_5_and_just_large_enough(length):
     assert length * (1 - 1e-6) <= step <= 2.5 * length * (1 + 1e-6)
 
 
-@settings(deadline=None)
 @given(
     low=st.floats(-1e4, 1e4), width=st.floats(0.01, 1e4), origin=st.integers(-6_000_000, 6_000_000)
 )
@@ -67,7 +65,7 @@ def test_any_box_has_a_ground_that_a_camera_can_see(bounds):
     assert len(labels) < 40
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(st.floats(0.1, 10_000), st.floats(0.1, 10), st.integers(-90, 90))
 def test_numbers_keep_clear_of_each_other(size, aspect, azimuth):
     stage = Stage.around(np.array([[0, 0, 0], [size, size * aspect, size / 9]]), np.zeros(3))

@@ -1,14 +1,13 @@
 import itertools
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from poolpart import Backoff
 
 
 @given(least=st.floats(1e-6, 1.0), factor=st.floats(1.0, 1e4), count=st.integers(1, 40))
-@settings(deadline=None)
 def test_pauses_double_up_to_the_longest(least, factor, count):
     most = least * factor
     pause = Backoff(least, most)

@@ -4,7 +4,7 @@ import time
 
 import pytest
 from distributed import Reschedule
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from poolpart.chunks import GROWTH, MOST_BYTES, MOST_ITEMS, Chunk, ChunkSize, run_chunk
@@ -88,7 +88,6 @@ def test_chunks_get_small_again_when_items_take_longer():
 
 
 @given(st.lists(st.tuples(st.integers(1, 1000), st.floats(0, 1e3), st.integers(0, 2**40))))
-@settings(deadline=None)
 def test_a_chunk_has_an_item_and_at_most_four_times_what_was_tried(chunks):
     size = ChunkSize()
     for items, seconds, nbytes in chunks:

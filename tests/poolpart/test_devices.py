@@ -11,7 +11,7 @@ from unittest.mock import patch
 import dask
 import pytest
 from distributed import Client, Nanny, Scheduler, SpecCluster
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from poolpart import Pool, assign_devices, devices, own_device, probe
@@ -110,7 +110,6 @@ def test_a_worker_that_has_gone_gets_none():
 
 
 @given(st.integers(1, 5), st.integers(1, 20), st.data())
-@settings(deadline=None)
 def test_shared_evenly_whatever_the_order_of_the_lists_and_whoever_is_restarted(gpus, n, data):
     names = "uvwxy"[:gpus]
     views = {f"w{i}": data.draw(st.permutations(names)) for i in range(n)}

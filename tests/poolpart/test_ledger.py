@@ -1,12 +1,11 @@
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from poolpart import Ledger
 
 
 @given(data=st.data(), total=st.integers(0, 60))
-@settings(deadline=None)
 def test_behaves_as_a_set(data, total):
     ledger, seen, repeated = Ledger(total), set(), 0
     items = st.integers(0, total - 1) if total else st.nothing()

@@ -8,7 +8,7 @@ import sys
 import psutil
 import pytest
 from distributed import Client
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from poolpart import Pool, PoolError, local_cluster
@@ -66,7 +66,6 @@ def children():
 
 
 @given(cores=st.integers(1, 256), gpus=st.integers(0, 16))
-@settings(deadline=None)
 def test_every_machine_gets_workers_and_no_more_than_cores_and_gpus(cores, gpus):
     workers = default_workers(cores, gpus)
     assert workers["GPU"] == gpus or gpus == 0

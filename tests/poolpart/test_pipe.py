@@ -93,7 +93,7 @@ OPERATIONS = st.lists(
 
 
 @given(operations=OPERATIONS, capacity=st.integers(1, 4))
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 def test_behaves_as_a_bounded_queue(_threads_client, operations, capacity):
     pipe = Pipe("model", capacity, _threads_client).create()
     producer, queued, taken = again(pipe), deque(), deque()

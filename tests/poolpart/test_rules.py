@@ -2,7 +2,7 @@
 
 import pytest
 from distributed import Client, LocalCluster, get_worker
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from poolpart import (
@@ -140,7 +140,6 @@ def test_nobody_wants_it():
     order=st.randoms(use_true_random=False),
     most=st.integers(1, 3),
 )
-@settings(deadline=None)
 def test_whoever_joins_finds_a_place_and_no_rule_gets_more_than_it_wants(gpus, order, most):
     pool = [
         worker(f"{h}-{i}", *(f"{h}:{g}" for g in range(count)), host=str(h))

@@ -3,7 +3,7 @@
 from collections import Counter
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from poolpart import PoolError, WorkerInfo, n_workers
@@ -124,7 +124,6 @@ HOSTS = st.lists(
 
 
 @given(hosts=HOSTS, most=st.integers(1, 4))
-@settings(deadline=None)
 def test_plain_workers_take_up_each_gpu_so_often(hosts, most):
     pool = [
         worker(f"{h}-{i}", *(f"{h}:{g}" for g in range(gpus)), host=str(h))
@@ -139,7 +138,6 @@ def test_plain_workers_take_up_each_gpu_so_often(hosts, most):
 
 
 @given(hosts=st.lists(st.integers(1, 6), min_size=1, max_size=4), most=st.integers(1, 4))
-@settings(deadline=None)
 def test_so_many_workers_of_each_host(hosts, most):
     pool = [worker(f"{h}-{i}", host=str(h)) for h, count in enumerate(hosts) for i in range(count)]
     chosen = Counter(w.host for w in choose("P", pool, max_workers_per_host=most)[0])

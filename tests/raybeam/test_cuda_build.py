@@ -96,7 +96,6 @@ def test_chain_of_ever_better_partners(built):
 
 
 @settings(
-    deadline=None,
     max_examples=80,
     derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture],

@@ -41,7 +41,7 @@ def leaves(tree):
                 yield tree.order[first : first + count], boxes
 
 
-@settings(deadline=None, max_examples=60, derandomize=True)
+@settings(max_examples=60, derandomize=True)
 @given(soups, st.sampled_from([(2, 1), (4, 4), (8, 4), (8, 8)]))
 def test_every_triangle_is_in_one_leaf_and_its_boxes(corners, shape):
     width, leaf_size = shape
@@ -57,7 +57,7 @@ def test_every_triangle_is_in_one_leaf_and_its_boxes(corners, shape):
     assert sorted(seen) == list(range(len(corners)))
 
 
-@settings(deadline=None, max_examples=60, derandomize=True)
+@settings(max_examples=60, derandomize=True)
 @given(soups)
 def test_binary_tree(corners):
     n = len(corners)

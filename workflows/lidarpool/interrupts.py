@@ -36,10 +36,10 @@ class _Interrupt:
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
         if self.first_at is None:
-            if not _AgainIfLost.is_at_work(frame):
-                self.first_at = time.monotonic()
-                raise KeyboardInterrupt
-            return
+            if _AgainIfLost.is_at_work(frame):
+                return  # raised in there it would be lost, and it comes again
+            self.first_at = time.monotonic()
+            raise KeyboardInterrupt
         if time.monotonic() - self.first_at > _IMPATIENT_S:
             _exit(b"lidarpool: stopped at once; workers of this machine end by themselves.\n")
 

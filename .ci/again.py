@@ -1,4 +1,3 @@
-#!/usr/bin/env python3
 """Run tests that failed by themselves, three times each, and say so.
 
 Tests here kill, stop and overload processes, while two suites share the processors. One in some
