@@ -1,134 +1,44 @@
 """A journal gives back what was delivered, whatever became of it, or says why it cannot."""
 
-import json
-import os
-import random
-import re
-import struct
-import subprocess
-import sys
 import weakref
 from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.lidarpool.journal_run import (
+    DELIVERIES,
+    SCANS,
+    VERTICES,
+    content,
+    deliver,
+    expected_content,
+    files,
+    frame,
+    interrupted,
+    make_job,
+    make_planning,
+    make_survey,
+    reopen,
+    trial,
+)
 
-from lidarpool import LidarpoolError, Planning, Scene, Sensor, Survey, identity, remove_journal
-from lidarpool.deliveries import Deliveries
-from lidarpool.job import Job
+from lidarpool import LidarpoolError, Scene, Sensor, Survey, identity, remove_journal
 from lidarpool.journal import COMMAND_TERMS, Journal, open_journal
 from lidarpool.journal_folder import FRAMES, RECORDS
 from lidarpool.journal_format import TRIAL
 from lidarpool.mesh import Mesh
-from lidarpool.plan import Trial
-from lidarpool.records import HEAD_BYTES
 from lidarpool.run import make_result
-from lidarpool.scan.messages import POINT, Frame, Part
-from lidarpool.survey import Pose
-
-SCANS, TRIALS = 12, 3
-VERTICES = [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
-
-
-def make_job(**changes):
-    scene = Scene.from_meshes([Mesh("wall", np.array(VERTICES, float), np.array([[0, 1, 2]]))])
-    settings = {"scene": scene, "survey": make_survey(), "planning": make_planning()} | changes
-    return Job(**settings)
-
-
-def make_survey(**changes):
-    settings = {"poses": [(0, 0, 1), (0, 0, 2)], "steps": SCANS // 2} | changes
-    return Survey(Sensor(layers=2), **settings)
-
-
-def make_planning(**changes):
-    return Planning((0, 0), (9, 0), trials=TRIALS, **changes)
-
-
-def part(*scans):
-    """Points of some scans, 0 to 4 of each."""
-    tables = []
-    for scan in scans:
-        table = np.zeros(scan % 5, POINT)
-        table["cell"] = np.arange(3 * len(table)).reshape(-1, 3) * (scan - 7)
-        table["scan"], table["ray"] = scan, np.arange(len(table))
-        table["ring"] = table["ray"] % 2
-        tables.append(table)
-    return Part(scans, tuple(map(len, tables)), np.concatenate(tables))
-
-
-def frame(scan):
-    triangle, count = np.zeros(1, np.int32), np.full(1, scan + 1, np.int32)
-    samples = np.full((2, 3), scan, np.float32)
-    return Frame(scan, Pose((0, 0, scan)), 56, scan + 1, triangle, count, samples)
-
-
-def trial(number):
-    rng = np.random.default_rng(number)
-    history = rng.normal(size=20).astype(np.float32)
-    return Trial(number, 2**63 + number, rng.normal(), rng.normal(size=(5, 2)), True, history, 0.1)
-
-
-# The order in which a run's deliveries come; a scan may come twice.
-DELIVERIES = [
-    part(3, 4), frame(0), part(0), trial(2), frame(1), frame(2), part(1, 2, 0), frame(3), part(8),
-    trial(0), frame(4), frame(5), part(5, 6, 7), frame(6), frame(7), part(10, 9), frame(8),
-    trial(1), frame(9), frame(10), part(11), frame(11),
-]  # fmt: skip
-
-
-def deliver(kept, deliveries=DELIVERIES):
-    """Deliver what is not there yet, as the pumps would."""
-    kept.backend = kept.backend or "numpy"
-    done = {trial.trial for trial in kept.trials}
-    for item in deliveries:
-        if isinstance(item, Part):
-            kept.cloud.add(item)
-        elif isinstance(item, Trial):
-            if item.trial not in done:
-                kept.add_trial(item)
-        elif item.scan >= kept.totals.frames:
-            kept.totals.take(item)
-
-
-def content(kept):
-    """All that a result says of what was delivered, as bytes."""
-    result = make_result(kept)
-    cloud = result.cloud
-    arrays = [cloud.positions, cloud.scan, cloud.ring, cloud.object]
-    arrays += [result.hit_counts, result.sample_rays]
-    for one in result.trials:
-        arrays += [np.array([one.trial, one.length, one.seconds]), one.waypoints, one.history]
-    return [a.tobytes() for a in arrays], result.hits, result.backend, result.plan.length
+from lidarpool.scan.messages import Frame, Part
 
 
 @pytest.fixture(scope="module")
 def expected():
-    kept = Deliveries(make_job())
-    deliver(kept)
-    return content(kept)
+    return expected_content()
 
 
 @pytest.fixture
 def path(tmp_path):
     return tmp_path / "journal"
-
-
-def reopen(path, **changes):
-    return open_journal(path, make_job(**changes), resume=True)
-
-
-def files(path):
-    return {entry.name: entry.read_bytes() for entry in path.iterdir()}
-
-
-def interrupted(path, after, *, orderly=True):
-    """Leave the journal of a run that ended after so many deliveries."""
-    journal = Journal(path, make_job())
-    deliver(journal, DELIVERIES[:after])
-    if orderly:
-        journal.save()
-    journal.close()
 
 
 def test_a_run_without_a_journal_and_one_with_it_agree(path, expected):
@@ -438,162 +348,3 @@ def test_the_file_is_open_as_long_as_somebody_reads_from_it(path, expected):
     assert file() is not None
     del result
     assert file() is None  # at once: nothing holds it in a circle
-
-
-# -- damage --------------------------------------------------------------------------------------
-
-
-def outcome(path, expected):
-    """What becomes of a run that is to go on from a journal, which may be damaged."""
-    before = files(path)
-    try:
-        journal = reopen(path)
-    except LidarpoolError as error:
-        assert files(path) == before, "it was refused and changed all the same"
-        assert len(str(error).splitlines()) <= 2
-        return "refused"
-    deliver(journal)
-    journal.save()
-    assert content(journal) == expected
-    journal.close()
-    return "resumed"
-
-
-@pytest.mark.parametrize(
-    ("harm", "what"),
-    [
-        (lambda file: (file.seek(900), file.write(b"\xff" * 40)), "the record at byte .* damaged"),
-        (lambda file: file.truncate(700), "the file ends at byte 700, before its records do"),
-        (lambda file: (file.truncate(0), file.truncate(9000)), "the record at byte 0 is damaged"),
-    ],
-    ids=["written over", "cut", "zeros"],
-)
-def test_a_journal_that_others_write_to_makes_no_result(harm, what, path):
-    journal = Journal(path, make_job(), COMMAND_TERMS)
-    with pytest.raises(LidarpoolError) as ended, journal.kept_on_error():
-        deliver(journal)
-        journal.check()  # it is whole
-        with (path / RECORDS).open("r+b") as file:
-            harm(file)
-        before = files(path)
-        journal.check()
-    assert re.search(
-        rf"was changed while this run wrote to it \(.*{what}.*--fresh", str(ended.value)
-    )
-    assert not hasattr(ended.value, "__notes__")  # there is nothing to go on from
-    assert files(path) == before
-
-
-@pytest.mark.parametrize("orderly", [True, False])
-def test_no_flipped_byte_makes_another_cloud(orderly, path, expected):
-    interrupted(path, 14, orderly=orderly)
-    whole = files(path)
-    dice = random.Random(7)
-    seen = []
-    for _ in range(150):
-        name = dice.choice(sorted(whole))
-        data = bytearray(whole[name])
-        for _ in range(dice.choice([1, 1, 1, 5])):
-            data[dice.randrange(len(data))] ^= 1 << dice.randrange(8)
-        for entry, kept in whole.items():
-            (path / entry).write_bytes(data if entry == name else kept)
-        seen.append(outcome(path, expected))
-    if orderly:  # the mark at the end vouches for every byte before it
-        assert seen.count("refused") >= 140
-    else:
-        assert "resumed" in seen and "refused" in seen
-
-
-@pytest.mark.parametrize("name", [RECORDS, FRAMES])
-def test_no_cut_makes_another_cloud(name, path, expected):
-    interrupted(path, 14)
-    whole = files(path)
-    seen = set()
-    for length in range(0, len(whole[name]), 13):
-        for entry, kept in whole.items():
-            (path / entry).write_bytes(kept[:length] if entry == name else kept)
-        seen.add(outcome(path, expected))
-    # The totals are replaced as a whole: nothing but damage cuts them.
-    assert seen == ({"resumed"} if name == RECORDS else {"refused"})
-
-
-def test_totals_that_were_never_written_are_made_again(path, expected):
-    interrupted(path, 14)
-    (path / FRAMES).unlink()
-    assert outcome(path, expected) == "resumed"
-
-
-@pytest.mark.parametrize("junk", [b"", b"[" * 100_000, b'{"format": 1}', b"\x80\x04N.", b"1e999"])
-def test_a_header_that_says_nothing_is_refused(junk, path, expected):
-    """Records whose checksum is right, and their content not."""
-    from lidarpool.records import RecordFile
-
-    path.mkdir()
-    file = RecordFile(path / RECORDS)
-    file.append(1, junk)
-    file.append(2, struct.pack("<I", 3))
-    file.close()
-    assert outcome(path, expected) == "refused"
-
-
-@pytest.mark.parametrize(
-    "payload",
-    [
-        b"",
-        struct.pack("<I", 10**9),
-        struct.pack("<III", 1, SCANS, 0),  # there is no such scan
-        struct.pack("<III", 1, 0, 7),  # seven points announced, none there
-        struct.pack("<III", 1, 0, 1) + b"half a point",
-    ],
-)
-def test_points_that_cannot_be_are_refused(payload, path, expected):
-    from lidarpool.records import RecordFile
-
-    interrupted(path, 9)
-    file = RecordFile(path / RECORDS)
-    list(file.records())
-    file.append(2, payload)
-    file.close()
-    assert outcome(path, expected) == "refused"
-
-
-def test_the_header_is_plain_json(path):
-    interrupted(path, 3)
-    data = (path / RECORDS).read_bytes()
-    header, _ = json.JSONDecoder().raw_decode(data[HEAD_BYTES:].decode("latin-1"))
-    assert header["backend"] == "numpy"
-    assert {"lidarpool", "numpy", "open3d"} == set(header["identity"]["versions"])
-    assert str(path.parent) not in data.decode("latin-1")
-
-
-FILL = """
-import resource, sys
-sys.path.insert(0, sys.argv[2])
-import test_journal as t
-from lidarpool import LidarpoolError
-resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[3]),) * 2)
-from pathlib import Path
-journal = t.reopen(Path(sys.argv[1]))
-try:
-    with journal.kept_on_error():
-        t.deliver(journal)
-        journal.save()
-except LidarpoolError as error:
-    print(error, *getattr(error, "__notes__", []))
-"""
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="has no limit on the size of files")
-@pytest.mark.parametrize("limit", [300, 1000, 2000, 3000])
-def test_a_full_disk_loses_nothing(limit, path, expected):
-    """With a limit on the size of files, which is as real as a full disk and needs no root."""
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    done = subprocess.run(
-        [sys.executable, "-c", FILL, path, Path(__file__).parent, str(limit)],
-        capture_output=True, text=True, env=environment, check=False,
-    )  # fmt: skip
-    assert "cannot be written (File too large): make room" in done.stdout, done.stderr
-    assert path.exists() == ("scans are kept" in done.stdout)
-    journal = reopen(path)
-    deliver(journal)
-    assert content(journal) == expected
