@@ -2,8 +2,8 @@
 
 from .backend import BackendUnavailable
 from .caster import RayCaster
-from .hits import Hits, Returns
-from .rays import Pattern
+from .hits import Hits, Returns, ScanReturns
+from .pattern import Pattern
 from .registry import available_backends
 
 __all__ = [
@@ -12,5 +12,6 @@ __all__ = [
     "Pattern",
     "RayCaster",
     "Returns",
+    "ScanReturns",
     "available_backends",
 ]

@@ -9,10 +9,12 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from .hits import RAY_BYTES, Gathering, Hits, Returns
+from .collector import Collector
+from .hits import RAY_BYTES, Gathering, Hits, Returns, ScanReturns
 from .memory import require
 from .mesh import LocalMesh
-from .rays import Pattern, Rays, rotated
+from .rays import Rays
+from .scan import Scan
 
 
 class BackendUnavailable(RuntimeError):  # noqa: N818 - a state, not a mishap
@@ -95,20 +97,16 @@ class Backend(ABC):
             gathering.add(Returns(ray, found.t / self._mesh.scale, found.triangle))
         return gathering.returns()
 
-    def scan(
-        self,
-        pattern: Pattern,
-        window: tuple[int, int],
-        origin: NDArray[np.float64],
-        rotation: NDArray[np.float64] | None,
-        interval: tuple[float, float],
-    ) -> Returns:
-        """Like `returns` for rows of a pattern, turned by `rotation`, from one origin (1, 3).
-
-        Rays are numbered from 0 at the window's start.
-        """
-        directions = rotated(pattern.directions[slice(*window)], rotation)
-        return self.returns(Rays(origin, directions, *interval))
+    def scan(self, scan: Scan) -> ScanReturns:
+        """Closest hits of a scan's rays: those that it keeps, and counts of all."""
+        collector = Collector(scan, self._mesh.face_count)
+        for start, stop in scan.chunks(self.chunk):
+            found = self.closest(scan.rays(start, stop), weights=False)
+            collector.tally(found.triangle)
+            kept = collector.keep(found.ray, start, stop)
+            ray = found.ray[kept].astype(np.uint32) + np.uint32(start)
+            collector.add(Returns(ray, found.t[kept] / self._mesh.scale, found.triangle[kept]))
+        return collector.result()
 
     def count(self, rays: Rays, every: bool) -> NDArray[np.int64]:
         """How many rays hit each triangle first or, if `every`, meet it at all: (face_count,)."""
@@ -117,16 +115,3 @@ class Backend(ABC):
             part = rays.part(start, start + self.chunk)
             np.add.at(counts, self.along(part) if every else self.closest(part, False).triangle, 1)
         return counts
-
-    def count_scan(
-        self,
-        pattern: Pattern,
-        window: tuple[int, int],
-        origin: NDArray[np.float64],
-        rotation: NDArray[np.float64] | None,
-        interval: tuple[float, float],
-        every: bool,
-    ) -> NDArray[np.int64]:
-        """Like `count` for rows of a pattern, given as to `scan`."""
-        directions = rotated(pattern.directions[slice(*window)], rotation)
-        return self.count(Rays(origin, directions, *interval), every)

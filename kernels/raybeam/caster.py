@@ -7,17 +7,12 @@ from operator import index
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .hits import Hits, Returns
+from .hits import Hits, Returns, ScanReturns
 from .mesh import local_mesh
-from .rays import (
-    Pattern,
-    check_interval,
-    check_origins,
-    check_rays,
-    check_rotation,
-    check_window,
-)
+from .pattern import Pattern
+from .rays import check_rays
 from .registry import choose
+from .scan import check_scan
 
 
 class RayCaster:
@@ -127,45 +122,79 @@ class RayCaster:
     def scan(
         self,
         pattern: Pattern,
-        origin: ArrayLike,
-        rotation: ArrayLike | None = None,
+        positions: ArrayLike,
+        rotations: ArrayLike | None = None,
         *,
         window: tuple[int, int] | None = None,
+        rays_per_pose: int | None = None,
         t_min: float = 0.0,
         t_max: float = np.inf,
-    ) -> Returns:
-        """Cast a pattern of directions from one pose: the fastest way for a lidar.
+        keep_every: int = 1,
+        groups: ArrayLike | None = None,
+        tally: bool = False,
+    ) -> ScanReturns:
+        """Cast a pattern of rays from one pose or from many: the fastest way for a lidar.
 
-        In the result, rays are numbered from 0 at the window's start.
+        Rays are numbered from 0 at the window's start. `Pattern.rays` tells where they run.
 
         Parameters
         ----------
         pattern
-            Directions in the sensor's axes, checked once; the cuda backend keeps them on the
-            device and makes the rays there.
-        origin
-            (3,), metres.
-        rotation
-            (3, 3) from the sensor's axes to the mesh's; None when they are the same.
+            Rays in the sensor's axes, checked once; the cuda backend keeps them on the device
+            and turns them there.
+        positions
+            (3,) or (k, 3), metres.
+        rotations
+            (3, 3) or (k, 3, 3) from the sensor's axes to the mesh's; None when they are the same.
         window
-            Rows ``start <= row < stop`` of the pattern to cast; None for all.
+            Rows ``start <= row < stop`` of the pattern to cast; None for all. It may go past the
+            pattern's end, where the pattern starts over: row r is row ``r % len(pattern)``.
+        rays_per_pose
+            Ray i is cast from pose ``i // rays_per_pose``: the number of beams, when a moving
+            lidar has a pose for each firing. A single pose needs none, it is that of all rays.
         t_min, t_max
             As in `cast`.
+        keep_every
+            Of the hits of each group, in ray order, keep the first and then every n-th.
+        groups
+            Ascending numbers of the rays at which groups begin, the first is 0: scans that are
+            cast together. None for one group.
+        tally
+            Count the hits of each triangle, those that are not kept included.
 
         Raises
         ------
         ValueError
-            If the origin is not finite, the rotation is none, or the window is not within the
-            pattern.
+            If a position is not finite, a rotation is none, the poses do not suffice for the
+            rays, the window's ends are no rows, there are more than 2**32 rays, or the groups
+            do not ascend from 0.
         TypeError
-            If the pattern is none, or the window not two whole numbers.
+            If the pattern is none, or what should be a whole number is not.
+
+        Examples
+        --------
+        A head with two beams that moves between its three firings; the pattern has one firing.
+
+        >>> caster = RayCaster([[0, 0, 0], [9, 0, 0], [0, 9, 0]], [[0, 1, 2]], backend="numpy")
+        >>> down = Pattern([[0, 0, -1], [0.1, 0, -1]])
+        >>> track = [[1, 1, 3], [2, 1, 3], [3, 1, 3]]
+        >>> found = caster.scan(down, track, window=(0, 6), rays_per_pose=2, keep_every=2)
+        >>> found.ray.tolist(), found.hits.tolist()
+        ([0, 2, 4], [6])
         """
         return self._engine.scan(
-            pattern,
-            check_window(pattern, window),
-            check_origins(origin, 1),
-            check_rotation(rotation),
-            check_interval(t_min, t_max),
+            check_scan(
+                pattern,
+                positions,
+                rotations,
+                window=window,
+                rays_per_pose=rays_per_pose,
+                t_min=t_min,
+                t_max=t_max,
+                keep_every=keep_every,
+                groups=groups,
+                tally=tally,
+            )
         )
 
     def count(
@@ -195,24 +224,3 @@ class RayCaster:
         [1]
         """
         return self._engine.count(check_rays(origins, directions, t_min, t_max), every)
-
-    def count_scan(
-        self,
-        pattern: Pattern,
-        origin: ArrayLike,
-        rotation: ArrayLike | None = None,
-        *,
-        window: tuple[int, int] | None = None,
-        t_min: float = 0.0,
-        t_max: float = np.inf,
-        every: bool = False,
-    ) -> NDArray[np.int64]:
-        """Count as `count` does, for a pattern cast from one pose as by `scan`."""
-        return self._engine.count_scan(
-            pattern,
-            check_window(pattern, window),
-            check_origins(origin, 1),
-            check_rotation(rotation),
-            check_interval(t_min, t_max),
-            every,
-        )

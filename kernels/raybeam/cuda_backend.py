@@ -13,16 +13,20 @@ from numpy.typing import NDArray
 
 from . import cuda_scene
 from .backend import Backend, Found
+from .collector import Collector
 from .cuda_module import Kernels, options
 from .cuda_results import Packer, PinnedRoom
 from .cuda_scene import WORK, free, sent
-from .hits import Returns
+from .hits import Returns, ScanReturns
 from .memory import lacking
 from .mesh import LocalMesh
-from .rays import Pattern, Rays
+from .pattern import Pattern
+from .rays import Rays
+from .scan import Scan
 
 _STACK_STEP = 32
 _RAY_BYTES = 104  # a ray of a chunk: origin, direction, hit with its weights, sums; 101 and room
+_MOST_INT = (1 << 31) - 1  # rays of a pose, as intersect.cu is told: more than a chunk has
 _KEEP = 1 << 30  # bytes of hits that wait on the device, at most
 
 
@@ -82,8 +86,8 @@ class CudaBackend(Backend):
         self._corners, self._faces, self._frame = tables.corners, tables.faces, tables.frame
         self._scene = (tables.nodes, tables.triangles, tables.corners, tables.faces, tables.frame)
         self._room = PinnedRoom(cupy)
-        # {pattern: its directions on the device}
-        self._patterns: WeakKeyDictionary[Pattern, Any] = WeakKeyDictionary()
+        # {pattern: its directions on the device, and its origins if it has any}
+        self._patterns: WeakKeyDictionary[Pattern, tuple[Any, ...]] = WeakKeyDictionary()
 
     @staticmethod
     def _library() -> Any:
@@ -133,20 +137,18 @@ class CudaBackend(Backend):
                 packer.add(*self._cast("cast_table", len(part), given), start, self._mesh.scale)
             return packer.returns()
 
-    def scan(
-        self,
-        pattern: Pattern,
-        window: tuple[int, int],
-        origin: NDArray[np.float64],
-        rotation: NDArray[np.float64] | None,
-        interval: tuple[float, float],
-    ) -> Returns:
-        """See `Backend.scan`; the rays are made on the device."""
-        with self._on_device(window[1] - window[0]):
+    def scan(self, scan: Scan) -> ScanReturns:
+        """See `Backend.scan`; the rays are made on the device, hits are chosen on the host."""
+        with self._on_device(len(scan)):
             packer = self._packer()
-            for start, n, rays in self._turned(pattern, window, origin, rotation, interval):
+            for start, n, rays in self._made(scan):
                 packer.add(*self._cast("cast_pattern", n, rays), start, self._mesh.scale)
-            return packer.returns()
+            found = packer.returns()
+        collector = Collector(scan, self._mesh.face_count)
+        collector.tally(found.triangle)
+        kept = collector.keep(found.ray, 0, len(scan))
+        collector.add(Returns(found.ray[kept], found.distance[kept], found.triangle[kept]))
+        return collector.result()
 
     def count(self, rays: Rays, every: bool) -> NDArray[np.int64]:
         """See `Backend.count`; only the counts leave the device."""
@@ -155,23 +157,7 @@ class CudaBackend(Backend):
             for start in range(0, len(rays), self.chunk):
                 part = rays.part(start, start + self.chunk)
                 given = self._limited(self._table(part), part)
-                self._tally("table", len(part), given, every, counts)
-            return self._cupy.asnumpy(counts)
-
-    def count_scan(
-        self,
-        pattern: Pattern,
-        window: tuple[int, int],
-        origin: NDArray[np.float64],
-        rotation: NDArray[np.float64] | None,
-        interval: tuple[float, float],
-        every: bool,
-    ) -> NDArray[np.int64]:
-        """See `Backend.count_scan`; the rays are made on the device."""
-        with self._on_device(window[1] - window[0]):
-            counts = self._cupy.zeros(self._mesh.face_count, np.int64)
-            for _, n, rays in self._turned(pattern, window, origin, rotation, interval):
-                self._tally("pattern", n, rays, every, counts)
+                self._tally(len(part), given, every, counts)
             return self._cupy.asnumpy(counts)
 
     # ---- arguments of the kernels ----
@@ -184,33 +170,39 @@ class CudaBackend(Backend):
         limits = (np.float64(t * self._mesh.scale) for t in (rays.t_min, rays.t_max))
         return (*table, np.int64(len(rays)), *limits)
 
-    def _turned(
-        self,
-        pattern: Pattern,
-        window: tuple[int, int],
-        origin: NDArray[np.float64],
-        rotation: NDArray[np.float64] | None,
-        interval: tuple[float, float],
-    ) -> Iterator[tuple[int, int, tuple[Any, ...]]]:
-        """Chunks of a pattern: number of the first ray, how many, and arguments for them."""
-        cp = self._cupy
-        directions = self._directions(pattern)[slice(*window)]
-        turn = np.eye(3) if rotation is None else rotation
-        pose = cp.asarray(np.concatenate([origin.ravel(), turn.ravel()]))
-        limits = [np.float64(t * self._mesh.scale) for t in interval]
-        for start in range(0, len(directions), self.chunk):
-            part = cp.asarray(directions[start : start + self.chunk])
-            n = len(part)
-            yield start, n, (pose, np.int32(rotation is not None), part, np.int64(n), *limits)
+    def _made(self, scan: Scan) -> Iterator[tuple[int, int, tuple[Any, ...]]]:
+        """Chunks of a scan: number of the first ray, how many, and arguments for cast_pattern."""
+        cp, poses, unused = self._cupy, scan.poses, np.zeros(1)
+        limits = [np.float64(t * self._mesh.scale) for t in (scan.t_min, scan.t_max)]
+        shifted, turned = scan.pattern.origins is not None, poses.rotations is not None
+        resident = self._resident(scan.pattern)
+        for start, stop in scan.chunks(self.chunk):
+            n = stop - start
+            tables, rows, first = resident, len(scan.pattern), (scan.first + start)
+            if tables is None:
+                row = (first + np.arange(n)) % rows
+                tables = tuple(cp.asarray(t.take(row, axis=1)) for t in _tables(scan.pattern))
+                rows, first = n, 0
+            pose, skip = divmod(start, poses.rays)
+            span = slice(pose, -(-stop // poses.rays))
+            matrices = unused if poses.rotations is None else poses.rotations[span]
+            places = [
+                cp.asarray(np.ascontiguousarray(a)) for a in (poses.positions[span], matrices)
+            ]
+            counts = (min(number, _MOST_INT) for number in (poses.rays - skip, poses.rays))
+            flags = (np.int32(flag) for flag in (*counts, turned, shifted))
+            given = (*places, tables[0], tables[-1], np.int64(rows), np.int64(first % rows))
+            yield start, n, (*given, *flags, np.int64(n), *limits)
 
-    def _directions(self, pattern: Pattern) -> Any:
-        """Directions of a pattern: on the device, if there is room for all of them."""
+    def _resident(self, pattern: Pattern) -> tuple[Any, ...] | None:
+        """Directions and origins of a pattern on the device, if there is room for all of them."""
         cupy, kept = self._cupy, self._patterns.get(pattern)
         if kept is None:
-            if pattern.directions.nbytes + self._keep + WORK > free(cupy):
-                return pattern.directions
+            tables = _tables(pattern)
+            if sum(table.nbytes for table in tables) + self._keep + WORK > free(cupy):
+                return None
             # Two threads may both come here: then the second copy is kept, and both are right.
-            kept = self._patterns[pattern] = sent(cupy, pattern.directions)
+            kept = self._patterns[pattern] = tuple(sent(cupy, table) for table in tables)
         return kept
 
     # ---- casts ----
@@ -224,13 +216,19 @@ class CudaBackend(Backend):
         self._kernels.run(kernel, n, *self._scene, *rays, t, place)
         return t, place
 
-    def _tally(self, kind: str, n: int, rays: tuple[Any, ...], every: bool, counts: Any) -> None:
+    def _tally(self, n: int, rays: tuple[Any, ...], every: bool, counts: Any) -> None:
         """Add to the counts of a chunk's triangles."""
         if every:
-            self._kernels.run(f"count_{kind}", n, *self._scene, *rays, counts)
+            self._kernels.run("count_table", n, *self._scene, *rays, counts)
             return
-        _, place = self._cast(f"cast_{kind}", n, rays)
+        _, place = self._cast("cast_table", n, rays)
         self._kernels.run("count_closest", n, self._faces, place, np.int64(n), counts)
+
+
+def _tables(pattern: Pattern) -> tuple[NDArray[np.float64], ...]:
+    """Directions of a pattern and its origins, if it has any: (3, n) each, one row an axis."""
+    given = (pattern.directions, pattern.origins)
+    return tuple(table.T for table in given if table is not None)
 
 
 def flags(stack: int) -> tuple[str, ...]:

@@ -12,15 +12,17 @@ from numpy.typing import NDArray
 
 from .backend import Backend, Found
 from .clip import clip
-from .hits import Returns
-from .memory import Meter, require
+from .collector import Collector
+from .hits import Returns, ScanReturns
+from .memory import require
 from .mesh import LocalMesh
-from .rays import Pattern, Rays
+from .rays import Rays
 from .refine import Refiner
+from .scan import Scan
 from .tree import PAD
-from .workspace import Workspace
+from .workspace import Starts, Workspace
 
-_MISS = 0xFFFFFFFF
+Float = NDArray[np.float64]
 
 # Embree decides in float32, and may find again what refinement put just before the start. So the
 # start moves on, in local units: a little for most surfaces, and for those that a ray grazes, along
@@ -31,7 +33,11 @@ _STARTS = (0.0, *(4.0**k * 2**-20 for k in range(6)))
 # then float32 rounds by the scene's size, not by the way to it.
 _NEAR = 2.0
 
-_PAIR_BYTES = 24  # a hit in _Pairs
+# Local units. A rough distance, in float32, that is farther than this from the limits decides by
+# itself whether the hit counts, so that only hits which are kept have to be refined. It is off by
+# more only where the cosine between ray and normal is below some 1e-4; then a refined distance
+# beyond a limit is not believed.
+_CLEAR = 2.0**-8
 
 # A triangle, at the peak of a build, the mesh apart: some 110 of them are Embree's own, which
 # Open3D 0.20 was seen to take.
@@ -39,16 +45,51 @@ _BYTES = 300
 
 
 @dataclass(frozen=True)
-class _Pairs:
-    """Hits: number of the ray, local distance, row of the mesh's corners; (k,) each."""
+class _Limits:
+    """Limits of distances, in local units.
+
+    The rough ones are numbers of float32, so that one in float32 and one in float64 compare alike.
+    """
+
+    t_min: float
+    t_max: float
+
+    @property
+    def near(self) -> float:
+        """A rough distance behind this is not before `t_min`."""
+        return _rounded(self.t_min + _CLEAR)
+
+    @property
+    def far(self) -> float:
+        """A rough distance before this is not behind `t_max`."""
+        return _rounded(self.t_max - _CLEAR)
+
+    @property
+    def last(self) -> float:
+        """A rough distance behind this is behind `t_max`."""
+        return _rounded(self.t_max + _CLEAR)
+
+
+@dataclass(frozen=True)
+class _Hits:
+    """Closest hits of a chunk of n rays.
+
+    Attributes
+    ----------
+    ray
+        (k,): numbers of the rays whose hits count, ascending.
+    t
+        (n,): local distance of each ray's hit; of a ray that is not listed, anything.
+    place
+        uint32 (n,): row of the mesh's corners; likewise.
+    refined
+        (n,): whether the distance is refined; None if all are rough.
+    """
 
     ray: NDArray[np.intp]
-    t: NDArray[np.float64]
-    place: NDArray[np.intp]
-
-    def only(self, rows: NDArray[Any]) -> _Pairs:
-        """Return some of the hits."""
-        return _Pairs(self.ray[rows], self.t[rows], self.place[rows])
+    t: NDArray[np.floating[Any]]
+    place: NDArray[np.uint32]
+    refined: NDArray[np.bool_] | None
 
 
 class EmbreeBackend(Backend):
@@ -99,36 +140,35 @@ class EmbreeBackend(Backend):
 
     def closest(self, rays: Rays, weights: bool) -> Found:
         """See `Backend.closest`."""
-        origins, scale = self._mesh.to_local(rays.origins), self._mesh.scale
-        hits = self._within(rays.directions, None, origins, rays.t_min * scale, rays.t_max * scale)
-        u = v = np.zeros(0)
+        u = v = none = np.zeros(0)
+        if self._scene is None or not len(rays):
+            return Found(none.astype(np.intp), none, none.astype(np.int32), u, v)
+        desk, limits = self._desk(len(rays)), self._limits(rays.t_min, rays.t_max)
+        unit, starts = desk.aim(rays.directions), Starts(self._mesh.to_local(rays.origins))
+        hits = self._within(desk, unit, starts, limits)
+        t, place = self._distance(hits, hits.ray, unit, starts, limits)
         if weights:
-            at = _of(origins, hits.ray)
-            u, v = self._refine.weights(at, rays.directions[hits.ray], hits.place)
-        return Found(hits.ray, hits.t, self._mesh.index[hits.place], u, v)
+            at = starts.of(hits.ray)
+            u, v = self._refine.weights(at, rays.directions[hits.ray], place)
+        return Found(hits.ray, t, self._mesh.index[place], u, v)
 
-    def scan(
-        self,
-        pattern: Pattern,
-        window: tuple[int, int],
-        origin: NDArray[np.float64],
-        rotation: NDArray[np.float64] | None,
-        interval: tuple[float, float],
-    ) -> Returns:
-        """See `Backend.scan`; rays are turned where Embree reads them, a chunk at a time."""
-        origins, scale = self._mesh.to_local(origin), self._mesh.scale
-        t_min, t_max = interval[0] * scale, interval[1] * scale
-        first, last = window
-        parts, meter = [], Meter("Joining the hits", "scan a smaller window at a time")
-        for start in range(first, max(last, first + 1), self.chunk):
-            directions = pattern.directions[start : min(start + self.chunk, last)]
-            hits = self._within(directions, rotation, origins, t_min, t_max)
-            np.add(hits.ray, start - first, out=hits.ray)
-            parts.append(hits)
-            meter.add(_PAIR_BYTES * len(hits.ray))
-        hits = _joined(parts)
-        np.divide(hits.t, scale, out=hits.t)
-        return Returns(hits.ray.astype(np.uint32), hits.t, self._mesh.index.take(hits.place))
+    def scan(self, scan: Scan) -> ScanReturns:
+        """See `Backend.scan`; rays are made where Embree reads them, a chunk at a time."""
+        collector = Collector(scan, self._mesh.face_count)
+        limits = self._limits(scan.t_min, scan.t_max)
+        for start, stop in scan.chunks(self.chunk) if self._scene is not None else ():
+            desk = self._desk(stop - start)
+            unit, starts = desk.make(scan, start, stop, self._mesh)
+            hits = self._within(desk, unit, starts, limits)
+            if scan.tally:
+                collector.tally(self._mesh.index.take(hits.place.take(hits.ray)))
+            kept = hits.ray[collector.keep(hits.ray, start, stop)]
+            t, place = self._distance(hits, kept, unit, starts, limits)
+            t /= self._mesh.scale
+            ray = kept.astype(np.uint32)
+            ray += np.uint32(start)
+            collector.add(Returns(ray, t, self._mesh.index.take(place)))
+        return collector.result()
 
     def along(self, rays: Rays) -> NDArray[np.int32]:
         """See `Backend.along`; of triangles at one distance Open3D lists one."""
@@ -149,84 +189,123 @@ class EmbreeBackend(Backend):
         found: NDArray[np.int32] = self._mesh.index[place[hit]]
         return found
 
-    def _within(
-        self,
-        directions: NDArray[np.float64],
-        rotation: NDArray[np.float64] | None,
-        origins: NDArray[np.float64],
-        t_min: float,
-        t_max: float,
-    ) -> _Pairs:
-        """Closest hits between two distances of rays whose directions are yet to be turned."""
-        if self._scene is None or not len(directions):
-            return _Pairs(np.zeros(0, np.intp), np.zeros(0), np.zeros(0, np.intp))
-        desk = self._desk(len(directions))
-        unit = desk.turn(directions, rotation)
-        hits = self._cast(desk, unit, origins, 0.0)
-        early = hits.t < t_min
-        if early.any():  # a refined distance may be just below 0 as well
-            hits = self._beyond(desk, hits, early, unit, origins, t_min)
-        return hits.only(hits.t <= t_max) if t_max < np.inf else hits
+    def _limits(self, t_min: float, t_max: float) -> _Limits:
+        return _Limits(t_min * self._mesh.scale, t_max * self._mesh.scale)
 
-    def _beyond(
-        self,
-        desk: Workspace,
-        hits: _Pairs,
-        early: NDArray[np.bool_],
-        unit: NDArray[np.float64],
-        origins: NDArray[np.float64],
-        t_min: float,
-    ) -> _Pairs:
-        """Replace hits before `t_min` by the next ones behind it."""
-        parts = [hits.only(~early)]
-        ray = hits.ray[early]
-        directions = unit[:, ray].T  # a copy: the workspace is about to be used again
-        for ahead in _STARTS:
-            turned = desk.turn(directions, None)
-            again = self._cast(desk, turned, _of(origins, ray), t_min + ahead)
-            parts.append(_Pairs(ray[again.ray], again.t, again.place).only(again.t >= t_min))
-            left = again.ray[again.t < t_min]
-            ray, directions = ray[left], directions[left]
-            if not len(ray):
-                break
-        joined = _joined(parts)
-        return joined.only(np.argsort(joined.ray))
-
-    def _cast(
-        self,
-        desk: Workspace,
-        unit: NDArray[np.float64],
-        origins: NDArray[np.float64],
-        start: float,
-    ) -> _Pairs:
-        """Closest hits at or behind `start`, up to float32 rounding; lengths are local.
+    def _within(self, desk: Workspace, unit: Float, starts: Starts, limits: _Limits) -> _Hits:
+        """Closest hits, refined where that decides whether they count; see `_CLEAR`.
 
         Parameters
         ----------
         desk
             Its rows hold the directions already.
         unit
-            (3, n): the same directions in float64.
-        origins
-            (n, 3) or (1, 3).
-        start
-            Distance along the rays.
+            (3, n): the same directions in float64; they stay as they are.
+        starts
+            Of the rays.
+        limits
+            Between which hits count.
         """
-        begin, starts = np.zeros(1), origins
-        near = np.abs(origins).max(axis=1) <= _NEAR
-        if start > 0 or not near.all():
-            entry, _ = clip(self._low, self._high, origins, unit.T)
-            begin = np.maximum(np.where(near, 0, entry), start)
+        t, place = self._cast(desk, unit, starts, 0.0)
+        counts = t < np.inf if limits.last == np.inf else t <= limits.last
+        unclear = t < limits.near
+        if limits.far < np.inf:
+            unclear |= t > limits.far
+            unclear &= counts
+        ray = np.flatnonzero(unclear)
+        if not len(ray):
+            return _Hits(np.flatnonzero(counts), t, place, None)
+        exact = self._refined(ray, t[ray], place[ray], unit, starts)
+        t = t.astype(np.float64)
+        t[ray] = exact
+        early = exact < limits.t_min  # a refined distance may be just below 0 as well
+        counts[ray] = ~early & (exact <= limits.t_max)
+        if early.any():
+            again, t[again], place[again] = self._beyond(desk, ray[early], unit, starts, limits)
+            counts[again] = t[again] <= limits.t_max
+        return _Hits(np.flatnonzero(counts), t, place, unclear)
+
+    def _beyond(
+        self,
+        desk: Workspace,
+        ray: NDArray[np.intp],
+        unit: Float,
+        starts: Starts,
+        limits: _Limits,
+    ) -> tuple[NDArray[np.intp], Float, NDArray[np.uint32]]:
+        """Find the next hits, behind `t_min`, of rays that hit something before.
+
+        Returns
+        -------
+        Numbers of the rays that have one, in any order; refined distances; places.
+        """
+        rays, distances, places = [], [], []
+        for ahead in _STARTS:
+            directions, at = _columns_of(unit, ray), Starts(starts.of(ray))
+            desk.write(directions)
+            rough, place = self._cast(desk, directions, at, limits.t_min + ahead)
+            hit = np.flatnonzero(rough < np.inf)
+            t = self._refined(hit, rough[hit], place[hit], directions, at)
+            good = t >= limits.t_min
+            rays.append(ray[hit[good]])
+            distances.append(t[good])
+            places.append(place[hit[good]])
+            ray = ray[hit[t < limits.t_min]]
+            if not len(ray):
+                break
+        return np.concatenate(rays), np.concatenate(distances), np.concatenate(places)
+
+    def _cast(
+        self, desk: Workspace, unit: Float, starts: Starts, begin: float
+    ) -> tuple[NDArray[np.floating[Any]], NDArray[np.uint32]]:
+        """Closest hits at or behind a distance `begin`, up to float32 rounding; see `_within`.
+
+        Returns
+        -------
+        t
+            (n,): rough distances, local; inf for a miss.
+        place
+            uint32 (n,): rows of the mesh's corners.
+        """
+        n = unit.shape[1]
+        ways: Float | None = None
+        if begin > 0 or np.abs(starts.points).max() > _NEAR:
+            points = starts.of(np.arange(n))
+            entry, _ = clip(self._low, self._high, points, unit.T)
+            near = np.abs(points).max(axis=1) <= _NEAR
+            ways = np.maximum(np.where(near, 0, entry), begin)
             # From so far away that float64 cannot place the start, it stays near the scene.
-            starts = np.clip(origins + begin[:, None] * unit.T, -_NEAR, _NEAR)
-        rows = desk.start(unit.shape[1], starts)
+            starts = Starts(np.clip(points + ways[:, None] * unit.T, -_NEAR, _NEAR))
+        rows = desk.start(n, starts)
         answer = self._scene.cast_rays(self._tensor(rows), nthreads=self._threads)
-        face = answer["primitive_ids"].numpy()
-        ray = np.flatnonzero(face != _MISS)
-        place = face.take(ray).astype(np.intp)
-        rough = answer["t_hit"].numpy().take(ray) + _of(begin, ray)
-        t = self._refine.distance(_of(origins, ray), unit.take(ray, axis=1), place, rough)
-        return _Pairs(ray, t, place)
+        t: NDArray[np.floating[Any]] = answer["t_hit"].numpy()
+        return t if ways is None else t + ways, answer["primitive_ids"].numpy()
+
+    def _refined(
+        self,
+        ray: NDArray[np.intp],
+        rough: NDArray[np.floating[Any]],
+        place: NDArray[np.uint32],
+        unit: Float,
+        starts: Starts,
+    ) -> Float:
+        """Distances of some rays in float64 accuracy; `rough` and `place` are theirs."""
+        directions = _columns_of(unit, ray)
+        return self._refine.distance(starts.of(ray), directions, place.astype(np.intp), rough)
+
+    def _distance(
+        self, hits: _Hits, ray: NDArray[np.intp], unit: Float, starts: Starts, limits: _Limits
+    ) -> tuple[Float, NDArray[np.intp]]:
+        """Refined distances of some hits that count, and their places."""
+        rough, place = hits.t.take(ray), hits.place.take(ray)
+        if hits.refined is None:
+            t = self._refined(ray, rough, place, unit, starts)
+        else:
+            t, rows = rough.astype(np.float64), np.flatnonzero(~hits.refined.take(ray))
+            t[rows] = self._refined(ray[rows], rough[rows], place[rows], unit, starts)
+        beyond = np.flatnonzero((t < limits.t_min) | (t > limits.t_max))
+        t[beyond] = rough[beyond]
+        return t, place.astype(np.intp)
 
     def _desk(self, rays: int) -> Workspace:
         """Workspace of this thread, for that many rays at least."""
@@ -236,16 +315,20 @@ class EmbreeBackend(Backend):
         return kept
 
 
-def _joined(parts: list[_Pairs]) -> _Pairs:
-    if len(parts) == 1:
-        return parts[0]
-    return _Pairs(
-        np.concatenate([part.ray for part in parts]),
-        np.concatenate([part.t for part in parts]),
-        np.concatenate([part.place for part in parts]),
-    )
+def _columns_of(unit: Float, ray: NDArray[np.intp]) -> Float:
+    """Take columns of (3, n); faster than `take` along the axis, which copies all of them first."""
+    out = np.empty((3, len(ray)))
+    for row, axis in zip(unit, out, strict=True):
+        row.take(ray, out=axis, mode="clip")  # the mode in which it writes straight to `out`
+    return out
 
 
-def _of(values: NDArray[np.float64], rows: NDArray[np.intp]) -> NDArray[np.float64]:
+def _rounded(t: float) -> float:
+    """Return a number of float32 near a distance; inf stays inf."""
+    with np.errstate(over="ignore"):
+        return float(np.float32(t))
+
+
+def _of(values: Float, rows: NDArray[np.intp]) -> Float:
     """Rows of what is either one for all or one a ray."""
     return values if len(values) == 1 else values.take(rows, axis=0)

@@ -67,6 +67,35 @@ class Returns:
         return len(self.ray)
 
 
+@dataclass(frozen=True)
+class ScanReturns:
+    """What a scan found: the hits that are kept of it, in ray order, and counts of all hits.
+
+    Attributes
+    ----------
+    ray
+        uint32 (k,): number of the ray, ascending, from 0 at the window's start.
+    distance
+        float64 (k,): as in `Hits`, metres.
+    triangle
+        int32 (k,): as in `Hits`.
+    hits
+        int64 (g,): number of hits of each group, kept or not.
+    tally
+        int64 (face_count,): how many of all hits, kept or not, each triangle got; None if it
+        was not asked for.
+    """
+
+    ray: NDArray[np.uint32]
+    distance: NDArray[np.float64]
+    triangle: NDArray[np.int32]
+    hits: NDArray[np.int64]
+    tally: NDArray[np.int64] | None
+
+    def __len__(self) -> int:
+        return len(self.ray)
+
+
 class Gathering:
     """Hits found part after part, to be joined when all are there."""
 

@@ -100,22 +100,56 @@ struct TableRays {
     }
 };
 
-// Directions of a pattern, turned by a pose: origin (3), rotation (9, by rows).
+// Rays of a pattern of `rows` rays, each turned and moved by the pose that it belongs to. Ray i is
+// row (first + i) modulo rows. The first pose has `left` rays, each of the others `each`.
 struct PatternRays {
-    const double* pose;
-    const double* directions;
-    int turned;
+    const double* positions;   // 3 a pose
+    const double* rotations;   // 9 a pose, by rows; not read where `turned` is 0
+    const double* directions;  // all x, then all y, then all z
+    const double* origins;     // the same; not read where `shifted` is 0
+    Count rows, first;
+    int left, each;
+    int turned, shifted;
+
+    __device__ __forceinline__ static void turn(
+        const double* r, double x, double y, double z, double& a, double& b, double& c)
+    {
+        a = (x * r[0] + y * r[1]) + z * r[2];
+        b = (x * r[3] + y * r[4]) + z * r[5];
+        c = (x * r[6] + y * r[7]) + z * r[8];
+    }
 
     __device__ __forceinline__ Ray load(const Scene& scene, Count i) const
     {
-        Ray ray;
-        place_origin(scene, pose, ray);
-        const double x = directions[3 * i], y = directions[3 * i + 1], z = directions[3 * i + 2];
-        const double* r = pose + 3;
-        ray.dx = turned ? (x * r[0] + y * r[1]) + z * r[2] : x;
-        ray.dy = turned ? (x * r[3] + y * r[4]) + z * r[5] : y;
-        ray.dz = turned ? (x * r[6] + y * r[7]) + z * r[8] : z;
-        return ray;
+        Count row = first + i;
+        // A chunk's rays fit an int, see above. So does what is left after a turn, if that is more
+        // than a turn.
+        if (row >= rows) row -= rows;
+        if (row >= rows) row = (unsigned)row % (unsigned)rows;
+        const int ray = (int)i;
+        const unsigned pose = ray < left ? 0u : 1u + (unsigned)(ray - left) / (unsigned)each;
+        const double* r = rotations + 9 * (Count)pose;
+        Ray out;
+        const double x = directions[row], y = directions[rows + row];
+        const double z = directions[2 * rows + row];
+        out.dx = x;
+        out.dy = y;
+        out.dz = z;
+        if (turned) turn(r, x, y, z, out.dx, out.dy, out.dz);
+        double at[3];
+        for (int axis = 0; axis < 3; ++axis) at[axis] = positions[3 * (Count)pose + axis];
+        if (shifted) {
+            double u = origins[row], v = origins[rows + row], w = origins[2 * rows + row];
+            if (turned) {
+                const double a = u, b = v, c = w;
+                turn(r, a, b, c, u, v, w);
+            }
+            at[0] = u + at[0];
+            at[1] = v + at[1];
+            at[2] = w + at[2];
+        }
+        place_origin(scene, at, out);
+        return out;
     }
 };
 
@@ -487,19 +521,22 @@ extern "C" __global__ void BOUNDS cast_table(
     if (best.place >= 0) distance[i] = best.t;
 }
 
-// Closest hits of a pattern from one pose; the rest as in cast_table.
+// Closest hits of a pattern's rays from one pose after another; the rest as in cast_table.
 extern "C" __global__ void BOUNDS cast_pattern(
     const float4* __restrict__ nodes, const float4* __restrict__ triangles,
     const double* __restrict__ corners, const int* __restrict__ faces,
     const double* __restrict__ frame,
-    const double* __restrict__ pose, int turned,
-    const double* __restrict__ directions, Count count, double t_min, double t_max,
+    const double* __restrict__ positions, const double* __restrict__ rotations,
+    const double* __restrict__ directions, const double* __restrict__ origins,
+    Count rows, Count first, int left, int each, int turned, int shifted,
+    Count count, double t_min, double t_max,
     double* __restrict__ distance, int* __restrict__ place)
 {
     const Count i = blockIdx.x * (Count)blockDim.x + threadIdx.x;
     if (i >= count) return;
     const Scene scene = {nodes, triangles, corners, faces, frame};
-    const PatternRays rays = {pose, directions, turned};
+    const PatternRays rays = {positions, rotations, directions, origins, rows,
+                              first,     left,      each,       turned,  shifted};
     Closest best(t_max);
     walk(scene, rays, i, t_min, t_max, best);
     place[i] = best.place;
@@ -537,23 +574,6 @@ extern "C" __global__ void BOUNDS count_table(
     if (i >= count) return;
     const Scene scene = {nodes, triangles, corners, faces, frame};
     const TableRays rays = {origins, origin_stride, directions};
-    Tally tally = {t_max, counts};
-    walk(scene, rays, i, t_min, t_max, tally);
-}
-
-// Count every triangle along the rays of a pattern.
-extern "C" __global__ void BOUNDS count_pattern(
-    const float4* __restrict__ nodes, const float4* __restrict__ triangles,
-    const double* __restrict__ corners, const int* __restrict__ faces,
-    const double* __restrict__ frame,
-    const double* __restrict__ pose, int turned,
-    const double* __restrict__ directions, Count count, double t_min, double t_max,
-    Sum* __restrict__ counts)
-{
-    const Count i = blockIdx.x * (Count)blockDim.x + threadIdx.x;
-    if (i >= count) return;
-    const Scene scene = {nodes, triangles, corners, faces, frame};
-    const PatternRays rays = {pose, directions, turned};
     Tally tally = {t_max, counts};
     walk(scene, rays, i, t_min, t_max, tally);
 }

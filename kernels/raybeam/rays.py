@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from operator import index
 from typing import Any
 
 import numpy as np
@@ -56,59 +55,6 @@ class Rays:
         return Rays(_float64(origins), _normalised(directions), self.t_min, self.t_max)
 
 
-class Pattern:
-    """Directions that are cast many times, for example one revolution of a lidar.
-
-    They are checked and normalised once; a backend may keep its own copy where it computes.
-
-    Parameters
-    ----------
-    directions
-        (n, 3), any length but zero, in the sensor's axes.
-
-    Raises
-    ------
-    ValueError
-        For a wrong shape, or a direction that is zero or not finite.
-    MemoryError
-        If there is no room for them.
-    """
-
-    def __init__(self, directions: ArrayLike) -> None:
-        self.directions = unit_directions(directions)
-        self.directions.flags.writeable = False
-
-    def __len__(self) -> int:
-        return len(self.directions)
-
-    def __repr__(self) -> str:
-        return f"Pattern({len(self)} directions)"
-
-    def window(self, start: int, stop: int) -> tuple[int, int]:
-        """Check a half-open range of rows; raises ValueError when it is not one."""
-        if not 0 <= start <= stop <= len(self):
-            raise ValueError(
-                f"Rows {start} to {stop} are not within the pattern's {len(self)} directions."
-            )
-        return start, stop
-
-
-def check_window(pattern: object, window: tuple[int, int] | None) -> tuple[int, int]:
-    """Rows of a pattern, all for None; raises TypeError or ValueError for what is not that."""
-    if not isinstance(pattern, Pattern):
-        raise TypeError(
-            f"pattern must be a raybeam.Pattern, not {type(pattern).__name__}: "
-            "make one of the directions, once, by Pattern(directions)."
-        )
-    try:
-        start, stop = (0, len(pattern)) if window is None else map(index, window)
-    except (TypeError, ValueError) as error:
-        raise TypeError(
-            f"window must be two row numbers, (start, stop), or None for all, not {window!r}."
-        ) from error
-    return pattern.window(start, stop)
-
-
 def check_rays(origins: ArrayLike, directions: ArrayLike, t_min: float, t_max: float) -> Rays:
     """Rays as they were given; raises ValueError for those that are none.
 
@@ -121,20 +67,20 @@ def check_rays(origins: ArrayLike, directions: ArrayLike, t_min: float, t_max: f
     t_min, t_max
         Metres, ``0 <= t_min <= t_max``.
     """
-    table = _table("directions", directions)
+    table = real_rows("directions", directions)
     _refuse_directions(table)
     return Rays(check_origins(origins, len(table)), table, *check_interval(t_min, t_max))
 
 
 def check_origins(origins: ArrayLike, rays: int) -> NDArray[Any]:
     """Origins (n, 3) as given, or one (1, 3) in float64; raises ValueError for what is neither."""
-    start = _table("origins", origins)
+    start = real_rows("origins", origins)
     if len(start) not in (1, rays):
         raise ValueError(
             f"There are {len(start)} origins and {rays} directions: "
             "give one origin for all rays, or one for each."
         )
-    _refuse("Origin", start, _finite, "finite coordinates")
+    refuse_rows("Origin", start, finite_rows, "finite coordinates")
     return _float64(start) if len(start) == 1 else start
 
 
@@ -161,14 +107,15 @@ def check_interval(t_min: float, t_max: float) -> tuple[float, float]:
 def unit_directions(directions: ArrayLike) -> NDArray[np.float64]:
     """Directions as new float64 unit vectors (n, 3); raises ValueError for zero, NaN and inf.
 
+    Their memory is in columns, so that the transposed array is contiguous, one row an axis.
     Each row's result depends on that row alone, so that batches may be cut anywhere. Raises
     MemoryError when there is no room for them.
     """
-    table = _table("directions", directions)
+    table = real_rows("directions", directions)
     _refuse_directions(table)
     need = 24 * len(table)
     require(need, f"A pattern of {len(table):,} directions", "cast it in several patterns")
-    out = np.empty((len(table), 3))
+    out = np.empty((3, len(table))).T
     for start in range(0, len(table), _BLOCK):
         out[start : start + _BLOCK] = _normalised(_float64(table[start : start + _BLOCK]))
     return out
@@ -208,23 +155,7 @@ def rotated(
     return out
 
 
-def check_rotation(rotation: ArrayLike | None) -> NDArray[np.float64] | None:
-    """Return a rotation matrix in float64; raises ValueError when it is not orthonormal."""
-    if rotation is None:
-        return None
-    given = as_array("rotation", rotation)
-    right = given.shape == (3, 3) and given.dtype.kind in "fiu"
-    matrix = given.astype(np.float64) if right else np.zeros((3, 3))
-    # Not np.allclose, which takes longer than casting a thousand rays; NaN compares as false.
-    if not np.abs(matrix @ matrix.T - np.eye(3)).max() <= 2e-9:
-        raise ValueError(
-            "rotation must be a (3, 3) matrix with orthonormal rows (sensor to scene axes), "
-            f"not {given.tolist()}."
-        )
-    return matrix
-
-
-def _table(name: str, values: ArrayLike) -> NDArray[Any]:
+def real_rows(name: str, values: ArrayLike) -> NDArray[Any]:
     """Real numbers (n, 3), copied only if they are no array; a single (3,) becomes one row."""
     given = as_array(name, values)
     if given.dtype.kind not in "fiu":
@@ -240,13 +171,14 @@ def _float64(table: NDArray[Any]) -> NDArray[np.float64]:
     return np.ascontiguousarray(table, dtype=np.float64)
 
 
-def _finite(block: NDArray[np.float64]) -> NDArray[np.bool_]:
+def finite_rows(block: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which rows (n, 3) have finite numbers only: (n,)."""
     x, y, z = np.isfinite(block).T
     return x & y & z
 
 
 def _has_length(block: NDArray[np.float64]) -> NDArray[np.bool_]:
-    return _finite(block) & block.any(axis=1)
+    return finite_rows(block) & block.any(axis=1)
 
 
 def _refuse_directions(table: NDArray[Any]) -> None:
@@ -255,10 +187,10 @@ def _refuse_directions(table: NDArray[Any]) -> None:
             f"{len(table):,} directions are more than the {MOST_RAYS:,} that one call can number: "
             "give them in parts."
         )
-    _refuse("Direction", table, _has_length, "a finite vector that is not zero")
+    refuse_rows("Direction", table, _has_length, "a finite vector that is not zero")
 
 
-def _refuse(
+def refuse_rows(
     what: str,
     table: NDArray[Any],
     good: Callable[[NDArray[np.float64]], NDArray[np.bool_]],

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,7 +28,11 @@ class Refiner:
         self._planes = np.column_stack([normal, (normal * first).sum(axis=1)])
 
     def distance(
-        self, origins: Float, directions: Float, place: NDArray[np.intp], rough: Float
+        self,
+        origins: Float,
+        directions: Float,
+        place: NDArray[np.intp],
+        rough: NDArray[np.floating[Any]],
     ) -> Float:
         """Distances at which rays meet given triangles.
 
@@ -67,7 +73,11 @@ class Refiner:
         return parts[1], parts[2]
 
     def _grazing(
-        self, origins: Float, directions: Float, place: NDArray[np.intp], rough: Float
+        self,
+        origins: Float,
+        directions: Float,
+        place: NDArray[np.intp],
+        rough: NDArray[np.floating[Any]],
     ) -> Float:
         a, b, c, det, t = self._exact(origins, directions, place)
         return np.where(exact.inside(a, b, c, det), t, rough)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from raybeam import Pattern, RayCaster, rays
+from raybeam import RayCaster, rays
 from raybeam import triangle as exact
 from raybeam.mesh import local_mesh
 
@@ -81,21 +81,6 @@ def test_copies_are_all_counted(exact_caster):
 
 
 @pytest.mark.parametrize("every", [False, True])
-@pytest.mark.parametrize("turned", [False, True])
-def test_pattern(caster, shapes, every, turned):
-    vertices, faces = shapes["terrain box"](20)
-    directions = np.random.default_rng(3).normal(size=(3000, 3))
-    turn = np.linalg.qr(np.random.default_rng(4).normal(size=(3, 3)))[0] if turned else None
-    engine, pattern = caster(vertices, faces), Pattern(directions)
-    origin = [0.1, -0.2, 0.5]
-    got = engine.count_scan(pattern, origin, turn, window=(100, 2900), t_max=1.5, every=every)
-    used = rays.rotated(pattern.directions[100:2900], turn)
-    want = engine.count(origin, used, 0.0, 1.5, every=every)
-    np.testing.assert_array_equal(got, want)
-    assert got.sum() > 1000
-
-
-@pytest.mark.parametrize("every", [False, True])
 def test_nothing_to_count(caster, shapes, every):
     vertices, faces = shapes["cube"]()
     engine = caster(vertices, faces)
@@ -103,7 +88,6 @@ def test_nothing_to_count(caster, shapes, every):
     none = engine.count([5, 5, 5], np.zeros((0, 3)), every=every)
     np.testing.assert_array_equal(away, np.zeros(12, np.int64))
     np.testing.assert_array_equal(none, away)
-    assert engine.count_scan(Pattern([[1, 0, 0]]), [0, 0, 0], window=(0, 0)).sum() == 0
     flat = caster(np.zeros((3, 3)), [[0, 1, 2]])
     assert flat.count([0, 0, 1], [[0, 0, -1]], every=every).tolist() == [0]
 
@@ -121,5 +105,3 @@ def test_bad_arguments():
     engine = RayCaster([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], "numpy")
     with pytest.raises(ValueError, match="Direction 0"):
         engine.count([0, 0, 1], [[0, 0, 0]])
-    with pytest.raises(ValueError, match="not within the pattern"):
-        engine.count_scan(Pattern([[0, 0, 1]]), [0, 0, 0], window=(0, 2))

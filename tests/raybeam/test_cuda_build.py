@@ -11,6 +11,7 @@ import pytest
 from raybeam import Pattern, RayCaster, cuda_build, cuda_scene, ploc
 from raybeam.layout import lay_out
 from raybeam.mesh import local_mesh
+from raybeam.scan import check_scan
 
 pytest.importorskip("hypothesis")
 from hypothesis import HealthCheck, given, settings
@@ -168,7 +169,7 @@ def test_arrays_are_kept_until_the_device_has_read_them(source_backend, shapes, 
     monkeypatch.setattr(cuda, "get_current_stream", lambda: stream)
     monkeypatch.setattr(source_backend, "device_build", least)
     engine = source_backend(mesh)
-    engine.scan(Pattern(np.eye(3)), (0, 3), np.zeros((1, 3)), None, (0.0, np.inf))
+    engine.scan(check_scan(Pattern(np.eye(3)), [0, 0, 0]))
     assert len(read) > 1
     assert all(read)
     assert not unread

@@ -10,6 +10,7 @@ import pytest
 from raybeam import Pattern, cuda_scene
 from raybeam.cuda_results import PinnedRoom
 from raybeam.mesh import local_mesh
+from raybeam.scan import check_scan
 
 
 class Locked:
@@ -122,11 +123,11 @@ def test_hits_stay_in_ray_order(source_backend, shapes, monkeypatch, limit, chun
     """However often hits are fetched, and in however many casts they were found."""
     engine = source_backend(local_mesh(*shapes["soup"]("random")))
     pattern = Pattern(np.random.default_rng(0).normal(size=(600, 3)))
-    given = (pattern, (50, 550), np.array([[1.0, 2.0, 3.0]]), None, (0.0, np.inf))
-    want = engine.scan(*given)
+    scan = check_scan(pattern, [1.0, 2.0, 3.0], window=(50, 550))
+    want = engine.scan(scan)
     engine._keep = limit
     monkeypatch.setattr(source_backend, "chunk", chunk)
-    got = engine.scan(*given)
+    got = engine.scan(scan)
     assert len(got) > 50
     assert (np.diff(got.ray) > 0).all()
     for name in ("ray", "distance", "triangle"):
@@ -137,16 +138,17 @@ def test_hits_stay_in_ray_order(source_backend, shapes, monkeypatch, limit, chun
 
 def test_pattern_that_does_not_fit_goes_chunk_by_chunk(source_backend, shapes, monkeypatch):
     engine = source_backend(local_mesh(*shapes["vase"]()))
-    pattern = Pattern(np.random.default_rng(0).normal(size=(3000, 3)))
-    given = ((5, 2990), np.array([[0.05, 0.1, 0.4]]), None, (0.0, np.inf))
+    directions = np.random.default_rng(0).normal(size=(3000, 3))
+    pattern = Pattern(directions, 0.01 * directions[::-1])
+    scan = check_scan(pattern, [0.05, 0.1, 0.4], window=(5, 4990))
     runtime = source_backend._library().cuda.runtime
     room = cuda_scene.WORK + engine._keep
     monkeypatch.setattr(source_backend, "chunk", 500)
     with monkeypatch.context() as patch:
-        patch.setattr(runtime, "memGetInfo", lambda: (room + 3000 * 24 - 1, 1 << 35))
-        got = engine.scan(pattern, *given)
+        patch.setattr(runtime, "memGetInfo", lambda: (room + 3000 * 48 - 1, 1 << 35))
+        got = engine.scan(scan)
         assert pattern not in engine._patterns
-    want = engine.scan(pattern, *given)
+    want = engine.scan(scan)
     assert pattern in engine._patterns
     assert len(got) > 2000
     np.testing.assert_array_equal(got.ray, want.ray)

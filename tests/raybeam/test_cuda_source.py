@@ -61,7 +61,7 @@ def test_compiles_without_spills(nvcc, tmp_path, card, file):
     for name, (stack, stores, loads, registers) in kernels.items():
         assert (stores, loads) == (0, 0), name
         # The nodes that wait and nothing else: what has to be looked up is not kept there.
-        walks = name.startswith(("cast_", "count_table", "count_pattern"))
+        walks = name.startswith(("cast_", "count_table"))
         assert stack == (8 * 64 if walks else 0), name
         most = next(most for start, most in REGISTERS.items() if name.startswith(start))
         assert registers <= most, name

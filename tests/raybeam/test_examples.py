@@ -8,7 +8,9 @@ import importlib
 import pytest
 
 
-@pytest.mark.parametrize("name", ["caster", "memory", "registry"])
+@pytest.mark.parametrize(
+    "name", ["caster", "collector", "memory", "pattern", "registry", "workspace"]
+)
 def test_examples(name):
     done = doctest.testmod(importlib.import_module(f"raybeam.{name}"))
     assert done.attempted > 0

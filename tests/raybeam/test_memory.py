@@ -23,6 +23,7 @@ from raybeam.cuda_results import Packer, PinnedRoom
 from raybeam.layout import lay_out
 from raybeam.numpy_backend import NumpyBackend
 from raybeam.rays import Rays
+from raybeam.scan import check_scan
 
 MANY = 2**31 + 5
 
@@ -156,12 +157,12 @@ def test_device_that_is_full_when_casting(source_backend, shapes, monkeypatch):
         raise library.cuda.memory.OutOfMemoryError("CuPy's own words")
 
     rays = Rays(np.zeros((1, 3)), np.eye(3), 0.0, np.inf)
-    scan = (Pattern(np.eye(3)), (0, 3), np.zeros((1, 3)), None, (0.0, np.inf))
+    scan = check_scan(Pattern(np.eye(3)), [0, 0, 0])
     monkeypatch.setattr(library, "empty", refuse)
     monkeypatch.setattr(library, "zeros", refuse)
     calls = (
-        lambda: engine.cast(rays), lambda: engine.returns(rays), lambda: engine.scan(*scan),
-        lambda: engine.count(rays, True), lambda: engine.count_scan(*scan, True),
+        lambda: engine.cast(rays), lambda: engine.returns(rays), lambda: engine.scan(scan),
+        lambda: engine.count(rays, True),
     )  # fmt: skip
     for call in calls:
         with pytest.raises(

@@ -1,0 +1,168 @@
+"""Rays in a sensor's axes, cast from one pose after another."""
+
+from __future__ import annotations
+
+from operator import index
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .given import as_array
+from .memory import require
+from .poses import Poses, check_poses
+from .rays import check_origins, unit_directions
+
+
+class Pattern:
+    """Rays that are cast many times, for example one revolution of a lidar.
+
+    They are checked and normalised once; a backend may keep its own copy where it computes.
+
+    Parameters
+    ----------
+    directions
+        (n, 3), any length but zero, in the sensor's axes.
+    origins
+        (n, 3), metres, in the sensor's axes: where each ray starts, as seen from the sensor's
+        position; (3,) for all rays; None when all start at that position.
+
+    Raises
+    ------
+    ValueError
+        For a wrong shape, or a direction that is zero or not finite, or an origin that is not
+        finite.
+    MemoryError
+        If there is no room for them.
+
+    Examples
+    --------
+    >>> pattern = Pattern([[2, 0, 0], [0, 1, 0]], origins=[[0.1, 0, 0], [0, 0.1, 0]])
+    >>> origins, directions = pattern.rays([0, 1, 2], positions=[0, 0, 5])
+    >>> origins.tolist()
+    [[0.1, 0.0, 5.0], [0.0, 0.1, 5.0], [0.1, 0.0, 5.0]]
+    >>> directions.tolist()
+    [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]
+    """
+
+    def __init__(self, directions: ArrayLike, origins: ArrayLike | None = None) -> None:
+        self._directions = unit_directions(directions).T
+        self._directions.flags.writeable = False
+        self._origins: NDArray[np.float64] | None = None
+        if origins is not None:
+            table = check_origins(origins, len(self))
+            require(24 * len(self), f"A pattern of {len(self):,} origins", "use several patterns")
+            self._origins = np.empty((3, len(self)))
+            self._origins[...] = table.T
+            self._origins.flags.writeable = False
+
+    def __len__(self) -> int:
+        return self._directions.shape[1]
+
+    def __repr__(self) -> str:
+        return f"Pattern({len(self)} directions{'' if self._origins is None else ', origins'})"
+
+    @property
+    def directions(self) -> NDArray[np.float64]:
+        """Unit vectors (n, 3), read-only; transposed, they are contiguous."""
+        return self._directions.T
+
+    @property
+    def origins(self) -> NDArray[np.float64] | None:
+        """Where rays start (n, 3), metres, read-only and contiguous as `directions`; or None."""
+        return None if self._origins is None else self._origins.T
+
+    def rays(
+        self,
+        numbers: ArrayLike,
+        positions: ArrayLike,
+        rotations: ArrayLike | None = None,
+        *,
+        start: int = 0,
+        rays_per_pose: int | None = None,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Origins and directions, in the mesh's axes, of some of the rays that a scan casts.
+
+        They have the bits of those that `RayCaster.scan` casts, in whatever batch they are asked
+        for.
+
+        Parameters
+        ----------
+        numbers
+            (m,) whole numbers: rays as `ScanReturns` numbers them, from 0 at the window's start.
+        positions, rotations, rays_per_pose
+            Those given to `RayCaster.scan`.
+        start
+            Start of the window.
+
+        Returns
+        -------
+        origins
+            float64 (m, 3), or (1, 3) when all are the same, metres.
+        directions
+            float64 (m, 3), unit vectors.
+
+        Raises
+        ------
+        ValueError
+            If the poses are none, or a ray has no pose or no row in the pattern.
+        TypeError
+            If numbers are not whole.
+        """
+        ray = as_array("numbers", numbers)
+        if ray.dtype.kind not in "iu" and ray.size:
+            raise TypeError(f"numbers of rays must be whole, not {ray.dtype}.")
+        if ray.ndim != 1:
+            raise ValueError(f"numbers of rays must have the shape (m,), not {ray.shape}.")
+        ray = ray.astype(np.int64)
+        most = int(ray.max()) + 1 if len(ray) else 0
+        first = index(start)
+        if first < 0 or (len(ray) and (int(ray.min()) < 0 or not len(self))):
+            raise ValueError(
+                f"There are no rays {ray.min() if len(ray) else 0} to {most} after row {start} of "
+                f"a pattern with {len(self)} rows: numbers and rows start at 0."
+            )
+        return self.made(first, ray, check_poses(positions, rotations, rays_per_pose, most))
+
+    def made(
+        self, first: int, ray: NDArray[np.int64], poses: Poses
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Make checked rays; see `rays`, of which `first` is the start.
+
+        What is in the mesh's axes is rotated, then moved: ``((x a + y b) + z c) + p``.
+        """
+        row = (first + ray) % max(len(self), 1)
+        pose = ray // poses.rays
+        directions = poses.turned(self._directions.take(row, axis=1), pose)
+        at = poses.positions if len(poses) == 1 else poses.positions.take(pose, axis=0)
+        if self._origins is None:
+            return at, directions
+        return poses.turned(self._origins.take(row, axis=1), pose) + at, directions
+
+
+def check_pattern(pattern: object) -> Pattern:
+    """Return it; raises TypeError if it is no pattern."""
+    if not isinstance(pattern, Pattern):
+        raise TypeError(
+            f"pattern must be a raybeam.Pattern, not {type(pattern).__name__}: "
+            "make one of the directions, once, by Pattern(directions)."
+        )
+    return pattern
+
+
+def check_window(pattern: Pattern, window: Any) -> tuple[int, int]:
+    """Half-open range of rows, the whole pattern for None; it may go past the pattern's end.
+
+    Raises TypeError or ValueError for what is not that.
+    """
+    try:
+        start, stop = (0, len(pattern)) if window is None else map(index, window)
+    except (TypeError, ValueError) as error:
+        raise TypeError(
+            f"window must be two row numbers, (start, stop), or None for all, not {window!r}."
+        ) from error
+    if not 0 <= start <= stop:
+        raise ValueError(f"Rows {start} to {stop} are no window: expected 0 <= start <= stop.")
+    if stop > start and not len(pattern):
+        raise ValueError(f"Rows {start} to {stop} cannot be cast: the pattern has none.")
+    return start, stop

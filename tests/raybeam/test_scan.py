@@ -1,0 +1,383 @@
+"""Scans against rays that are made one by one and cast: many poses, windows, thinning, counts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from raybeam import Pattern, RayCaster, workspace
+from raybeam.collector import Collector
+from raybeam.rays import unit_directions
+from raybeam.scan import check_scan
+
+TRIANGLE = [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]
+
+
+def rotations(count, seed=0):
+    return np.linalg.qr(np.random.default_rng(seed).normal(size=(count, 3, 3)))[0]
+
+
+def made(case, window):
+    """Origins and directions of a scan's rays, ray by ray as the interface tells it."""
+    directions, origins = unit_directions(case["directions"]), case["origins"]
+    at, to = [], []
+    for number in range(window[1] - window[0]):
+        row = (window[0] + number) % len(directions)
+        pose = number // case["each"] if len(case["positions"]) > 1 else 0
+        d = directions[row]
+        o = None if origins is None else origins[row]
+        if case["rotations"] is not None:
+            turn = case["rotations"][pose]
+            d, o = (
+                v if v is None else [(v[0] * r[0] + v[1] * r[1]) + v[2] * r[2] for r in turn]
+                for v in (d, o)
+            )
+        place = case["positions"][pose]
+        at.append(place if o is None else np.array(o) + place)
+        to.append(d)
+    return np.array(at).reshape(-1, 3), np.array(to).reshape(-1, 3)
+
+
+# {name: (poses, rays of a pose, turned, lever arms)}
+CASES = {
+    "one pose": (1, None, True, False),
+    "one pose, not turned": (1, None, False, False),
+    "one pose, lever arms": (1, None, True, True),
+    "a pose each ray": (2500, 1, True, False),
+    "firings": (60, 40, True, False),
+    "firings, not turned": (60, 40, False, False),
+    "firings, lever arms": (60, 40, True, True),
+    "firings, lever arms, not turned": (60, 40, False, True),
+    "long poses": (3, 900, True, False),
+}
+
+
+def case_of(name, scale=1.0):
+    count, each, turned, shifted = CASES[name]
+    rng = np.random.default_rng(len(name))
+    return {
+        "directions": rng.normal(size=(1000, 3)),
+        "origins": 0.1 * rng.normal(size=(1000, 3)) if shifted else None,
+        "positions": scale * np.array([0.3, -0.2, 0.1]) + 0.2 * rng.normal(size=(count, 3)),
+        "rotations": rotations(count) if turned else None,
+        "each": each,
+    }
+
+
+def scanned(caster, case, window, **more):
+    pattern = Pattern(case["directions"], case["origins"])
+    return caster.scan(
+        pattern, case["positions"], case["rotations"],
+        window=window, rays_per_pose=case["each"], **more,
+    )  # fmt: skip
+
+
+def same(got, want):
+    for name in ("ray", "triangle", "distance"):
+        mine, other = getattr(got, name), getattr(want, name)
+        assert mine.dtype == other.dtype
+        np.testing.assert_array_equal(mine, other, err_msg=name)
+
+
+WINDOWS = [(0, 1000), (0, 2400), (937, 1003), (2999, 5000), (123, 123)]
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("scale", [1.0, 3e3], ids=["near", "far"])
+def test_rays_are_those_of_the_interface(caster, shapes, name, scale):
+    """Windows that go past the pattern's end, with and without limits; the rays themselves."""
+    vase, case = caster(*shapes["vase"]()), case_of(name, scale)
+    if scale > 1:  # aim at the mesh
+        aim = case["directions"] - case["positions"][0]
+        if case["rotations"] is not None:
+            case["rotations"][:] = case["rotations"][0]
+            aim = aim @ case["rotations"][0]
+        case["directions"] = aim
+    pattern = Pattern(case["directions"], case["origins"])
+    limits = (0.5, 1.5) if scale == 1 else (np.linalg.norm(case["positions"][0]), np.inf)
+    for window in WINDOWS:
+        origins, directions = made(case, window)
+        for t_min, t_max in ((0.0, np.inf), limits):
+            want = vase.returns(origins, directions, t_min, t_max)
+            got = scanned(vase, case, window, t_min=t_min, t_max=t_max)
+            same(got, want)
+            assert got.hits.tolist() == [len(want)]
+            assert got.tally is None
+            assert len(want) > len(origins) / 10 or not len(origins)
+        some = np.random.default_rng(1).integers(0, max(len(origins), 1), 50)[: len(origins)]
+        pose = {"start": window[0], "rays_per_pose": case["each"]}
+        at, to = pattern.rays(some, case["positions"], case["rotations"], **pose)
+        np.testing.assert_array_equal(np.broadcast_to(at, to.shape), origins[some])
+        np.testing.assert_array_equal(to, directions[some])
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_scans_may_be_cut_anywhere(caster, shapes, name, monkeypatch):
+    case = case_of(name)
+    whole = scanned(caster(*shapes["vase"]()), case, (700, 2700), t_min=0.5, t_max=2)
+    assert len(whole) > 400
+    for chunk, block in ((97, 1 << 14), (1000, 64), (1 << 17, 100)):
+        vase = caster(*shapes["vase"]())
+        monkeypatch.setattr(type(vase._engine), "chunk", chunk)
+        monkeypatch.setattr(workspace, "_BLOCK", block)
+        same(scanned(vase, case, (700, 2700), t_min=0.5, t_max=2), whole)
+
+
+def test_many_poses_are_as_one_after_another(caster, shapes):
+    vase, case = caster(*shapes["vase"]()), case_of("firings, lever arms")
+    pattern = Pattern(case["directions"], case["origins"])
+    got = scanned(vase, case, (500, 2900), t_min=0.3)
+    rays, distances = [], []
+    for pose in range(60):
+        start = 500 + 40 * pose
+        given = pattern, case["positions"][pose], case["rotations"][pose]
+        one = vase.scan(*given, window=(start, start + 40), t_min=0.3)
+        rays.append(one.ray + np.uint32(40 * pose))
+        distances.append(one.distance)
+    np.testing.assert_array_equal(got.ray, np.concatenate(rays))
+    np.testing.assert_array_equal(got.distance, np.concatenate(distances))
+
+
+def test_positions_and_rotations_may_be_one_for_all(caster, shapes):
+    vase, case = caster(*shapes["vase"]()), case_of("firings")
+    pattern, place, turn = Pattern(case["directions"]), case["positions"], case["rotations"]
+    for positions, turns in ((place, turn[3]), (place[3], turn), (place[3:4], turn)):
+        got = vase.scan(pattern, positions, turns, window=(0, 2400), rays_per_pose=40)
+        full = np.broadcast_to(positions, (60, 3)), np.broadcast_to(turns, (60, 3, 3))
+        same(got, vase.scan(pattern, *full, window=(0, 2400), rays_per_pose=40))
+
+
+def test_pattern_shorter_than_a_chunk(caster, shapes):
+    """A pattern of one firing, over and over."""
+    vase, case = caster(*shapes["vase"]()), case_of("firings, lever arms")
+    case["directions"], case["origins"] = case["directions"][:7], case["origins"][:7]
+    got = scanned(vase, case, (5, 2100))
+    assert len(got) > 1000
+    same(got, vase.returns(*made(case, (5, 2100))))
+
+
+# ---- thinning and counts ----
+
+GROUPS = [[0], [0, 1000, 2000], [0, 0, 13, 13, 14, 1999, 2390, 2400], [0, 2400]]
+
+
+def thinned(want, groups, every, rays):
+    """Hits of each group, and rows of those to keep, group by group."""
+    hits, keep = [], []
+    for begin, end in zip(groups, [*groups[1:], rays], strict=True):
+        rows = np.flatnonzero((want.ray >= begin) & (want.ray < end))
+        hits.append(len(rows))
+        keep.extend(rows[::every])
+    return hits, keep
+
+
+@pytest.mark.parametrize("name", ["one pose", "firings, lever arms"])
+@pytest.mark.parametrize(
+    "limits",
+    [(0, np.inf), (0.5, np.inf), (0, 1.5), (0.8, 1.2), (1, 1.0001), (50, 60)],
+    ids=str,
+)
+def test_thinning_keeps_what_the_whole_has(caster, shapes, name, limits, monkeypatch):
+    vase, case = caster(*shapes["vase"]()), case_of(name)
+    given = {"window": (300, 2700), "t_min": limits[0], "t_max": limits[1]}
+    whole = scanned(vase, case, **given)
+    want_tally = np.bincount(whole.triangle, minlength=vase.face_count)
+    for chunk in (type(vase._engine).chunk, 111):
+        monkeypatch.setattr(type(vase._engine), "chunk", chunk)
+        for every in (1, 2, 5, 10_000):
+            for groups in GROUPS:
+                more = {"keep_every": every, "groups": groups, "tally": True}
+                got = scanned(vase, case, **given, **more)
+                hits, keep = thinned(whole, groups, every, 2400)
+                assert got.hits.tolist() == hits
+                np.testing.assert_array_equal(got.ray, whole.ray[keep])
+                np.testing.assert_array_equal(got.distance, whole.distance[keep])
+                np.testing.assert_array_equal(got.triangle, whole.triangle[keep])
+                np.testing.assert_array_equal(got.tally, want_tally)
+                assert got.hits.dtype == got.tally.dtype == np.int64
+
+
+def test_thinning_where_rays_graze(caster):
+    """A plane met at all angles, limits within it: rough distances are worst there."""
+    plane = np.array([[-50.0, -50, 0], [50, -50, 0], [50, 50, 0], [-50, 50, 0]])
+    floor = caster(plane, [[0, 1, 2], [0, 2, 3]])
+    rng = np.random.default_rng(3)
+    slope = -(10.0 ** rng.uniform(-7, 0, 20_000))
+    angle = rng.uniform(0, 2 * np.pi, 20_000)
+    pattern = Pattern(np.column_stack([np.cos(angle), np.sin(angle), slope]))
+    for height in (1e-5, 1e-3, 1.0):
+        for limits in ((0.0, np.inf), (2.0, 30.0), (0.0, 10.0)):
+            given = {"t_min": limits[0], "t_max": limits[1]}
+            whole = floor.scan(pattern, [0.1, 0.2, height], **given)
+            assert len(whole) > 100
+            assert whole.distance.min() >= limits[0]
+            assert whole.distance.max() <= limits[1]
+            got = floor.scan(pattern, [0.1, 0.2, height], keep_every=3, **given)
+            assert got.hits.tolist() == [len(whole)]
+            np.testing.assert_array_equal(got.ray, whole.ray[::3])
+            np.testing.assert_array_equal(got.distance, whole.distance[::3])
+
+
+def test_nothing_to_scan(caster, shapes):
+    vase = caster(*shapes["vase"]())
+    for pattern in (Pattern(np.empty((0, 3))), Pattern(np.eye(3))):
+        found = vase.scan(pattern, [0, 0, 1], window=(0, 0), keep_every=3, groups=[0, 0])
+        assert len(found) == 0
+        assert found.hits.tolist() == [0, 0]
+    away = vase.scan(Pattern([[0, 0, 1]] * 5), [0, 0, 50], keep_every=2, tally=True)
+    assert (len(away), away.hits.tolist(), away.tally.sum()) == (0, [0], 0)
+    flat = caster(np.zeros((3, 3)), [[0, 1, 2]])
+    found = flat.scan(Pattern([[0, 0, -1]] * 5), [0, 0, 1], groups=[0, 2], tally=True)
+    assert (found.hits.tolist(), found.tally.tolist()) == ([0, 0], [0])
+
+
+def test_groups_are_counted_across_chunks():
+    groups = [0, 4, 4, 9]
+    scan = check_scan(Pattern(np.eye(3)), [0, 0, 0], window=(0, 12), keep_every=2, groups=groups)
+    ray = np.array([0, 1, 2, 3, 5, 6, 7, 8, 9, 11])
+    for cut in range(1, 13):
+        collector, kept = Collector(scan, 1), []
+        for start in range(0, 12, cut):
+            part = ray[(ray >= start) & (ray < start + cut)]
+            kept.extend(part[collector.keep(part - start, start, min(start + cut, 12))].tolist())
+        assert kept == [0, 2, 5, 7, 9]
+        assert collector.result().hits.tolist() == [4, 0, 4, 2]
+
+
+# ---- what is refused ----
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"window": (2, 1)}, "Rows 2 to 1 are no window: expected 0 <= start <= stop"),
+        ({"window": (-1, 2)}, "Rows -1 to 2"),
+        ({"window": (5, 2**32 + 6)}, "4,294,967,297 rays are more than the 4,294,967,296 that"),
+        ({"rotations": 2 * np.eye(3)}, r"Rotation 0 is .*orthonormal.*1 of 1"),
+        ({"rotations": [np.eye(3), np.eye(3)[::-1] * 1.1]}, r"Rotation 1 is .*orthonormal.*1 of 2"),
+        ({"rotations": np.eye(2)}, r"orthonormal matrices of shape .*, not float64 \(2, 2\)"),
+        ({"rotations": np.full((3, 3), np.nan)}, "orthonormal"),
+        ({"rotations": np.full((3, 3), 1e200)}, "orthonormal"),
+        ({"rotations": np.eye(3) * 1j}, "orthonormal.*complex"),
+        ({"rotations": "level"}, "orthonormal"),
+        ({"rotations": np.zeros((0, 3, 3))}, "There are no rotations"),
+        ({"rotations": [[1, 0, 0], [0, 1], [0, 0, 1]]}, "rotations must be an array or rows"),
+        ({"positions": [0, 0, np.nan]}, "Position 0 is .*nan"),
+        ({"positions": [[0, 0, 0], [0, np.inf, 1]]}, "Position 1 is .*inf"),
+        ({"positions": np.zeros((0, 3))}, "There are no positions"),
+        ({"positions": np.zeros((2, 2))}, r"positions must have the shape \(n, 3\)"),
+        ({"positions": np.zeros((2, 3))}, "There are 2 poses: rays_per_pose must say"),
+        ({"rotations": rotations(2)}, "There are 2 poses: rays_per_pose must say"),
+        (
+            {"positions": np.zeros((2, 3)), "rotations": rotations(3), "rays_per_pose": 1},
+            "2 positions and 3 rotations",
+        ),
+        (
+            {"positions": np.zeros((2, 3)), "rays_per_pose": 1},
+            "2 poses of 1 rays are not enough for 3 rays",
+        ),
+        ({"rays_per_pose": 2}, "1 poses of 2 rays are not enough for 3 rays"),
+        ({"rays_per_pose": 0}, "1 poses of 0 rays"),
+        ({"t_min": 2, "t_max": 1}, "t_min is 2.0 and t_max 1.0"),
+        ({"keep_every": 0}, "keep_every is 0: it must be at least 1"),
+        ({"groups": [1, 2]}, "groups begin at rays 1 to 2: expected numbers that ascend from 0"),
+        ({"groups": [0, 2, 1]}, "groups begin at rays 0 to 1"),
+        ({"groups": [0, 4]}, "groups begin at rays 0 to 4: .* the window's 3 rays"),
+        ({"groups": []}, "groups must be numbers of the rays at which groups begin"),
+        ({"groups": [0.0]}, r"groups must be .*, not float64 \(1,\)"),
+        ({"groups": [[0]]}, r"groups must be .*, not int64 \(1, 1\)"),
+    ],
+)
+def test_scan_refused(change, words):
+    caster = RayCaster(*TRIANGLE, "numpy")
+    with pytest.raises(ValueError, match=words):
+        caster.scan(Pattern(np.eye(3)), **{"positions": [0, 0, 0], **change})
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        *(
+            ({"window": window}, r"window must be two row numbers, \(start, stop\), or")
+            for window in ((0, 1.0), (0, 1, 2), 1, slice(0, 1))
+        ),
+        ({"rays_per_pose": 1.5}, "rays_per_pose must be a whole number, or None, not 1.5"),
+        ({"keep_every": 1.0}, "keep_every must be a whole number, not 1.0"),
+        ({"t_min": None}, "t_min and t_max must be numbers"),
+    ],
+    ids=str,
+)
+def test_what_is_of_a_wrong_type(change, words):
+    caster = RayCaster(*TRIANGLE, "numpy")
+    with pytest.raises(TypeError, match=words):
+        caster.scan(Pattern(np.eye(3)), [0, 0, 0], **change)
+
+
+def test_window_of_numpy_integers():
+    caster = RayCaster(*TRIANGLE, "numpy")
+    pattern = Pattern([[0, 0, 1], [0, 0, -1], [0, 1, 0]])
+    hits = caster.scan(pattern, [0.2, 0.2, 1], window=np.array([1, 3]))
+    assert hits.ray.tolist() == [0]
+
+
+def test_window_of_an_empty_pattern():
+    caster = RayCaster(*TRIANGLE, "numpy")
+    with pytest.raises(ValueError, match="Rows 0 to 2 cannot be cast: the pattern has none"):
+        caster.scan(Pattern(np.empty((0, 3))), [0, 0, 0], window=(0, 2))
+
+
+def test_directions_that_are_no_pattern():
+    caster = RayCaster(*TRIANGLE, "numpy")
+    with pytest.raises(TypeError, match=r"pattern must be .*, not list: make one .* by Pattern"):
+        caster.scan([[0, 0, -1]], [0.2, 0.2, 1])
+
+
+# ---- the pattern itself ----
+
+
+def test_more_rays_than_can_be_numbered_are_refused():
+    many = np.broadcast_to([0.0, 0.0, 1.0], (2**32 + 1, 3))  # takes no memory
+    with pytest.raises(ValueError, match=r"4,294,967,297 directions are more than the 4,294,967,2"):
+        Pattern(many)
+
+
+def test_pattern_refused():
+    with pytest.raises(ValueError, match="Direction 2 is"):
+        Pattern([[0, 0, 1], [0, 1, 0], [0, 0, 0]])
+    with pytest.raises(ValueError, match=r"Origin 1 is .*nan"):
+        Pattern(np.eye(3), [[0, 0, 0], [0, np.nan, 0], [0, 0, 0]])
+    with pytest.raises(ValueError, match="2 origins and 3 directions"):
+        Pattern(np.eye(3), np.zeros((2, 3)))
+    for table in ("directions", "origins"):
+        with pytest.raises(ValueError, match="read-only"):
+            getattr(Pattern(np.eye(3), np.eye(3)), table)[0] = 1
+
+
+def test_pattern_is_what_was_given():
+    pattern = Pattern(2 * np.eye(3), [1, 2, 3])
+    np.testing.assert_array_equal(pattern.directions, np.eye(3))
+    np.testing.assert_array_equal(pattern.origins, np.tile([1, 2, 3], (3, 1)))
+    assert repr(pattern) == "Pattern(3 directions, origins)"
+    assert repr(Pattern(np.eye(3))) == "Pattern(3 directions)"
+    assert Pattern(np.eye(3)).origins is None
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "words"),
+    [
+        ({"numbers": [0.5]}, TypeError, "numbers of rays must be whole, not float64"),
+        ({"numbers": [[1]]}, ValueError, r"numbers of rays must have the shape \(m,\), not \(1, 1"),
+        ({"numbers": [3, -1]}, ValueError, "There are no rays -1 to 4 after row 0"),
+        ({"start": -1}, ValueError, "There are no rays 0 to 2 after row -1"),
+        ({"positions": np.zeros((2, 3))}, ValueError, "There are 2 poses: rays_per_pose"),
+        ({"numbers": [4], "rays_per_pose": 4}, ValueError, "not enough for 5 rays"),
+    ],
+)
+def test_rays_refused(change, error, words):
+    with pytest.raises(error, match=words):
+        Pattern(np.eye(3)).rays(**{"numbers": [0, 1], "positions": [0, 0, 0], **change})
+
+
+def test_no_rays_of_a_pattern():
+    origins, directions = Pattern(np.eye(3)).rays([], [1, 2, 3])
+    assert (origins.tolist(), directions.shape) == ([[1, 2, 3]], (0, 3))
