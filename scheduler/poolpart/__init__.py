@@ -1,17 +1,10 @@
-"""Pool partitions, pipes and a delivery ledger for Dask clusters."""
+"""Pool partitions and pipes for Dask clusters."""
 
-from .asking import ask_workers
-from .awaiting import await_news
-from .backoff import Backoff
-from .claims import Claim, claim_slots, drop_claim
-from .current_client import own_client
-from .departure import WorkerLeft, telling_departure
+from .awaiting import Backoff, await_news, take_news
 from .devices import assign_devices, own_device
 from .errors import PipeClosed, PipeFailed, PoolError
 from .fence import lower_fence, raise_fence
-from .fetch import fetch_available
-from .identities import worker_identities
-from .ledger import Ledger
+from .fetch import fetch_available, fetch_from, hold_for_driver, take_held
 from .local import local_cluster
 from .mapping import Results
 from .page import (
@@ -21,21 +14,19 @@ from .page import (
     tell_page,
 )
 from .partition import Partition
-from .pipe import Pipe
-from .pipe_parts import forget_pipes
+from .pipe import Pipe, forget_pipes
 from .placement import Recorder, TaskRecord, placement_violations, recorded
 from .pool import Pool
+from .remote import ask_workers, worker_identities
 from .rules import Rule, n_workers, named, per_gpu, per_host, rest
-from .slots import Slots, look_at_slots
 from .stats import PartitionStats, StageStats
+from .task_context import WorkerLeft, own_client, telling_departure
+from .task_locations import Slots, TaskPlace, Whereabouts, look_at_slots, look_for_tasks
 from .tracing import trace, trace_to
-from .whereabouts import TaskPlace, Whereabouts, look_for_tasks
 from .worker_info import WorkerInfo
 
 __all__ = [
     "Backoff",
-    "Claim",
-    "Ledger",
     "Partition",
     "PartitionStats",
     "Pipe",
@@ -56,11 +47,11 @@ __all__ = [
     "ask_workers",
     "assign_devices",
     "await_news",
-    "claim_slots",
-    "drop_claim",
     "fetch_available",
+    "fetch_from",
     "forget_pipes",
     "has_partitions_page",
+    "hold_for_driver",
     "local_cluster",
     "look_at_slots",
     "look_for_tasks",
@@ -77,6 +68,8 @@ __all__ = [
     "recorded",
     "remove_partitions_page",
     "rest",
+    "take_held",
+    "take_news",
     "tell_page",
     "telling_departure",
     "trace",

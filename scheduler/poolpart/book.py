@@ -1,6 +1,6 @@
-"""Who is to be in which partition: the scheduler's book, without the scheduler.
+"""Which worker is to be in which partition: the scheduler's table, without the scheduler.
 
-The book says what should be; `settling.py` makes it so. Whatever happens to a worker in
+The book says what should be; `reconciler.py` makes it so. Whatever happens to a worker in
 between, what it should declare can be read here.
 """
 
@@ -11,7 +11,7 @@ from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 from .errors import PoolError
-from .rules import Count, Declared, Rest, Rule
+from .rules import Count, Declared, Rest, Rule, partition_for
 from .worker_info import WorkerInfo
 
 HOLD_S = 30.0  # how long a worker's place is kept while its nanny starts it again
@@ -155,6 +155,38 @@ class Book:
     def groups(self) -> Mapping[str, list[WorkerInfo]]:
         """Tell what is known of the members, by partition."""
         return {name: [seat.info for seat in self.members(name)] for name in self.rules}
+
+    def vacated(self) -> list[Seat]:
+        """Workers whose place is given up now; each is returned once.
+
+        While a nanny may be starting its worker again, the worker's place is kept, and a worker
+        that joins goes where the rules want it otherwise, mostly to the partition that has the
+        rest. Once the place is given up, it is as if that worker joined now: see `replacement`.
+        """
+        seats = [
+            seat
+            for seat in self.seats.values()
+            if seat.absent_since is not None and not seat.holds and not seat.given_up
+        ]
+        for seat in seats:
+            seat.given_up = True
+        return seats
+
+    def replacement(self, gone: Seat) -> Seat | None:
+        """Worker that has joined since another left, and would have its place if it joined now."""
+        rest = self.remainder()
+        if rest is None or gone.partition in (None, rest) or gone.absent_since is None:
+            return None
+        members = self.members(rest, present=True)
+        if len(members) <= self.rules[rest].minimum:
+            return None
+        for seat in members:
+            others = [member.info for member in self.members(rest) if member is not seat]
+            groups = {**self.groups(), rest: others}
+            late = seat.joined > gone.absent_since and seat.home is None
+            if late and partition_for(seat.info, self.rules, groups) == gone.partition:
+                return seat
+        return None
 
     def forget(self, now: float) -> None:
         """Forget workers that have been away for so long that they will not come back."""

@@ -1,7 +1,9 @@
-"""Putting workers of a running cluster into partitions: what a client asks of the scheduler."""
+"""Making partitions of the workers of a running cluster, and undoing them."""
 
 from __future__ import annotations
 
+import asyncio
+import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
@@ -9,12 +11,16 @@ from distributed import Client
 
 from .book import Seat, names_of
 from .errors import PoolError
-from .fence_plugin import enclose, lower, settle_fences
+from .fence import enclose, fences_of, lower, settle_fences
 from .inherit import begin_inheritance, end_inheritance
+from .page import close_page
+from .placing import asks_for
+from .reconciler import LOOK_EVERY_S
 from .remote import on_scheduler
 from .rules import Rule
-from .stats import statistics_of
+from .stats import forget_statistics, statistics_of
 from .steward import Steward, steward_of
+from .wording import counted
 from .worker_info import WorkerInfo
 
 PATIENCE_S = 60.0  # for a worker to answer
@@ -96,14 +102,14 @@ async def _declare(
         _check_sole(steward, name, seats[name], seen)
     _begin(steward, rules)
     for address, devices in gpus.items():
-        if devices and (seat := steward.settling.seat_at(address)):
+        if devices and (seat := steward.reconciler.seat_at(address)):
             seat.info = seat.info.with_gpus(devices)
     for name, rule in rules.items():
         steward.book.enter(name, rule)
         for seat in seats[name]:
             steward.book.put(seat, name, rule.slots_of(seat.info))
     everyone = [seat for group in seats.values() for seat in group]
-    late = await steward.settling.arrive(everyone, PATIENCE_S)
+    late = await steward.reconciler.arrive(everyone, PATIENCE_S)
     await settle_fences(steward.scheduler)
     if late or not all(seat.holds for seat in everyone):
         away = [seat for seat in everyone if seat in late or not seat.holds]
@@ -133,7 +139,7 @@ def _begin(steward: Steward, rules: Mapping[str, Rule]) -> None:
 
 
 def _seat(steward: Steward, name: str, address: str) -> Seat:
-    seat = steward.settling.seat_at(address)
+    seat = steward.reconciler.seat_at(address)
     if seat is None:
         raise PoolError(
             f"The worker at {address} could not be put into partition {name!r}: it has left. "
@@ -167,3 +173,107 @@ def _check_sole(steward: Steward, name: str, chosen: Sequence[Seat], seen: Colle
 def _declared_by(steward: Steward, seat: Seat) -> set[str]:
     """Partitions that a worker belongs to, or soon will."""
     return {name for name, slots in steward.book.wanted(seat).items() if slots}
+
+
+_RETURN_S = 10.0  # for workers to declare what they did before, at least
+_LOOK_SHARE = 20  # the scheduler does other things for so many times as long as it looks
+_UNFINISHED = ("waiting", "queued", "no-worker", "processing")
+
+
+def dissolve(client: Client, names: Collection[str] | None, timeout_s: float) -> list[str]:
+    """Undo partitions that were made while the cluster ran, all of them if None.
+
+    Parameters
+    ----------
+    client
+        Client of the cluster.
+    names
+        The partitions.
+    timeout_s
+        How long to wait for their tasks to end.
+
+    Returns
+    -------
+    list of str
+        Names of the partitions that there were.
+
+    Raises
+    ------
+    PoolError
+        If tasks of theirs have not ended; then they stay.
+    """
+    asked = None if names is None else list(names)
+    done: list[str] = ask(client, _dissolve, names=asked, timeout_s=timeout_s)
+    return done
+
+
+async def _dissolve(steward: Steward, names: list[str] | None, timeout_s: float) -> list[str]:
+    book, scheduler = steward.book, steward.scheduler
+
+    def those() -> list[str]:
+        return [name for name in book.rules if names is None or name in names]
+
+    deadline = time.monotonic() + timeout_s
+    # What the client submitted just before comes by another connection, after some milliseconds.
+    await asyncio.sleep(2 * LOOK_EVERY_S)
+    began = time.monotonic()
+    while tasks := _unfinished(scheduler, those()):
+        now = time.monotonic()
+        if now >= deadline:
+            raise PoolError(
+                f"After {timeout_s:g} s {counted(len(tasks), 'task')} of {' and '.join(those())} "
+                f"had not ended, such as {tasks[0].key}: wait or cancel, then dissolve."
+            )
+        # To look at a hundred thousand tasks takes long; they are to end meanwhile.
+        pause = max(LOOK_EVERY_S, _LOOK_SHARE * (now - began))
+        await asyncio.sleep(min(pause, deadline - now))
+        began = time.monotonic()
+    # From here to the next await nothing else happens on the scheduler; up to here somebody else
+    # may have dissolved the same partitions, or made some.
+    gone = those()
+    for name in gone:  # whoever was lent is a member of its own partition again
+        steward.rebalancing.drop_all(name)
+    seats = [seat for seat in book.seats.values() if seat.partition in gone]
+    for name in gone:
+        del book.rules[name]
+        # Here and now, whatever becomes of the client and of workers that do not answer. A
+        # fence may be there also if the rule does not say so: somebody has raised it.
+        lower(scheduler, name)
+        end_inheritance(scheduler, name)
+    if names is None:
+        for fence in fences_of(scheduler):  # raised by hand, of workers that were started so
+            lower(scheduler, fence)
+        close_page(scheduler)
+        forget_statistics(scheduler)
+    for seat in seats:
+        book.put(seat, None)
+    _lift_restrictions(scheduler, gone)
+    late = await steward.reconciler.arrive(seats, max(timeout_s, _RETURN_S))
+    for seat in seats:
+        if not seat.holds:
+            await steward.nannies.restore(seat)
+    if late:
+        raise PoolError(
+            f"{names_of(late)} did not answer while {' and '.join(gone)} were dissolved; they "
+            "become what they were when they do."
+        )
+    return gone
+
+
+def _unfinished(scheduler: Any, names: Collection[str]) -> list[Any]:
+    return [
+        task
+        for task in scheduler.tasks.values()
+        if task.state in _UNFINISHED and asks_for(task, names)
+    ]
+
+
+def _lift_restrictions(scheduler: Any, names: Collection[str]) -> None:
+    """Let results that are still held be computed again, if they are lost, on any worker.
+
+    There is none any more that could take such a task: it would wait for ever.
+    """
+    for task in scheduler.tasks.values():
+        if asks_for(task, names):
+            kept = {n: q for n, q in task.resource_restrictions.items() if n not in names}
+            task.resource_restrictions = kept or None

@@ -14,16 +14,294 @@ The fence lives on the scheduler until it is lowered, also when the client has g
 follows what the workers declare, so workers that join late, are restarted or move between
 partitions need nothing else. Tasks that no worker outside may take wait; the scheduler logs
 that, every client gets a warning, and statistics count them.
+
+A fence is a rule that is asked whenever the scheduler decides where a task goes: the methods
+that decide are overridden on the running scheduler, and nothing is written on tasks or
+workers. Two ways that need no overriding were tried, on two workers, one of them fenced:
+
+- *A resource that all workers outside declare, put on every task without one
+  (`update_graph`).* The scheduler marks each such task, workers must hold enough of the
+  resource, declare it again after a restart and take part in its accounting; and tasks that
+  were there before, or that are given `workers=`, need care of their own.
+- *`worker_restrictions` that name the workers outside, one set that all tasks share.* An
+  empty set means "no restriction", user-given restrictions must be merged and put back.
+
+Both make every task a restricted one, and Dask holds no restricted tasks back: of 200 root
+tasks all 200 were given to the open worker at once, whose memory then holds all their results,
+where without restrictions 2 are given and 198 stay in the scheduler's queue. With the rule of
+this module it is 2 and 198.
 """
 
 from __future__ import annotations
 
+import asyncio
+import logging
+import pickle
+import time
+from collections.abc import Callable, Iterable
+from itertools import islice
 from typing import Any
 
 from distributed import Client
+from distributed.core import Status
+from distributed.diagnostics.plugin import SchedulerPlugin
+from distributed.shuffle._core import barrier_key
 
-from .fence_plugin import fences_of, lower, raise_
+from .override import Overrides
+from .placing import forget_recalls, recall, recalls_under_way
 from .remote import on_scheduler
+
+logger = logging.getLogger(__name__)
+
+NAME = "poolpart-fences"
+COMPLAIN_EVERY_S = 10.0
+_LOOK_AT_MOST = 1000
+_SETTLE_S = 5.0  # longest wait for workers to give up tasks that they have not started
+
+
+def enclose(scheduler: Any, name: str) -> None:
+    """Raise a fence: from now on no task comes in.
+
+    Raises
+    ------
+    PoolError
+        If this version of Dask decides by other means.
+    """
+    fences: Fences | None = scheduler.plugins.get(NAME)
+    if fences is None:
+        fences = Fences(scheduler)
+        fences.install()
+    fences.names.add(name)
+    fences.look_again()
+
+
+async def settle_fences(scheduler: Any) -> None:
+    """Turn out what has not started behind fences, if there are any."""
+    fences: Fences | None = scheduler.plugins.get(NAME)
+    if fences is not None:
+        await fences.settle()
+
+
+def lower(scheduler: Any, name: str) -> None:
+    """Lower a fence; the last one takes the rule with it."""
+    fences: Fences | None = scheduler.plugins.get(NAME)
+    if fences is None or name not in fences.names:
+        return
+    fences.names.discard(name)
+    if not fences.names:
+        fences.uninstall()
+    fences.look_again()
+
+
+def fences_of(scheduler: Any) -> frozenset[str]:
+    """Names of the fences that are raised."""
+    fences: Fences | None = scheduler.plugins.get(NAME)
+    return frozenset(fences.names) if fences else frozenset()
+
+
+def kept_out(scheduler: Any) -> int:
+    """Count tasks that wait because only workers behind fences could take them.
+
+    Of those that no worker may take at all, the first thousand are looked at.
+    """
+    fences: Fences | None = scheduler.plugins.get(NAME)
+    if fences is None:
+        return 0
+    waiting = sum(map(fences.holds_up, islice(scheduler.unrunnable, _LOOK_AT_MOST)))
+    return waiting + (0 if fences.remainder else len(scheduler.queued))
+
+
+class Fences(SchedulerPlugin):
+    """The rule: a worker behind a fence takes tasks only that ask for the fence's resource."""
+
+    name = NAME
+
+    def __init__(self, scheduler: Any) -> None:
+        self.scheduler = scheduler
+        self.names: set[str] = set()
+        self.closed: set[Any] = set()  # states of the workers behind fences
+        self._overrides = Overrides()
+        self._complained_at = float("-inf")
+
+    # -- coming and going --------------------------------------------------------------
+
+    def install(self) -> None:
+        """Override what decides.
+
+        Raises
+        ------
+        PoolError
+            If this version of Dask decides by other means.
+        """
+        scheduler, put = self.scheduler, self._overrides.put
+        rule: dict[str, Callable[..., Any]] = {
+            "valid_workers": self._valid_workers,
+            "decide_worker_non_rootish": self._non_rootish,
+            "decide_worker_rootish_queuing_disabled": self._rootish_not_queued,
+            "add_resources": self._add_resources,
+        }
+        put(scheduler, rule)
+        if stealing := scheduler.extensions.get("stealing"):
+            put(stealing, {"_get_thief": self._get_thief})
+        if shuffle := scheduler.extensions.get("shuffle"):
+            put(shuffle, {"_calculate_worker_for": self._outputs_of_shuffle})
+        scheduler.handlers["set_resources"] = scheduler.add_resources
+        scheduler.idle_task_count = _OpenWorkers(self.closed, scheduler.idle_task_count)
+        scheduler.add_plugin(self)
+
+    def uninstall(self) -> None:
+        """Take everything back."""
+        self._overrides.take_back()
+        self.scheduler.handlers["set_resources"] = self.scheduler.add_resources
+        self.scheduler.idle_task_count = set(self.scheduler.idle_task_count)
+        forget_recalls(self.scheduler)
+        self.scheduler.remove_plugin(NAME)
+
+    # -- who is behind a fence ---------------------------------------------------------
+
+    @property
+    def remainder(self) -> set[Any]:
+        """Workers that all tasks may run on now."""
+        remainder: set[Any] = self.scheduler.running - self.closed
+        return remainder
+
+    def look_again(self) -> None:
+        """Find out which workers are behind fences."""
+        for worker in self.scheduler.workers.values():
+            self._look_at(worker)
+
+    def _look_at(self, worker: Any) -> None:
+        """Enclose a worker, or open it, by what it declares."""
+        declares = any(worker.resources.get(name) for name in self.names)
+        if declares:
+            self.closed.add(worker)
+            self.scheduler.idle_task_count.discard(worker)
+        elif worker in self.closed:
+            self.closed.discard(worker)
+            self.scheduler.check_idle_saturated(worker)
+            if worker.status is Status.running:
+                stimulus = f"{NAME}-opened-{time.time()}"
+                self.scheduler.transitions(
+                    self.scheduler.bulk_schedule_unrunnable_after_adding_worker(worker), stimulus
+                )
+                self.scheduler.stimulus_queue_slots_maybe_opened(stimulus_id=stimulus)
+
+    def _turn_out(self, worker: Any, asked: set[Any]) -> None:
+        """Ask a worker for tasks that it should not have, each once."""
+        mine = (task for task in worker.processing - asked if self.stop(task))
+        asked.update(recall(self.scheduler, worker, mine))
+
+    async def settle(self) -> None:
+        """Turn out what has not started behind fences, and wait a moment for the answers."""
+        asked: set[Any] = set()
+        deadline = time.monotonic() + _SETTLE_S
+        while time.monotonic() < deadline:
+            for worker in self.closed:
+                self._turn_out(worker, asked)
+            # Also what is just being stolen from somebody behind a fence, which is not asked for
+            # twice, or by somebody there; that is turned out then.
+            if not recalls_under_way(self.scheduler, self.closed, self.stop):
+                return
+            await asyncio.sleep(0.005)
+
+    def remove_worker(self, scheduler: Any, worker: str, **kwargs: Any) -> None:
+        """Forget a worker that has left."""
+        self.closed.intersection_update(scheduler.workers.values())
+
+    # -- the rule ----------------------------------------------------------------------
+
+    def stop(self, task: Any) -> bool:
+        """Whether fences keep a task out: it asks for none of their resources."""
+        asked = task.resource_restrictions
+        return not asked or self.names.isdisjoint(asked)
+
+    def holds_up(self, task: Any) -> bool:
+        """Whether fences are why no worker may take a task now."""
+        if not self.stop(task):
+            return False
+        # As Dask has it, without fences: what nobody could take anyhow is not our affair.
+        valid = type(self.scheduler).valid_workers(self.scheduler, task)
+        could = self.scheduler.running if valid is None else valid
+        return bool(could) and could <= self.closed
+
+    def _add_resources(self, original: Callable[..., Any], worker: str, resources: Any) -> Any:
+        answer = original(worker, resources)
+        state = self.scheduler.workers[worker]
+        self._look_at(state)
+        if state in self.closed:
+            self._turn_out(state, set())
+        return answer
+
+    def _valid_workers(self, original: Callable[..., Any], task: Any) -> Any:
+        valid = original(task)
+        if not self.stop(task):
+            return valid
+        if valid is None:
+            return self.remainder
+        allowed = valid - self.closed
+        # Restrictions that are mere wishes; without this Dask would then take any worker.
+        return allowed or (self.remainder if task.loose_restrictions else allowed)
+
+    def _non_rootish(self, original: Callable[..., Any], task: Any) -> Any:
+        worker = original(task)
+        return None if worker in self.closed and self.stop(task) else worker
+
+    def _rootish_not_queued(self, original: Callable[..., Any], task: Any) -> Any:
+        return self.scheduler.decide_worker_non_rootish(task)
+
+    def _get_thief(
+        self, original: Callable[..., Any], scheduler: Any, task: Any, *args: Any, **kwargs: Any
+    ) -> Any:
+        thief = original(scheduler, task, *args, **kwargs)
+        return None if thief in self.closed and self.stop(task) else thief
+
+    def _outputs_of_shuffle(self, original: Callable[..., Any], spec: Any) -> Any:
+        """Have a shuffle choose the workers of its outputs among those that may take them."""
+        barrier = self.scheduler.tasks[barrier_key(spec.id)]
+        given = barrier.worker_restrictions
+        allowed = self.scheduler.valid_workers(barrier)
+        try:
+            if not given and allowed:
+                barrier.worker_restrictions = {worker.address for worker in allowed}
+            return original(spec)
+        finally:
+            barrier.worker_restrictions = given
+
+    # -- never silently ----------------------------------------------------------------
+
+    def transition(self, key: Any, start: str, finish: str, *args: Any, **kwargs: Any) -> None:
+        """Say so when a task waits because of fences."""
+        if finish not in ("no-worker", "queued"):
+            return
+        # In the queue tasks wait for their turn as well.
+        if finish == "queued" and not self.scheduler.running <= self.closed:
+            return
+        now = time.monotonic()
+        task = self.scheduler.tasks[key]
+        if now - self._complained_at < COMPLAIN_EVERY_S or not self.holds_up(task):
+            return
+        self._complained_at = now
+        fences = ", ".join(sorted(self.names))
+        complaint = (
+            f"Tasks wait, such as {key!r}: all workers that could take them are kept for "
+            f"exclusive partitions ({fences}). Start more workers, submit to a partition, or "
+            "make a partition that is not exclusive."
+        )
+        logger.warning(complaint)
+        self.scheduler.log_event("warn", {"message": pickle.dumps(complaint)})
+
+
+class _OpenWorkers(set[Any]):
+    """Workers with room for tasks from the queue, without those behind fences."""
+
+    def __init__(self, closed: set[Any], workers: Iterable[Any]) -> None:
+        super().__init__(workers)
+        self.difference_update(closed)
+        self._closed = closed
+
+    def add(self, worker: Any) -> None:
+        if worker not in self._closed:
+            super().add(worker)
 
 
 def raise_fence(client: Client, name: str) -> None:
@@ -51,7 +329,8 @@ def raised_fences(client: Client) -> frozenset[str]:
 
 
 async def _raise(name: str, dask_scheduler: Any = None) -> None:
-    await raise_(dask_scheduler, name)
+    enclose(dask_scheduler, name)
+    await settle_fences(dask_scheduler)
 
 
 async def _lower(name: str, dask_scheduler: Any = None) -> None:

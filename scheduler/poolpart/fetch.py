@@ -1,16 +1,25 @@
-"""Fetching results from the workers that have them, without waiting on a dead one for long."""
+"""Fetching results and held bytes from the workers that have them, past the scheduler."""
 
 from __future__ import annotations
 
 import asyncio
 import random
+import threading
 from collections import defaultdict
-from collections.abc import Collection
-from typing import Any
+from collections.abc import Collection, Coroutine
+from typing import Any, TypeVar
 
-from distributed import Client
+from distributed import Client, get_worker
+from distributed.protocol import to_serialize
 from distributed.utils import wait_for
 from distributed.utils_comm import gather_from_workers
+
+T = TypeVar("T")
+
+_HANDLER = "poolpart_take_held"  # what a worker that holds bytes is asked by
+
+_held: dict[str, Any] = {}  # {name: bytes} of this process
+_lock = threading.Lock()
 
 
 def fetch_available(
@@ -42,21 +51,6 @@ def fetch_available(
         Results by key, possibly none.
     """
 
-    async def take(address: str, held: list[str]) -> dict[str, Any]:
-        who_has = {key: [address] for key in held}
-        taking = asyncio.ensure_future(gather_from_workers(who_has, rpc=client.rpc))
-        try:
-            # To give up one that answers would throw away what has come, and all would come again
-            # with the next call, as slowly: on a busy machine that went on for ever. And a worker
-            # keeps each message that nobody reads to its end (the error holds its own stream).
-            while not (await asyncio.wait([taking], timeout=patience_s))[0]:
-                if not await _answers(client, address, patience_s):
-                    return {}
-            data, *_ = taking.result()
-        finally:
-            taking.cancel()
-        return data
-
     async def fetch() -> dict[str, Any]:
         try:
             who_has = await wait_for(client.scheduler.who_has(keys=list(keys)), patience_s)
@@ -67,10 +61,65 @@ def fetch_available(
             if addresses:
                 # Any one of them: if it does not answer, the next call may ask another.
                 by_worker[random.choice(list(addresses))].append(key)
-        taken = await asyncio.gather(*(take(*worker) for worker in by_worker.items()))
+        taken = await asyncio.gather(
+            *(_take(client, *worker, patience_s) for worker in by_worker.items())
+        )
         return {key: result for data in taken for key, result in data.items()}
 
     return client.sync(fetch)
+
+
+def fetch_from(
+    client: Client, address: str, keys: Collection[str], patience_s: float = 2.0
+) -> dict[str, Any]:
+    """Fetch results from a worker that has them, without asking the scheduler where they are.
+
+    Parameters
+    ----------
+    client
+        A client; on a worker, the worker's own.
+    address
+        Of the worker.
+    keys
+        Keys of tasks whose results are there.
+    patience_s
+        Longest time without a sign of life of that worker, in seconds. What it sends may take
+        longer.
+
+    Returns
+    -------
+    dict
+        Results by key, without those that are not there; none if the worker is gone.
+    """
+
+    async def fetch() -> dict[str, Any]:
+        return await _take(client, address, list(keys), patience_s)
+
+    return client.sync(fetch)
+
+
+async def _take(client: Client, address: str, held: list[str], patience_s: float) -> dict[str, Any]:
+    who_has = {key: [address] for key in held}
+    taking = gather_from_workers(who_has, rpc=client.rpc)
+    data, *_ = await _unless_silent(client, address, taking, patience_s) or ({},)
+    return data
+
+
+async def _unless_silent(
+    client: Client, address: str, request: Coroutine[Any, Any, T], patience_s: float
+) -> T | None:
+    """Await a request to a worker; None if the worker gives no sign of life for so long."""
+    asking = asyncio.ensure_future(request)
+    try:
+        # To give up one that answers would throw away what has come, and all would come again
+        # with the next call, as slowly: on a busy machine that went on for ever. And a worker
+        # keeps each message that nobody reads to its end (the error holds its own stream).
+        while not (await asyncio.wait([asking], timeout=patience_s))[0]:
+            if not await _answers(client, address, patience_s):
+                return None
+        return asking.result()
+    finally:
+        asking.cancel()
 
 
 async def _answers(client: Client, address: str, patience_s: float) -> bool:
@@ -79,3 +128,52 @@ async def _answers(client: Client, address: str, patience_s: float) -> bool:
     except (TimeoutError, OSError):
         return False
     return True
+
+
+def hold_for_driver(name: str, data: Any) -> str:
+    """Keep bytes in this worker's memory until `take_held`; returns the worker's address.
+
+    Whoever calls it bounds how much is held: it stays for ever if nobody fetches it.
+    """
+    worker = get_worker()
+    with _lock:
+        _held[name] = data
+        worker.handlers.setdefault(_HANDLER, _hand_over)
+    return str(worker.address)
+
+
+def take_held(client: Client, address: str, name: str, patience_s: float = 2.0) -> Any:
+    """Fetch what a worker holds under a name, and have the worker forget it.
+
+    Parameters
+    ----------
+    client
+        A client of the cluster.
+    address
+        Address of the worker, as `hold_for_driver` returned it.
+    name
+        Name that the bytes are held under.
+    patience_s
+        Longest time without a sign of life of that worker, in seconds. What it sends may take
+        longer.
+
+    Returns
+    -------
+    bytes-like or None
+        None if they are gone: taken before, or the worker has died.
+    """
+
+    async def take() -> Any:
+        request = getattr(client.rpc(address), _HANDLER)(name=name)
+        answer = await _unless_silent(client, address, request, patience_s)
+        return answer and answer["data"]
+
+    try:
+        return client.sync(take)
+    except (OSError, ValueError, AttributeError, TypeError, KeyError):
+        return None  # the worker has died; one that was restarted knows no such question
+
+
+def _hand_over(name: str) -> dict[str, Any]:
+    data = _held.pop(name, None)
+    return {"data": None if data is None else to_serialize(memoryview(data))}

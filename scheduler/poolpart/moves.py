@@ -77,7 +77,7 @@ async def _grow(
     if source is not None:
         book.adopt(source)
     lender = source or book.remainder()
-    there = [] if source else [seat for seat in book.free() if steward.settling.settled(seat)]
+    there = [] if source else [seat for seat in book.free() if steward.reconciler.settled(seat)]
     if lender is not None and lender != name:
         members = _arrived(steward, lender)
         spare = max(0, len(members) - book.rules[lender].minimum)
@@ -121,7 +121,7 @@ async def _follow(steward: Steward, rule: Help) -> None:
 
 async def _unfollow(steward: Steward, lender: str, borrower: str, timeout_s: float) -> list[str]:
     back = steward.rebalancing.drop(lender, borrower)
-    if late := await steward.settling.arrive(back, timeout_s):
+    if late := await steward.reconciler.arrive(back, timeout_s):
         raise PoolError(
             f"{names_of(late)} not back in partition {lender!r} after {timeout_s:g} s"
             f"{_held(steward, late, [borrower])}; what is left to do there ends first."
@@ -138,7 +138,7 @@ async def _move(
         _resize(steward, seat.partition, -1)
         _resize(steward, target, 1)
         steward.book.put(seat, target)
-    late = await steward.settling.arrive(seats, timeout_s)
+    late = await steward.reconciler.arrive(seats, timeout_s)
     for seat in late:
         origin, slots, home = before[seat]
         if seat.partition != target or (origin and origin not in steward.book.rules):
@@ -149,7 +149,7 @@ async def _move(
         seat.home = home
     if late:
         leaving = [name for name, *_ in (before[seat] for seat in late) if name]
-        steward.settling.settle(late)
+        steward.reconciler.settle(late)
         raise PoolError(
             f"{len(late)} of {counted(len(seats), 'worker')} could not be moved within "
             f"{timeout_s:g} s; left in place: {names_of(late)}{_held(steward, late, leaving)}."
@@ -169,7 +169,7 @@ def _arrived(steward: Steward, name: str) -> list[Seat]:
     only lent: they go back, and would leave fewer than the minimum behind.
     """
     members = steward.book.members(name, present=True)
-    return [s for s in members if s.home is None and steward.settling.settled(s)]
+    return [s for s in members if s.home is None and steward.reconciler.settled(s)]
 
 
 def _resize(steward: Steward, name: str | None, change: int) -> None:

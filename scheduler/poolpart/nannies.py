@@ -1,4 +1,4 @@
-"""What nannies were told to start their workers with, and whether they are there."""
+"""Telling nannies which resources to start their workers with."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import logging
 from collections.abc import Collection
 from typing import Any
 
+from distributed import Status
 from distributed.comm.addressing import parse_address, parse_host_port
 
 from .book import Resources, Seat
-from .calls import call
-from .restarts import keep_on_nanny, restore_on_nanny
+from .remote import call
 
 logger = logging.getLogger(__name__)
 
@@ -105,3 +105,52 @@ async def has_gone(nanny: str) -> bool:
         return False
     writer.close()
     return False
+
+
+_FOUND = "poolpart_found"  # on a nanny: what it started its worker with before
+
+
+def keep_on_nanny(resources: Resources, dask_worker: Any = None) -> None:
+    """Start the worker with these resources from now on; runs on a nanny.
+
+    Resources set on a running worker are lost when its nanny restarts it. Setting them once
+    more from inside the new worker comes too late for tasks that found no worker meanwhile:
+    nothing wakes those. A resource in what the nanny starts the worker with is there when the
+    worker registers, and that does wake them.
+
+    The nanny itself keeps what it had before: the answer to this may be lost, when its worker
+    dies at the same moment, and then nobody else would know.
+    """
+    nanny = dask_worker  # the server that this runs on
+    if not hasattr(nanny, _FOUND):
+        setattr(nanny, _FOUND, (nanny.resources, _started_with(nanny)))
+    _start_with(nanny, dict(resources), dict(resources))
+
+
+def restore_on_nanny(dask_worker: Any = None) -> bool:
+    """Have the nanny as `keep_on_nanny` found it; runs on a nanny, any number of times.
+
+    Returns
+    -------
+    starting
+        Whether it is starting its worker just now: that one comes as it was begun.
+    """
+    nanny = dask_worker
+    if hasattr(nanny, _FOUND):
+        _start_with(nanny, *getattr(nanny, _FOUND))
+        delattr(nanny, _FOUND)
+    return nanny.process is not None and nanny.process.status is Status.starting
+
+
+def _started_with(nanny: Any) -> Resources | None:
+    """Look up what a nanny has started its worker with, and would again."""
+    started: Resources | None = nanny.resources
+    if nanny.process is not None:
+        started = nanny.process.worker_kwargs["resources"]
+    return started
+
+
+def _start_with(nanny: Any, resources: Resources | None, again: Resources | None) -> None:
+    nanny.resources = resources
+    if nanny.process is not None:
+        nanny.process.worker_kwargs["resources"] = again

@@ -8,30 +8,65 @@ what is there with ``get(batch=True)``, which returns at once, and between empty
 the scheduler look out for items, which takes none. (`get(timeout=…)` is no way out: each
 time-out is logged as an error on the scheduler, and a request that waits for an item is the
 very thing that loses it.)
+
+A pipe has two parts on the scheduler: a Queue of items and a Variable with its state. Changes
+of the state run in the scheduler's event loop, one at a time. If each side read the Variable,
+changed it and wrote it back, a `close` could undo a `fail` of the same moment; and a write after
+the pipe was deleted would bring half of it back.
+
+Pipes end with the client that made them, also where it was killed. Otherwise tasks at both ends
+would wait for ever, and keep their slots from whoever comes after; Dask does not stop the thread
+of a task whose client has left.
 """
 
 from __future__ import annotations
 
+import asyncio
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
 from typing import Any, TypeVar
 
 from distributed import Client, Queue, Variable
+from distributed.diagnostics.plugin import SchedulerPlugin
 
-from .awaiting import await_news
-from .backoff import Backoff
-from .current_client import own_client
+from .awaiting import await_news, await_room, take_news
 from .errors import PipeClosed, PipeFailed
-from .pipe_parts import AttachedQueue, PipeState, change_pipe, forget_pipes, open_pipe
+from .remote import on_scheduler
+from .task_context import own_client
 
 T = TypeVar("T")
 
 _NOTHING = object()  # where None is an item
 
 _STATE_MAX_AGE_S = 0.05  # how long a pipe may go on before it sees that it was closed or failed
+_WAIT_S = 1.0  # in one request; a pipe that is closed or fails ends it
 _NO_SUCH_PIPE_S = 0.05  # how long the scheduler may look for a Variable; it is there or it is not
 _UNKNOWN_FUTURE_S = 10.0  # how long the scheduler may wait to hear of a future that is put
+_LATE_WORD_S = 2.0  # clients send such words every few milliseconds
+_OWNERS = "poolpart-pipe-owners"
+
+
+@dataclass(frozen=True)
+class PipeState:
+    """What a pipe's Variable holds."""
+
+    closed: bool = False
+    failure: str = ""  # the reason, empty while there is none
+    advice: int = 1
+
+
+class AttachedQueue(Queue):
+    """A Queue that exists already.
+
+    Constructing a `Queue` creates it where it does not exist and counts as a reference, which
+    a killed worker never gives back: a consumer that starts late would revive the queue of
+    a pipe that was deleted. This one does neither.
+    """
+
+    def _maybe_start(self) -> None:
+        """Do not create the queue."""
 
 
 class Pipe:
@@ -52,7 +87,7 @@ class Pipe:
     iteration hand them out one by one. At most ``capacity * (1 + consumers)`` items are
     under way. Where items are slow and consumers several, choose a small capacity, so that
     none sits on work while another idles. Items taken by a consumer that dies are lost with
-    it: whoever needs each item exactly once keeps a `Ledger` and puts what is missing again.
+    it: whoever needs each item exactly once notes what has arrived, and puts what is missing again.
 
     Parameters
     ----------
@@ -92,7 +127,7 @@ class Pipe:
         state = self._state.failure or ("closed" if self._state.closed else "open")
         return f"<Pipe {self.name!r} capacity {self.capacity}, {state}>"
 
-    # -- the two parts on the scheduler ------------------------------------------------
+    # -- coming and going --------------------------------------------------------------
 
     @property
     def client(self) -> Client:
@@ -192,7 +227,7 @@ class Pipe:
         if amount != self._read_state().advice:
             self._change_state(advice=amount)
 
-    def put(self, item: Any, timeout_s: float | None = None) -> None:
+    def put(self, item: Any, timeout_s: float | None = None, *, unbounded: bool = False) -> None:
         """Add an item; waits while the pipe is full.
 
         Parameters
@@ -203,6 +238,9 @@ class Pipe:
             into tuples.
         timeout_s
             Longest wait in seconds.
+        unbounded
+            Put it whatever is queued, which saves a question: for producers that bound what is
+            under way themselves.
 
         Raises
         ------
@@ -216,19 +254,19 @@ class Pipe:
             If the item is a future of which the scheduler knows nothing.
         """
         deadline = _deadline(timeout_s)
-        pause = Backoff()
         while True:
             if self._read_state().closed:
                 raise PipeClosed(f"Pipe {self.name!r} is closed; nothing can be put into it.")
             # The queue itself has no limit. In one that has, the second of two producers that
             # see room for one would wait inside the scheduler: deaf to `fail`, for ever if
             # the pipe is deleted, and putting its item after its own death if it is killed.
-            if self.depth < self.capacity:
+            if unbounded or self.depth < self.capacity:
                 self._put_now(item)
                 return
             if time.monotonic() > deadline:
                 raise TimeoutError(f"Pipe {self.name!r} stayed full for {timeout_s} s.")
-            pause.sleep()
+            wait_s = min(_WAIT_S, max(0.0, deadline - time.monotonic()))
+            await_room(self.client, wait_s, self.name, self.capacity)
 
     def _put_now(self, item: Any) -> None:
         try:
@@ -257,8 +295,17 @@ class Pipe:
         except IndexError:
             return default
 
-    def get_all(self, timeout_s: float | None = None) -> list[Any]:
+    def get_all(self, timeout_s: float | None = None, *, alone: bool = False) -> list[Any]:
         """Everything that is queued, as soon as there is anything.
+
+        Parameters
+        ----------
+        timeout_s
+            Longest wait in seconds.
+        alone
+            For a pipe that has one reader in all: waiting and taking are one request then, see
+            `take_news`, and what is taken for a reader that dies meanwhile is lost. Items must be
+            plain data.
 
         Raises
         ------
@@ -271,6 +318,9 @@ class Pipe:
         """
         deadline = _deadline(timeout_s)
         while True:
+            wait_s = min(_WAIT_S, max(0.0, deadline - time.monotonic()))
+            if alone and (news := take_news(self.client, wait_s, [self.name])):
+                return news[self.name]
             # The state is read before the queue: items put before the closing are seen.
             closed = self._read_state().closed
             if items := self.poll():
@@ -279,8 +329,8 @@ class Pipe:
                 raise PipeClosed(f"Pipe {self.name!r} is closed and empty.")
             if time.monotonic() > deadline:
                 raise TimeoutError(f"Nothing came through pipe {self.name!r} for {timeout_s} s.")
-            wait_s = min(_STATE_MAX_AGE_S, max(0.0, deadline - time.monotonic()))
-            await_news(self.client, wait_s, [self.name])
+            if not alone:
+                await_news(self.client, wait_s, [self.name])
 
     def get(self, timeout_s: float | None = None) -> Any:
         """Take the next item; waits for one, and raises as `get_all` does."""
@@ -303,3 +353,109 @@ class Pipe:
 
 def _deadline(timeout_s: float | None) -> float:
     return float("inf") if timeout_s is None else time.monotonic() + timeout_s
+
+
+# -- the two parts on the scheduler -----------------------------------------------------
+
+
+def open_pipe(client: Client, name: str) -> bool:
+    """Make both parts; False if there is a pipe of that name."""
+    state = asdict(PipeState())
+    return bool(on_scheduler(client, _open, name=name, owner=client.id, state=state))
+
+
+def change_pipe(client: Client, name: str, **changes: Any) -> PipeState | None:
+    """Change fields of the state; returns what it is now, or None if there is no such pipe."""
+    state = on_scheduler(client, _change, name=name, changes=changes)
+    return None if state is None else PipeState(**state)
+
+
+def forget_pipes(client: Client, names: Sequence[str]) -> None:
+    """Remove these pipes from the scheduler, with what is in them; those unknown are skipped."""
+    on_scheduler(client, _forget, names=list(names))
+
+
+async def _open(name: str, owner: str, state: dict[str, Any], dask_scheduler: Any = None) -> bool:
+    queues = dask_scheduler.extensions["queues"]
+    variables = dask_scheduler.extensions["variables"]
+    if name in queues.queues or name in variables.variables:
+        return False
+    if owner not in dask_scheduler.clients:
+        # It was killed, and its last question is read after that was seen: nobody would take
+        # the pipe away, nor hear the answer.
+        return False
+    # Without `maxsize`: see `Pipe.put`.
+    queues.create(name=name)
+    _note_owner(dask_scheduler, name, owner)
+    await variables.set(name=name, data=state)
+    return True
+
+
+async def _change(
+    name: str, changes: dict[str, Any], dask_scheduler: Any = None
+) -> dict[str, Any] | None:
+    variables = dask_scheduler.extensions["variables"]
+    if name not in variables.variables:
+        return None
+    state: dict[str, Any] = {**variables.variables[name]["value"]}
+    if state["failure"]:  # the first reason is the cause, later ones are its consequences
+        changes = {key: value for key, value in changes.items() if key != "failure"}
+    state |= changes
+    await variables.set(name=name, data=state)
+    return state
+
+
+async def _forget(names: list[str], dask_scheduler: Any = None) -> None:
+    queues = dask_scheduler.extensions["queues"]
+    variables = dask_scheduler.extensions["variables"]
+    _drop_owners(dask_scheduler, names)
+    for name in names:
+        while name in queues.queues:
+            queues.release(name=name, client="poolpart")
+        _forget_counts(queues, name)
+        # A consumer's word that it has a future may still be under way, and would be counted.
+        asyncio.get_running_loop().call_later(_LATE_WORD_S, _forget_counts, queues, name)
+        # Futures that were taken by a consumer which died before it could say so.
+        if f"queue-{name}" in dask_scheduler.clients:
+            dask_scheduler.remove_client(f"queue-{name}")
+        if name in variables.variables:
+            await variables.delete(name=name, client="poolpart")
+
+
+def _forget_counts(queues: Any, name: str) -> None:
+    if name not in queues.queues:
+        for counted in [counted for counted in queues.future_refcount if counted[0] == name]:
+            del queues.future_refcount[counted]
+
+
+class PipeOwners(SchedulerPlugin):
+    """Forgets the pipes of clients that leave; there as long as there are pipes."""
+
+    def __init__(self) -> None:
+        self.owners: dict[str, str] = {}  # {pipe: id of the client that made it}
+        self._under_way: set[asyncio.Future[None]] = set()  # else they might be collected
+
+    def remove_client(self, scheduler: Any, client: str) -> None:
+        """Forget the pipes of a client that has left."""
+        names = [name for name, owner in self.owners.items() if owner == client]
+        if names:
+            work = asyncio.ensure_future(_forget(names, dask_scheduler=scheduler))
+            self._under_way.add(work)
+            work.add_done_callback(self._under_way.discard)
+
+
+def _note_owner(scheduler: Any, name: str, client: str) -> None:
+    """Note that a client has made a pipe."""
+    if _OWNERS not in scheduler.plugins:
+        scheduler.add_plugin(PipeOwners(), name=_OWNERS)
+    scheduler.plugins[_OWNERS].owners[name] = client
+
+
+def _drop_owners(scheduler: Any, names: Sequence[str]) -> None:
+    """Note that pipes are gone; the plugin goes with the last."""
+    if _OWNERS in scheduler.plugins:
+        owners = scheduler.plugins[_OWNERS].owners
+        for name in names:
+            owners.pop(name, None)
+        if not owners:
+            scheduler.remove_plugin(_OWNERS)

@@ -1,13 +1,24 @@
-"""What the scheduler believes a worker to declare; this runs in its event loop."""
+"""Where the scheduler places tasks: resources as it knows them, and tasks that it moves.
+
+All of this runs in the scheduler's event loop. `hand_off` and `recall` use the protocol of work
+stealing: the worker is asked, and gives a task up unless the task runs. `hand_off` names another
+worker that gets the task. `recall` asks in the name of a worker that has left, so that the
+scheduler sends the task nowhere, but decides anew where it goes.
+"""
 
 from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Iterable
 from typing import Any
 
+from distributed.core import Status
+from distributed.scheduler import WorkerState
+
 from .book import Resources
+
+_NOBODY = "poolpart-nobody"  # name of the worker in whose name tasks are recalled
 
 
 def show(scheduler: Any, worker: Any, resources: Resources) -> None:
@@ -96,3 +107,59 @@ def hand_off(scheduler: Any, worker: Any, names: Collection[str], asked: set[Any
             thief = min(others, key=lambda o: (len(o.processing) + given[o]) / o.nthreads)
             given[thief] += 1
             stealing.move_task_request(task, worker, thief)
+
+
+def recall(scheduler: Any, worker: Any, tasks: Iterable[Any]) -> list[Any]:
+    """Ask a worker for tasks that it has not started; returns those that it was asked for.
+
+    It is not asked for actors and long-running tasks, nor for tasks that are being stolen from it
+    already.
+    """
+    stealing = scheduler.extensions.get("stealing")
+    if stealing is None:
+        return []
+    asked = [
+        task
+        for task in tasks
+        if not (task.actor or task in worker.long_running or task in stealing.in_flight)
+    ]
+    for task in asked:
+        stealing.move_task_request(task, worker, _nobody(scheduler))
+    return asked
+
+
+def recalls_under_way(
+    scheduler: Any, workers: Collection[Any], concerns: Callable[[Any], bool]
+) -> bool:
+    """Whether workers have yet to answer to `recall`.
+
+    Or to a theft, from these workers or by them, of a task that `concerns` is true for.
+    """
+    stealing = scheduler.extensions.get("stealing")
+    moves = stealing.in_flight.items() if stealing else ()
+    return any(
+        move["thief"].server_id == _NOBODY
+        or (concerns(task) and not {move["thief"], move["victim"]}.isdisjoint(workers))
+        for task, move in moves
+    )
+
+
+def forget_recalls(scheduler: Any) -> None:
+    """Leave nothing of `recall` with work stealing."""
+    if stealing := scheduler.extensions.get("stealing"):
+        stealing.in_flight_tasks.pop(_nobody(scheduler), None)
+
+
+def _nobody(scheduler: Any) -> Any:
+    return WorkerState(
+        address="tcp://0.0.0.0:0",
+        status=Status.closed,
+        pid=0,
+        name=_NOBODY,
+        nthreads=1,
+        memory_limit=0,
+        local_directory="",
+        nanny=None,
+        server_id=_NOBODY,
+        scheduler=scheduler,
+    )

@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import replace
 
 from distributed import Client
 
-from .asking import ask_workers
-from .dissolve import dissolve
+from .declare import declare, dissolve
 from .errors import PoolError
-from .identities import worker_identities
-from .making import make_partitions
 from .moves import follow, unfollow
 from .page import partitions_page
 from .partition import Partition
 from .probe import probe_worker
 from .rebalancing import Help
-from .rules import Rule, check_rule, check_rules, divide, rule_of
-from .selection import check_request, choose
+from .remote import ask_workers, worker_identities
+from .rules import Rule, check_request, check_rule, check_rules, choose, divide, rule_of
 from .wording import counted
 from .worker_info import WorkerInfo
+
+logger = logging.getLogger(__name__)
 
 
 class Pool:
@@ -35,7 +35,7 @@ class Pool:
     --------
     >>> pool = Pool.from_client(client)                                # doctest: +SKIP
     >>> gpu, rest = pool.partition("GPU", max_workers_per_gpu=1)       # doctest: +SKIP
-    >>> lidar, rest = rest.partition("LIDAR", n_workers=4)             # doctest: +SKIP
+    >>> io, rest = rest.partition("IO", n_workers=4)                   # doctest: +SKIP
     >>> other, _ = rest.partition("OTHER", workers=rest.names)         # doctest: +SKIP
     >>> gpu.submit(pow, 2, 10).result()                                # doctest: +SKIP
     1024
@@ -181,7 +181,7 @@ class Pool:
         --------
         >>> from poolpart import Pool, per_gpu, per_host, rest
         >>> parts = Pool.from_client(client).divide(                   # doctest: +SKIP
-        ...     {"GPU": per_gpu(1), "LIDAR": per_host(2), "OTHER": rest(exclusive=True)}
+        ...     {"GPU": per_gpu(1), "IO": per_host(2), "OTHER": rest(exclusive=True)}
         ... )
         >>> parts["GPU"].submit(pow, 2, 10).result()                   # doctest: +SKIP
         1024
@@ -190,7 +190,7 @@ class Pool:
         cluster = self._cluster_now()
         mine = self._mine(cluster)
         chosen, notes = divide(rules, mine)
-        return make_partitions(self.client, rules, chosen, notes, cluster)
+        return self._make(rules, chosen, notes, cluster)
 
     def partition(
         self,
@@ -263,7 +263,7 @@ class Pool:
         common = {"slots": slots, "minimum": minimum, "exclusive": exclusive}
         rule = rule_of(given, [worker.name for worker in chosen], common)
         check_rule(name, rule)
-        made = make_partitions(self.client, {name: rule}, {name: chosen}, {name: note}, cluster)
+        made = self._make({name: rule}, {name: chosen}, {name: note}, cluster)
         taken = {worker.address for worker in chosen}
         rest = Pool(self.client, [worker for worker in mine if worker.address not in taken])
         return made[name], rest
@@ -332,6 +332,20 @@ class Pool:
             If tasks of theirs have not ended; then everything stays.
         """
         return dissolve(self.client, None, timeout_s)
+
+    def _make(
+        self,
+        rules: Mapping[str, Rule],
+        chosen: Mapping[str, Sequence[WorkerInfo]],
+        notes: Mapping[str, str],
+        cluster: Sequence[WorkerInfo],
+    ) -> dict[str, Partition]:
+        """Make partitions of the workers chosen for them, all or none; see `declare`."""
+        for name, note in notes.items():
+            if note:
+                logger.warning("Partition %r: %s", name, note)
+        declare(self.client, rules, chosen, cluster)
+        return {name: Partition(name, self.client, notes.get(name, "")) for name in rules}
 
     def _cluster_now(self) -> list[WorkerInfo]:
         """Every worker of the cluster; the GPUs of those in this pool are known."""

@@ -8,7 +8,7 @@ from typing import Any
 
 from .book import Book, Seat
 from .placing import asks_for
-from .settling import Settling
+from .reconciler import Reconciler
 
 # Longer than an idle worker waits to be lent: whoever submits may need a moment to notice it,
 # and a worker that goes back and forth is of no use to anybody.
@@ -41,12 +41,12 @@ class Rebalancing:
         The scheduler.
     book
         Who is where; changed here.
-    settling
+    reconciler
         Has workers follow the book.
     """
 
-    def __init__(self, scheduler: Any, book: Book, settling: Settling) -> None:
-        self.scheduler, self.book, self.settling = scheduler, book, settling
+    def __init__(self, scheduler: Any, book: Book, reconciler: Reconciler) -> None:
+        self.scheduler, self.book, self.reconciler = scheduler, book, reconciler
         self.helps: dict[tuple[str, str], Help] = {}
         self._idle_since: dict[str, float] = {}  # {address: when it was first seen idle}
 
@@ -121,7 +121,7 @@ class Rebalancing:
     def _lend(self, rule: Help, most: int, now: float) -> None:
         # Not those on their way: they may turn back.
         members = [
-            s for s in self.book.members(rule.lender, present=True) if self.settling.settled(s)
+            s for s in self.book.members(rule.lender, present=True) if self.reconciler.settled(s)
         ]
         spare = max(0, len(members) - self.book.rules[rule.lender].minimum)
         # A worker that is itself lent goes home first.
@@ -132,9 +132,9 @@ class Rebalancing:
             seat.home = rule.lender
             # The new member starts with a clean record, else it would be idle at once.
             self._idle_since.pop(seat.info.address, None)
-        self.settling.settle(chosen)
+        self.reconciler.settle(chosen)
 
     def _give_back(self, seats: list[Seat]) -> None:
         for seat in seats:
             self.book.put(seat, seat.home)
-        self.settling.settle(seats)
+        self.reconciler.settle(seats)

@@ -1,11 +1,18 @@
-"""Running a function of this package on the scheduler; a leaf module."""
+"""Running functions on the scheduler, workers and nannies of a cluster.
+
+`on_scheduler`, `ask_workers` and `worker_identities` are called by clients; `call` is called on
+the scheduler, in its event loop.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from distributed import Client
+from distributed.comm.core import CommClosedError
+from distributed.protocol.pickle import dumps
+from distributed.protocol.serialize import Serialize, Serialized, deserialize
 
 from .errors import PoolError
 
@@ -40,3 +47,74 @@ def check_client(client: Client) -> None:
         )
     if client.status in ("closing", "closed"):
         raise PoolError(f"The client is {client.status}: make another one, and the pool anew.")
+
+
+def worker_identities(client: Client) -> dict[str, dict[str, Any]]:
+    """Ask the scheduler for all its workers, by address.
+
+    `Client.scheduler_info(n_workers=-1)` asks too, but returns what is in an attribute by then.
+    Every two seconds the client itself puts an answer there that has no workers, so that on a
+    busy machine a cluster of hundreds looks empty now and then.
+
+    Raises
+    ------
+    PoolError
+        If the client is closed, or asynchronous.
+    """
+    check_client(client)
+    identity: dict[str, Any] = client.sync(client.scheduler.identity, n_workers=-1)
+    workers: dict[str, dict[str, Any]] = identity["workers"]
+    return workers
+
+
+def ask_workers(
+    client: Client, question: Callable[..., Any], addresses: Sequence[str]
+) -> dict[str, Any]:
+    """Run a function on workers, outside their tasks.
+
+    Parameters
+    ----------
+    client
+        Client of their cluster.
+    question
+        What `Client.run` is to run there.
+    addresses
+        The workers.
+
+    Returns
+    -------
+    dict
+        By address, what each returned, or the exception that it raised there. Workers that
+        have died before they answered are left out, as those that had died before.
+    """
+    if not addresses:  # to Client.run that would be all workers
+        return {}
+    answers = client.run(question, workers=list(addresses), on_error="return")
+    if not any(isinstance(answer, OSError) for answer in answers.values()):
+        return dict(answers)
+    here = worker_identities(client)
+    return {a: answer for a, answer in answers.items() if not _has_died(answer, a in here)}
+
+
+def _has_died(answer: Any, is_here: bool) -> bool:
+    # An OSError may also be what the question raised on a worker that is well.
+    return isinstance(answer, CommClosedError) or (isinstance(answer, OSError) and not is_here)
+
+
+async def call(scheduler: Any, address: str, function: Callable[..., Any], **arguments: Any) -> Any:
+    """Call a function in the event loop of a worker or nanny, which it gets as `dask_worker`.
+
+    Raises
+    ------
+    OSError
+        If nobody answers there, or the function raises something.
+    """
+    answer = await scheduler.rpc(address).run(function=dumps(function), kwargs=dumps(arguments))
+    if answer["status"] != "OK":
+        raise OSError(answer["exception_text"])
+    result = answer["result"]
+    # The scheduler leaves what passes through it as it came: as bytes, or not yet packed where
+    # the worker is in the same process.
+    if isinstance(result, Serialized):
+        return deserialize(result.header, result.frames)
+    return result.data if isinstance(result, Serialize) else result

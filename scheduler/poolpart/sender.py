@@ -4,13 +4,75 @@ from __future__ import annotations
 
 import inspect
 import sys
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
 from distributed import Client, Future
 
-from .quota import Quota
+
+def when_done(future: Future, function: Callable[[Future], Any]) -> None:
+    """Call `function(future)` once the task has succeeded, failed or been cancelled.
+
+    It is called in the client's event loop and must not block. `Future.add_done_callback`
+    calls in a thread that all callbacks of the process share: a user's callback that waits
+    there for this one would wait for ever. It also takes a task for done whose result was lost
+    with its worker, while that is computed again.
+    """
+    future.client.loop.add_callback(_wait, future, function)
+
+
+async def _wait(future: Future, function: Callable[[Future], Any]) -> None:
+    while future.status in ("pending", "lost"):
+        await future._state.wait()
+    function(future)
+
+
+class Quota:
+    """At most so many tasks under way at a time, counted where they are submitted.
+
+    Dask places tasks by a worker's total resources and knows no users. So whoever submits
+    holds back: one place for each task, given back when the task is done.
+    """
+
+    def __init__(self, slots: int) -> None:
+        if not isinstance(slots, int) or slots < 1:
+            raise ValueError(f"A quota of {slots!r} slots; give a whole number, 1 or more.")
+        self.slots = slots
+        self._free = threading.Semaphore(slots)
+
+    def take(self, most: int, wait: bool) -> int:
+        """Take up to so many places.
+
+        Parameters
+        ----------
+        most
+            Places wanted, 1 or more.
+        wait
+            Whether to wait until there is one; else this may be none.
+
+        Returns
+        -------
+        int
+            Places taken.
+        """
+        taken = int(self._free.acquire(blocking=wait))
+        while 0 < taken < most and self._free.acquire(blocking=False):
+            taken += 1
+        return taken
+
+    def watch(self, future: Future) -> None:
+        """Give the task's place back when it is done, failed or cancelled."""
+        when_done(future, self._done)
+
+    def give_back(self, places: int) -> None:
+        """Give places back for which no task was submitted after all."""
+        self._free.release(places)
+
+    def _done(self, _: Any) -> None:
+        self._free.release()
+
 
 # `Client.submit` keeps these for itself; a function that has one of them would not get it.
 _OPTIONS_OF_SUBMIT = frozenset(

@@ -1,7 +1,7 @@
 """Keeps workers in their partitions; a plugin of the scheduler.
 
 It lives on the scheduler, so what was divided stays divided when the client has gone. It enters
-into the book who comes and goes, and `settling.py` makes the book come true.
+into the book who comes and goes, and `reconciler.py` makes the book come true.
 """
 
 from __future__ import annotations
@@ -18,13 +18,12 @@ from tornado.ioloop import PeriodicCallback
 
 from .adapting import Adapting
 from .book import Book, Seat, seat_key
-from .calls import call
 from .nannies import Nannies, has_gone
 from .probe import probe_worker
 from .rebalancing import Rebalancing
+from .reconciler import Reconciler
+from .remote import call
 from .rules import PerGpu, partition_for
-from .settling import Settling
-from .vacancies import successor, vacated
 from .worker_info import WorkerInfo
 
 logger = logging.getLogger(__name__)
@@ -49,8 +48,8 @@ class Steward(SchedulerPlugin):
         self.book = Book()
         self.asked = 0  # questions of clients that are being answered
         self.nannies = Nannies(scheduler)
-        self.settling = Settling(scheduler, self.book, self.nannies, self._find_place)
-        self.rebalancing = Rebalancing(scheduler, self.book, self.settling)
+        self.reconciler = Reconciler(scheduler, self.book, self.nannies, self._find_place)
+        self.rebalancing = Rebalancing(scheduler, self.book, self.reconciler)
         self.adapting = Adapting(scheduler, self.book)
         self.adapting.install()
         self._looked_at: Any = None  # rules and members when nobody wanted those without a place
@@ -66,7 +65,7 @@ class Steward(SchedulerPlugin):
 
     def _seat(self, worker: Any) -> Seat:
         """Seat of a worker that has come, or come back."""
-        self.settling.meet(worker)
+        self.reconciler.meet(worker)
         key = seat_key(worker.name, worker.address, worker.nanny)
         seat = self.book.seats.get(key)
         gpus = seat.info.gpus if seat else ()
@@ -93,11 +92,11 @@ class Steward(SchedulerPlugin):
                 self.book.put(seat, declared[0], seat.found[declared[0]])
             elif not any(seat.found.values()):
                 seat.partition, seat.unplaced = None, True
-        self.settling.settle([seat])
+        self.reconciler.settle([seat])
 
     def remove_worker(self, scheduler: Any, worker: str, **kwargs: Any) -> None:
         """Note that a worker has left; its place is held for a while if it has a nanny."""
-        self.settling.miss(worker)
+        self.reconciler.miss(worker)
         for seat in self.book.seats.values():
             if seat.info.address == worker and seat.absent_since is None:
                 seat.absent_since = time.monotonic()
@@ -129,7 +128,7 @@ class Steward(SchedulerPlugin):
         """Do nothing more."""
         self._ticker.stop()
         self.adapting.uninstall()
-        self.settling.stop()
+        self.reconciler.stop()
         for task in (*self._missed, *self._restoring.values()):
             task.cancel()
 
@@ -140,7 +139,7 @@ class Steward(SchedulerPlugin):
             return
         self.rebalancing.look(time.monotonic())
         if any(seat.absent_since is not None for seat in self.book.seats.values()):
-            for gone in vacated(self.book):
+            for gone in self.book.vacated():
                 self._pass_on(gone)
             self.book.forget(time.monotonic())
             self.nannies.forget_others({seat.nanny for seat in self.book.seats.values()})
@@ -150,9 +149,9 @@ class Steward(SchedulerPlugin):
 
     def _pass_on(self, gone: Seat) -> None:
         """Give the place of a worker to one that joined while it was kept."""
-        if seat := successor(self.book, gone):
+        if seat := self.book.replacement(gone):
             self.book.put(seat, gone.partition)
-            self.settling.settle([seat])
+            self.reconciler.settle([seat])
 
     def _look_for_places(self, waiting: list[Seat]) -> None:
         """Place workers that nobody wanted: another may have gone for good since.
@@ -164,8 +163,8 @@ class Steward(SchedulerPlugin):
         now = dict(book.rules), {n: [s.key for s in book.members(n)] for n in book.rules}
         if now == self._looked_at:
             return
-        seats = [seat for seat in waiting if not self.settling.is_under_way(seat)]
-        self.settling.settle([seat for seat in seats if self._place(seat)])
+        seats = [seat for seat in waiting if not self.reconciler.is_under_way(seat)]
+        self.reconciler.settle([seat for seat in seats if self._place(seat)])
         # Those that are on their way look for themselves, perhaps before what has changed.
         self._looked_at = now if len(seats) == len(waiting) else None
 
@@ -214,7 +213,7 @@ class Steward(SchedulerPlugin):
     def _at_rest(self, seat: Seat) -> bool:
         """Whether nothing is left to do for a worker, or its nanny, which may start it again."""
         if seat.absent_since is None:
-            return self.settling.settled(seat)
+            return self.reconciler.settled(seat)
         return not self.nannies.was_told(seat)
 
     def remove_if_done(self) -> None:

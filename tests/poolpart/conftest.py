@@ -9,7 +9,8 @@ from contextlib import ExitStack
 import pytest
 from distributed import Client, Nanny, Scheduler, SpecCluster, Worker
 
-from poolpart import Pipe, local_cluster
+from poolpart import Pipe, Pool, local_cluster
+from poolpart.local import _NannyCluster
 
 QUIET = 50  # logging level: the workers that tests kill are not news
 
@@ -64,30 +65,63 @@ def client(_threads):
 
 @pytest.fixture(scope="session")
 def processes():
-    """Client of a local cluster of processes: GPU, LIDAR and OTHER, one worker each."""
+    """Client of a local cluster of processes: GPU, IO of four slots, and OTHER, one worker each."""
     with (
-        local_cluster(gpu_workers=1, lidar_slots=4, other_workers=1, dashboard_port=0) as cluster,
+        local_cluster({"GPU": (1, 1), "IO": (1, 4), "OTHER": (1, 1)}) as cluster,
         Client(cluster) as client,
     ):
         yield client
 
 
-@pytest.fixture
-def nannies(monkeypatch):
-    """Client of a cluster of two worker processes that belong to no partition."""
-    # A busy machine needs longer than that to start a worker again.
-    monkeypatch.setattr("poolpart.book.HOLD_S", 3600.0)
-    monkeypatch.setattr("poolpart.declare.PATIENCE_S", 120.0)
+def nanny_cluster():
+    """Cluster of two worker processes, 0 and 1, that belong to no partition."""
     options = {"nthreads": 1, "host": "127.0.0.1", "dashboard": False, "silence_logs": QUIET}
     spec = {name: {"cls": Nanny, "options": options} for name in (0, 1)}
     scheduler = {
         "cls": Scheduler,
         "options": {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0", "dashboard": False},
     }
-    with (
-        SpecCluster(workers=spec, scheduler=scheduler, silence_logs=QUIET) as cluster,
-        Client(cluster) as client,
-    ):
+    # Not a bare SpecCluster: it gives up a worker that is dead 15 seconds after another death.
+    return _NannyCluster(workers=spec, scheduler=scheduler, silence_logs=QUIET)
+
+
+@pytest.fixture(scope="session")
+def _nannies():
+    with nanny_cluster() as cluster:
+        yield cluster
+
+
+@pytest.fixture
+def patient(monkeypatch):
+    """Have the scheduler wait long: a busy machine needs time to start a worker again."""
+    monkeypatch.setattr("poolpart.book.HOLD_S", 3600.0)
+    monkeypatch.setattr("poolpart.declare.PATIENCE_S", 120.0)
+
+
+@pytest.fixture
+def nannies(_nannies, patient):
+    """Client of a cluster of two worker processes that belong to no partition.
+
+    Tests share the cluster: workers may be killed, but not changed for good.
+    """
+    with Client(_nannies) as client:
+        client.wait_for_workers(2, timeout=120)
+        yield client
+        client.wait_for_workers(2, timeout=120)
+        Pool(client, []).dissolve(timeout_s=120)
+        wait_until(lambda: not any(map(partitions_of, _nannies.scheduler.workers.values())))
+    wait_until(lambda: not _nannies.scheduler.tasks)
+
+
+def partitions_of(worker):
+    """Partitions that a worker belongs to, as the scheduler knows it."""
+    return [name for name, slots in worker.resources.items() if slots]
+
+
+@pytest.fixture
+def own_nannies(patient):
+    """Client of such a cluster that a test has for itself, to do with as it likes."""
+    with nanny_cluster() as cluster, Client(cluster) as client:
         yield client
 
 

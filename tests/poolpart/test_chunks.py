@@ -7,7 +7,7 @@ from distributed import Reschedule
 from hypothesis import given
 from hypothesis import strategies as st
 
-from poolpart.chunks import GROWTH, MOST_BYTES, MOST_ITEMS, Chunk, ChunkSize, run_chunk
+from poolpart.mapping import GROWTH, MOST_BYTES, MOST_ITEMS, Chunk, ChunkSize, run_chunk
 
 
 def invert(x):

@@ -14,13 +14,13 @@ from poolpart import (
     Partition,
     Pool,
     PoolError,
-    dissolve,
+    declare,
     n_workers,
     named,
     per_host,
     raise_fence,
+    reconciler,
     rest,
-    settling,
     steward,
     worker_identities,
 )
@@ -179,12 +179,12 @@ def test_nothing_stays_but_of_workers_that_do_not_answer(start, wait_until, monk
     before = known(client)
     pool = Pool.from_client(client)
     pool.divide({"A": n_workers(1, exclusive=True), "B": rest()})
-    arrive = settling.Settling.arrive
+    arrive = reconciler.Reconciler.arrive
 
     async def impatient(self, seats, timeout_s):
         return await arrive(self, seats, 0.0)
 
-    monkeypatch.setattr(settling.Settling, "arrive", impatient)
+    monkeypatch.setattr(reconciler.Reconciler, "arrive", impatient)
     with pytest.raises(PoolError, match="a, b did not answer while A and B were dissolved"):
         pool.dissolve()
     wait_until(lambda: steward.NAME not in client.cluster.scheduler.plugins)
@@ -324,11 +324,11 @@ def test_a_scheduler_with_many_tasks_is_not_kept_from_them_by_looking(monkeypatc
     async def sleep(seconds):
         clock.now += seconds
 
-    monkeypatch.setattr(dissolve, "time", SimpleNamespace(monotonic=lambda: clock.now))
-    monkeypatch.setattr(dissolve, "asyncio", SimpleNamespace(sleep=sleep))
-    monkeypatch.setattr(dissolve, "_unfinished", look)
+    monkeypatch.setattr(declare, "time", SimpleNamespace(monotonic=lambda: clock.now))
+    monkeypatch.setattr(declare, "asyncio", SimpleNamespace(sleep=sleep))
+    monkeypatch.setattr(declare, "_unfinished", look)
     book = SimpleNamespace(rules={"A": rest()})
-    asked = dissolve._dissolve(SimpleNamespace(book=book, scheduler=None), ["A"], 10.0)
+    asked = declare._dissolve(SimpleNamespace(book=book, scheduler=None), ["A"], 10.0)
     with pytest.raises(PoolError, match="After 10 s 1 task of A had not ended"):
         asyncio.run(asked)
     assert clock.looked < 0.1 * clock.now < 1.1
@@ -341,22 +341,22 @@ def start_once(path, dask_worker):
 
 
 def test_a_worker_that_comes_back_when_nobody_expects_it_is_as_it_was(
-    nannies, wait_until, monkeypatch, tmp_path
+    own_nannies, wait_until, monkeypatch, tmp_path
 ):
     """Its place has been given up by then, and there is no partition any more."""
-    part = Pool.from_client(nannies).divide({"A": rest()})["A"]
+    part = Pool.from_client(own_nannies).divide({"A": rest()})["A"]
     victim, gate = part.workers[0], tmp_path / "gate"
-    nannies.run(start_once, str(gate), nanny=True)
-    monkeypatch.setattr(dissolve, "_PATIENCE_S", 0.2)
-    os.kill(nannies.run(os.getpid, workers=[victim.address])[victim.address], signal.SIGKILL)
+    own_nannies.run(start_once, str(gate), nanny=True)
+    monkeypatch.setattr(declare, "_RETURN_S", 0.2)
+    os.kill(own_nannies.run(os.getpid, workers=[victim.address])[victim.address], signal.SIGKILL)
     wait_until(lambda: len(part.workers) == 1)
     with pytest.raises(PoolError, match="did not answer while A were dissolved; they become what"):
         part.dissolve(timeout_s=0.1)
     monkeypatch.setattr("poolpart.book.HOLD_S", 0.0)  # from here on nobody expects it
-    nanny = next(n for n in nannies.cluster.workers.values() if str(n.name) == victim.name)
+    nanny = next(n for n in own_nannies.cluster.workers.values() if str(n.name) == victim.name)
     wait_until(lambda: nanny.resources is None)  # it was told, but its worker is on its way
     gate.touch()
-    nannies.wait_for_workers(2, timeout=LONG_S)
-    wait_until(lambda: steward.NAME not in nannies.cluster.scheduler.plugins)
-    assert set(map(str, declared(nannies).values())) == {"{}"}
-    assert {told[1] for told in nannies.run(_on_nanny, nanny=True).values()} == {None}
+    own_nannies.wait_for_workers(2, timeout=LONG_S)
+    wait_until(lambda: steward.NAME not in own_nannies.cluster.scheduler.plugins)
+    assert set(map(str, declared(own_nannies).values())) == {"{}"}
+    assert {told[1] for told in own_nannies.run(_on_nanny, nanny=True).values()} == {None}

@@ -13,9 +13,16 @@ import dask.array
 import pytest
 from distributed import get_worker, wait, worker_client
 
-from poolpart import Partition, Pool, PoolError, fence_plugin
-from poolpart.fence import lower_fence, raise_fence, raised_fences
-from poolpart.fence_plugin import NAME, kept_out, raise_
+from poolpart import Partition, Pool, PoolError
+from poolpart.fence import (
+    NAME,
+    enclose,
+    kept_out,
+    lower_fence,
+    raise_fence,
+    raised_fences,
+    settle_fences,
+)
 from poolpart.override import Overrides
 
 LONG_S = 120.0
@@ -47,8 +54,8 @@ class Counting:
 @pytest.fixture
 def client(start, monkeypatch):
     # How long workers may take to answer, and after which time tasks that wait are told of again.
-    monkeypatch.setattr(fence_plugin, "_SETTLE_S", LONG_S)
-    monkeypatch.setattr(fence_plugin, "COMPLAIN_EVERY_S", 3600.0)
+    monkeypatch.setattr("poolpart.fence._SETTLE_S", LONG_S)
+    monkeypatch.setattr("poolpart.fence.COMPLAIN_EVERY_S", 3600.0)
     client = start(CLUSTER)
     client.cluster.scheduler.validate = True  # Dask checks itself after each step
     return client
@@ -236,7 +243,8 @@ async def steal_and_raise(victim, thief, dask_scheduler):
     victim, thief = by_name[victim], by_name[thief]
     for task in list(victim.processing):  # also the one that runs, of which Dask knows nothing
         dask_scheduler.extensions["stealing"].move_task_request(task, victim, thief)
-    await raise_(dask_scheduler, "A")
+    enclose(dask_scheduler, "A")
+    await settle_fences(dask_scheduler)
     return len(victim.processing)
 
 

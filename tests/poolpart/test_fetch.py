@@ -3,12 +3,25 @@
 import asyncio
 import os
 import signal
+import time
 import uuid
+from collections import Counter
 
+import numpy as np
 import pytest
 from distributed import Event, wait
+from distributed.comm import tcp
+from distributed.comm.addressing import parse_host_port
 
-from poolpart import Partition, fetch, fetch_available
+from poolpart import (
+    Partition,
+    fetch,
+    fetch_available,
+    fetch_from,
+    hold_for_driver,
+    take_held,
+    worker_identities,
+)
 
 LONG_S = 120.0
 
@@ -67,6 +80,10 @@ def answer_late(seconds, dask_worker):
     dask_worker.handlers["get_data"] = send_late
 
 
+def answer_again(dask_worker):
+    dask_worker.handlers["get_data"] = dask_worker.get_data
+
+
 def test_a_worker_that_is_slow_is_waited_for(nannies, monkeypatch):
     """Else it would send the same again with each call, and nothing would ever come."""
     futures = [nannies.submit(os.getpid, workers=[name], pure=False) for name in (0, 1)]
@@ -76,6 +93,7 @@ def test_a_worker_that_is_slow_is_waited_for(nannies, monkeypatch):
     in_time = fetch.wait_for
     monkeypatch.setattr(fetch, "wait_for", lambda answer, _: in_time(answer, LONG_S))
     fetched = fetch_available(nannies, [future.key for future in futures], patience_s=0.2)
+    nannies.run(answer_again)
     assert fetched == {future.key: pid for future, pid in zip(futures, pids, strict=True)}
 
 
@@ -96,3 +114,85 @@ def test_a_worker_that_does_not_answer_keeps_only_its_own_results(nannies, wait_
         os.kill(stopped, signal.SIGCONT)
     assert fetched == {futures[0].key: answering}
     assert len(fetch_available(nannies, keys, LONG_S)) == 2
+
+
+# -- from a worker that is known -------------------------------------------------------
+
+
+def test_results_come_from_the_worker_that_has_them(client):
+    part = Partition("A", client)
+    one, two = (worker.address for worker in part.workers)
+    there, elsewhere = (part.submit(twice, n, worker=a) for n, a in ((3, one), (4, two)))
+    wait([there, elsewhere], timeout=LONG_S)
+    keys = [there.key, elsewhere.key, "never-submitted"]
+    assert fetch_from(client, one, keys, LONG_S) == {there.key: 6}
+    assert fetch_from(client, two, keys, LONG_S) == {elsewhere.key: 8}
+    assert fetch_from(client, one, [], LONG_S) == {}
+
+
+def test_the_scheduler_is_not_asked_where_results_are(client, monkeypatch):
+    part = Partition("A", client)
+    future = part.submit(twice, 5, worker=part.workers[0].address)
+    wait([future], timeout=LONG_S)
+
+    def refuse(*_, **__):
+        raise AssertionError
+
+    for name in ("who_has", "gather"):
+        monkeypatch.setitem(client.cluster.scheduler.handlers, name, refuse)
+    assert fetch_from(client, part.workers[0].address, [future.key], LONG_S) == {future.key: 10}
+
+
+# -- bytes that a long task leaves with its worker -------------------------------------
+
+SIZE = 8 * 2**20
+
+
+def hold(name):
+    """Hold bytes that do not compress, nor repeat; returns where."""
+    data = np.random.default_rng(0).bytes(SIZE)
+    return hold_for_driver(name, data), os.getpid()
+
+
+def received(monkeypatch):
+    """Count the bytes that this process, with client and scheduler, receives: {peer: bytes}."""
+    counts, read = Counter(), tcp.read_bytes_rw
+
+    async def count(stream, n):
+        counts[stream.socket.getpeername()[:2]] += n
+        return await read(stream, n)
+
+    monkeypatch.setattr(tcp, "read_bytes_rw", count)
+    return counts
+
+
+def test_held_bytes_are_fetched_once_and_do_not_pass_the_scheduler(processes, monkeypatch):
+    counts = received(monkeypatch)
+    name = f"part-{uuid.uuid4().hex}"
+    address, _ = Partition("GPU", processes).submit(hold, name).result(LONG_S)
+    assert counts.total() < SIZE / 8  # they have stayed where they were made
+    other = Partition("OTHER", processes).workers[0].address
+    assert take_held(processes, other, name) is None
+    assert take_held(processes, address, "another") is None
+    data = take_held(processes, address, name)
+    assert bytes(data) == np.random.default_rng(0).bytes(SIZE)
+    assert take_held(processes, address, name) is None
+    # The client connects to the worker's address; the scheduler is called from another port.
+    worker = parse_host_port(address.removeprefix("tcp://"))
+    assert counts.pop(worker) >= SIZE
+    assert counts.total() < SIZE / 8
+
+
+def test_what_a_dead_worker_had_is_given_up_soon(nannies):
+    """Dask tries for half a minute to connect to it."""
+    address, pid = nannies.submit(hold, "part").result(LONG_S)
+    result = nannies.submit(os.getpid, workers=[address])
+    wait([result], timeout=LONG_S)
+    assert fetch_from(nannies, address, [result.key], LONG_S) == {result.key: pid}
+    os.kill(pid, signal.SIGKILL)
+    while address in worker_identities(nannies):
+        time.sleep(0.01)
+    start = time.monotonic()
+    assert take_held(nannies, address, "part", patience_s=0.5) is None
+    assert fetch_from(nannies, address, [result.key], patience_s=0.5) == {}
+    assert time.monotonic() - start < 20

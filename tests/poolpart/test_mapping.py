@@ -35,7 +35,7 @@ def slow_if_even(x):
 
 def slow_from_200_to_220(x):
     if 200 <= x < 220:
-        time.sleep(0.3)
+        time.sleep(0.15)
     return x
 
 
@@ -192,7 +192,7 @@ def test_the_first_tasks_start_at_once(a, client, wait_until):
 
 
 def test_items_that_take_longer_than_those_before_are_shared_out_again(a, client):
-    # One after the other they would take six seconds, in the chunk that has them.
+    # One after the other they would take three seconds, in the chunk that has them.
     numbers = []
     for ordered in (True, False):
         results = a.map(slow_from_200_to_220, iter(range(3000)), ordered=ordered)

@@ -18,9 +18,9 @@ from poolpart import (
     n_workers,
     per_host,
     rebalancing,
+    reconciler,
     recorded,
     rest,
-    settling,
     trace_to,
     worker_identities,
 )
@@ -251,7 +251,7 @@ def test_a_worker_that_is_moved_on_in_the_moment_in_which_it_arrives(
 
     def move_on(seat):
         steward.book.put(seat, "B")
-        steward.settling.settle([seat])
+        steward.reconciler.settle([seat])
 
     def wake_and_move_on(scheduler, worker):
         # The last that is done for a worker; what comes next in the event loop is before anybody
@@ -259,10 +259,10 @@ def test_a_worker_that_is_moved_on_in_the_moment_in_which_it_arrives(
         wake(scheduler, worker)
         if worker.resources.get("A") and worker.name not in before and not arrived:
             arrived.append(worker.name)
-            seat = steward.settling.seat_at(worker.address)
+            seat = steward.reconciler.seat_at(worker.address)
             asyncio.get_running_loop().call_soon(move_on, seat)
 
-    monkeypatch.setattr(settling, "wake", wake_and_move_on)
+    monkeypatch.setattr(reconciler, "wake", wake_and_move_on)
     parts["A"].grow(1, source="C")
     wait_until(lambda: arrived and arrived[0] in members(parts["B"]))
     assert members(parts["A"]) == before
@@ -282,7 +282,7 @@ def test_a_cancelled_task_that_is_on_its_way_when_its_worker_leaves(start, monke
     wait_until(lambda: not scheduler.tasks)
     with ThreadPoolExecutor(1) as thread:
         moved = thread.submit(parts["A"].shrink)
-        wait_until(lambda: any(message["op"] == "poolpart-mark" for message in on_the_way[:]))
+        wait_until(lambda: any(message["op"] == "poolpart-barrier" for message in on_the_way[:]))
         time.sleep(0.1)
         assert not moved.done()
         monkeypatch.undo()

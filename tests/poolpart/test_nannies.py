@@ -8,7 +8,6 @@ import pytest
 from poolpart import Pool, WorkerInfo, book, n_workers, per_gpu, rest
 from poolpart.book import Book, Seat
 from poolpart.nannies import has_gone
-from poolpart.vacancies import successor, vacated
 
 
 def declared(client):
@@ -26,21 +25,21 @@ def test_nobody_listens():
 
 @pytest.mark.parametrize("others", [n_workers(1), rest()])
 def test_the_place_of_a_worker_that_was_stopped_goes_to_the_next(
-    nannies, wait_until, monkeypatch, others
+    own_nannies, wait_until, monkeypatch, others
 ):
     """Also if that one has joined before, and was given to what takes the rest."""
     monkeypatch.setattr(book, "HOLD_S", 3600.0)
-    parts = Pool.from_client(nannies).divide({"A": n_workers(1), "B": others})
-    (name,) = (name for name, resources in declared(nannies).items() if "A" in resources)
-    spec = nannies.cluster.worker_spec.pop(name)
-    nannies.sync(nannies.cluster._correct_state)
-    wait_until(lambda: name not in declared(nannies))
+    parts = Pool.from_client(own_nannies).divide({"A": n_workers(1), "B": others})
+    (name,) = (name for name, resources in declared(own_nannies).items() if "A" in resources)
+    spec = own_nannies.cluster.worker_spec.pop(name)
+    own_nannies.sync(own_nannies.cluster._correct_state)
+    wait_until(lambda: name not in declared(own_nannies))
     waiting = parts["A"].submit(pow, 2, 6)
-    nannies.cluster.worker_spec["next"] = spec
-    nannies.sync(nannies.cluster._correct_state)
+    own_nannies.cluster.worker_spec["next"] = spec
+    own_nannies.sync(own_nannies.cluster._correct_state)
     assert waiting.result(120) == 64
-    (stayed,) = declared(nannies).keys() - {"next"}
-    assert declared(nannies) == {"next": {"A": 1}, stayed: {"B": 1}}
+    (stayed,) = declared(own_nannies).keys() - {"next"}
+    assert declared(own_nannies) == {"next": {"A": 1}, stayed: {"B": 1}}
 
 
 # -- who inherits a place, by the book alone -------------------------------------------
@@ -61,15 +60,15 @@ def test_only_whoever_joined_since_inherits(monkeypatch):
     before, after = seat("before", "B", joined=9.0), seat("after", "B", joined=11.0)
     rules = {"A": n_workers(1), "B": rest(minimum=1)}
     mine = a_book(gone, before, after, **rules)
-    assert vacated(mine) == [gone]
-    assert vacated(mine) == []
-    assert successor(mine, gone) is after
-    assert successor(a_book(gone, after, **rules), gone) is None  # B has none to spare
-    assert successor(a_book(gone, before, seat("b", "B"), **rules), gone) is None
+    assert mine.vacated() == [gone]
+    assert mine.vacated() == []
+    assert mine.replacement(gone) is after
+    assert a_book(gone, after, **rules).replacement(gone) is None  # B has none to spare
+    assert a_book(gone, before, seat("b", "B"), **rules).replacement(gone) is None
     lent = seat("lent", "B", joined=11.0, home="C")
-    assert successor(a_book(gone, before, lent, **rules, C=n_workers(1)), gone) is None
+    assert a_book(gone, before, lent, **rules, C=n_workers(1)).replacement(gone) is None
     filled = a_book(gone, before, after, seat("next", "A", joined=12.0), **rules)
-    assert successor(filled, gone) is None
+    assert filled.replacement(gone) is None
 
 
 def test_a_place_at_a_gpu_is_not_for_a_worker_without(monkeypatch):
@@ -78,5 +77,5 @@ def test_a_place_at_a_gpu_is_not_for_a_worker_without(monkeypatch):
     there = seat("there", "GPU", gpus=("y",))
     without, one = seat("without", "B", joined=11.0), seat("one", "B", joined=12.0, gpus=("x",))
     rules = {"GPU": per_gpu(1), "B": rest()}
-    assert successor(a_book(gone, there, without, one, **rules), gone) is one
-    assert successor(a_book(gone, there, without, **rules), gone) is None
+    assert a_book(gone, there, without, one, **rules).replacement(gone) is one
+    assert a_book(gone, there, without, **rules).replacement(gone) is None

@@ -19,10 +19,8 @@ from distributed import Client, Scheduler, SpecCluster, Worker, get_worker
 
 from poolpart import Partition, Pipe, Pool, PoolError
 from poolpart.fence import raise_fence
-from poolpart.page import partitions_page, remove_partitions_page, tell_page
-from poolpart.page_server import snapshot
-from poolpart.stats import statistics_of
-from poolpart.stats_plugin import Ran
+from poolpart.page import partitions_page, remove_partitions_page, snapshot, tell_page
+from poolpart.stats import Ran, statistics_of
 
 LONG_S = 120.0
 NASTY = "<script>alert('x')</script>&\"'"
@@ -98,7 +96,7 @@ def test_what_it_tells(client, wait_until):
     part = Partition("A", client)
     results = [part.submit(work, i) for i in range(6)]
     failing = part.submit(broken)
-    pipe = Pipe("lidarpool-12345678-scans", 5, client).create()
+    pipe = Pipe("frames-12345678", 5, client).create()
     try:
         for item in range(3):
             pipe.put(item)
@@ -110,7 +108,7 @@ def test_what_it_tells(client, wait_until):
         pipe.fail("the reason")
         assert data_of(url)["pipes"] == [
             {
-                "name": "lidarpool-12345678-scans",
+                "name": "frames-12345678",
                 "depth": 3,
                 "state": "failed",
                 "failure": "the reason",

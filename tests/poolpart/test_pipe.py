@@ -12,7 +12,7 @@ from distributed import Client
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from poolpart import Partition, Pipe, PipeClosed, PipeFailed, forget_pipes, pipe_parts
+from poolpart import Partition, Pipe, PipeClosed, PipeFailed, forget_pipes
 from poolpart import pipe as pipe_module
 
 LONG_S = 120.0  # for what happens at once, or the test fails
@@ -447,5 +447,45 @@ def test_two_pipes_of_one_name(client, make_pipe):
 def test_a_pipe_of_a_client_that_has_left_is_not_made(client, before):
     """One that was killed while it asked may be known to be gone before it is heard."""
     arguments = {"name": "late", "owner": "gone", "state": {}}
-    assert not client.run_on_scheduler(pipe_parts._open, **arguments)
+    assert not client.run_on_scheduler(pipe_module._open, **arguments)
     assert known(client) == before
+
+
+@pytest.mark.parametrize(
+    ("change", "outcome"),
+    [
+        (Pipe.poll, None),
+        (Pipe.close, PipeClosed),
+        (Pipe.delete, PipeFailed),
+        (lambda pipe: pipe.fail("no more"), PipeFailed),
+    ],
+)
+def test_a_put_that_waits_for_room_hears_at_once(client, make_pipe, monkeypatch, change, outcome):
+    """By the scheduler's answer: it would look by itself only after the longest wait."""
+    monkeypatch.setattr(pipe_module, "_WAIT_S", LONG_S)
+    pipe = make_pipe(client, capacity=1)
+    pipe.put("first")
+    with ThreadPoolExecutor(1) as thread:
+        waiting = thread.submit(pipe.put, "second")
+        time.sleep(0.2)
+        assert not waiting.done()
+        start = time.monotonic()
+        change(Pipe(pipe.name, 1, client))
+        error = waiting.exception(LONG_S)
+    assert time.monotonic() - start < LONG_S / 2
+    assert error is None if outcome is None else isinstance(error, outcome)
+    if outcome is None:
+        assert pipe.poll() == ["second"]
+
+
+def test_an_unbounded_put_does_not_wait_for_room(client, make_pipe):
+    pipe = make_pipe(client, capacity=1)
+    for number in range(5):
+        pipe.put(number, unbounded=True)
+    assert pipe.depth == 5
+    with pytest.raises(TimeoutError, match=r"stayed full for 0\.1 s"):
+        pipe.put("bounded", timeout_s=0.1)
+    assert pipe.poll() == [0, 1, 2, 3, 4]
+    pipe.close()
+    with pytest.raises(PipeClosed):
+        pipe.put("late", unbounded=True)

@@ -53,9 +53,9 @@ def kill_a_waiting_consumer(client, function, greetings, what, waits=lambda: Tru
 
 def test_items_from_and_to_several_processes(processes, make_pipe):
     pipe = make_pipe(processes, capacity=5)
-    lidar, gpu, other = (Partition(name, processes) for name in ("LIDAR", "GPU", "OTHER"))
+    io, gpu, other = (Partition(name, processes) for name in ("IO", "GPU", "OTHER"))
     consumers = [part.submit(consume, pipe) for part in (gpu, other)]
-    producers = [lidar.submit(produce, pipe, number, 50) for number in range(3)]
+    producers = [io.submit(produce, pipe, number, 50) for number in range(3)]
     for producer in producers:
         producer.result(LONG_S)
     pipe.close()

@@ -52,13 +52,13 @@ def test_more_workers_than_dask_lists_by_default(start):
 
 
 def test_a_cluster_from_the_command_line_is_divided_already(start):
-    workers = {"g": {"resources": {"GPU": 1}}, "l": {"resources": {"LIDAR": 4}}, "free": {}}
+    workers = {"g": {"resources": {"GPU": 1}}, "l": {"resources": {"IO": 4}}, "free": {}}
     parts = Pool.from_client(start(workers)).partitions()
     assert {name: (len(part), part.slots) for name, part in parts.items()} == {
         "GPU": (1, 1),
-        "LIDAR": (1, 4),
+        "IO": (1, 4),
     }
-    assert parts["LIDAR"].submit(here).result() == "l"
+    assert parts["IO"].submit(here).result() == "l"
 
 
 def test_dividing_the_remainder_again(start):
@@ -228,16 +228,16 @@ def test_without_gpus_the_fall_back_is_seen(start, caplog):
 
 
 def test_slots_that_are_missing_are_named_with_their_purpose(start):
-    pool = Pool.from_client(start({"l": {"resources": {"LIDAR": 2}}}))
-    pool.require({"LIDAR": 2})
-    with pytest.raises(PoolError, match=r"'LIDAR' has 2 of the 4 slots needed \(four stages\): "):
-        pool.require({"LIDAR": 4}, {"LIDAR": "four stages"})
+    pool = Pool.from_client(start({"l": {"resources": {"IO": 2}}}))
+    pool.require({"IO": 2})
+    with pytest.raises(PoolError, match=r"'IO' has 2 of the 4 slots needed \(four stages\): "):
+        pool.require({"IO": 4}, {"IO": "four stages"})
     with pytest.raises(PoolError, match="'GPU' has 0 of the 1 slot needed: start workers"):
-        pool.require({"GPU": 1}, {"LIDAR": "four stages"})
+        pool.require({"GPU": 1}, {"IO": "four stages"})
 
 
 def test_a_worker_in_two_partitions(start):
-    pool = Pool.from_client(start({"w": {"resources": {"GPU": 1, "LIDAR": 4}}}))
+    pool = Pool.from_client(start({"w": {"resources": {"GPU": 1, "IO": 4}}}))
     pool.require({"GPU": 1})
-    with pytest.raises(PoolError, match="Worker w declares GPU and LIDAR: give each worker one"):
-        pool.require({"GPU": 1, "LIDAR": 1})
+    with pytest.raises(PoolError, match="Worker w declares GPU and IO: give each worker one"):
+        pool.require({"GPU": 1, "IO": 1})

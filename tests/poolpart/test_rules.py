@@ -19,8 +19,7 @@ from poolpart import (
     steward,
     worker_identities,
 )
-from poolpart.rules import check_rules, divide, partition_for
-from poolpart.selection import NO_GPU
+from poolpart.rules import NO_GPU, check_rules, divide, partition_for
 
 
 def worker(name, *gpus, host="h", **resources):
@@ -40,8 +39,8 @@ def here():
 
 def test_each_rule_takes_of_what_those_before_it_have_left():
     pool = [worker("a"), worker("b", "x"), worker("c", "x"), worker("d"), worker("e", host="2")]
-    rules = {"GPU": per_gpu(1), "LIDAR": per_host(1), "REST": rest()}
-    assert names(rules, pool) == {"GPU": ["b"], "LIDAR": ["a", "e"], "REST": ["c", "d"]}
+    rules = {"GPU": per_gpu(1), "IO": per_host(1), "REST": rest()}
+    assert names(rules, pool) == {"GPU": ["b"], "IO": ["a", "e"], "REST": ["c", "d"]}
 
 
 def test_workers_that_a_rule_names_are_kept_for_it():
@@ -100,21 +99,21 @@ def test_rules_that_make_no_sense(rules, message):
 
 # -- whom a worker that joins belongs to -----------------------------------------------
 
-RULES = {"GPU": per_gpu(1), "LIDAR": per_host(2), "OTHER": rest()}
+RULES = {"GPU": per_gpu(1), "IO": per_host(2), "OTHER": rest()}
 
 
 def test_a_gpu_that_nobody_uses_comes_first():
-    members = {"GPU": [worker("a", "x")], "LIDAR": [worker("b")], "OTHER": []}
+    members = {"GPU": [worker("a", "x")], "IO": [worker("b")], "OTHER": []}
     assert partition_for(worker("new", "y"), RULES, members) == "GPU"
-    assert partition_for(worker("new", "x"), RULES, members) == "LIDAR"
-    assert partition_for(worker("new"), RULES, members) == "LIDAR"
-    assert partition_for(worker("new", host="2"), RULES, members) == "LIDAR"
-    full = members | {"LIDAR": [worker("b"), worker("c")]}
+    assert partition_for(worker("new", "x"), RULES, members) == "IO"
+    assert partition_for(worker("new"), RULES, members) == "IO"
+    assert partition_for(worker("new", host="2"), RULES, members) == "IO"
+    full = members | {"IO": [worker("b"), worker("c")]}
     assert partition_for(worker("new"), RULES, full) == "OTHER"
 
 
 def test_a_gpu_worker_joins_where_cpu_workers_had_to_do():
-    members = {"GPU": [worker("a")], "LIDAR": [worker("b"), worker("c")], "OTHER": []}
+    members = {"GPU": [worker("a")], "IO": [worker("b"), worker("c")], "OTHER": []}
     assert partition_for(worker("new", "x"), RULES, members) == "GPU"
     assert partition_for(worker("new"), RULES, members) == "OTHER"
     assert partition_for(worker("new", host="2"), RULES, members) == "GPU"

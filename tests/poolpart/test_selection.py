@@ -7,8 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from poolpart import PoolError, WorkerInfo, n_workers
-from poolpart.rules import divide
-from poolpart.selection import NO_GPU, check_request, choose
+from poolpart.rules import NO_GPU, check_request, choose, divide
 
 NONE = dict.fromkeys(("max_workers_per_gpu", "max_workers_per_host", "n_workers", "workers"))
 

@@ -7,8 +7,17 @@ from distributed import Client, get_worker, worker_client
 from distributed.diagnostics.plugin import SchedulerPlugin
 
 from poolpart import Partition
-from poolpart.stats import StageStats, partition_stats, unwatch, watch
-from poolpart.stats_plugin import MOST_STAGES, NAME, OTHER_STAGES, RECENT_TASKS, Statistics
+from poolpart.stats import (
+    MOST_STAGES,
+    NAME,
+    OTHER_STAGES,
+    RECENT_TASKS,
+    StageStats,
+    Statistics,
+    partition_stats,
+    unwatch,
+    watch,
+)
 
 LONG_S = 120.0
 CLUSTER = {"A-0": {"resources": {"A": 2}, "nthreads": 2}, "B-0": {"resources": {"B": 1}}}

@@ -86,8 +86,10 @@ def test_a_task_for_a_worker_by_name_waits_for_its_old_address_and_one_for_a_par
 
 
 @pytest.mark.slow
-def test_two_deaths_condemn_a_pile_of_innocent_tasks_and_not_a_window(nannies, wait_until):
-    nannies.cluster.scheduler.allowed_failures = 1
+def test_two_deaths_condemn_a_pile_of_innocent_tasks_and_not_a_window(
+    nannies, wait_until, monkeypatch
+):
+    monkeypatch.setattr(nannies.cluster.scheduler, "allowed_failures", 1)
     partition, _ = Pool.from_client(nannies).partition("P", workers=["1"])
     count = 40
     # What has ended is lost with the worker, but is not to blame: most are not to end before.

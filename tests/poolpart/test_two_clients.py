@@ -7,7 +7,7 @@ from functools import partial
 import pytest
 from distributed import Client, Event
 
-from poolpart import Partition, Pool, PoolError, making, n_workers, rest, steward, trace_to
+from poolpart import Partition, Pool, PoolError, n_workers, pool, rest, steward, trace_to
 
 LONG_S = 120.0
 
@@ -33,7 +33,7 @@ def two(start):
 def both(monkeypatch):
     """Call two functions so that both have looked at the cluster before either changes it."""
     looked = threading.Barrier(2, timeout=LONG_S)
-    declare = making.declare
+    declare = pool.declare
 
     def wait_and_declare(*args):
         looked.wait()
@@ -46,10 +46,10 @@ def both(monkeypatch):
             except PoolError as error:
                 return error
 
-        monkeypatch.setattr(making, "declare", wait_and_declare)
+        monkeypatch.setattr(pool, "declare", wait_and_declare)
         with ThreadPoolExecutor(2) as threads:
             outcomes = list(threads.map(outcome, functions))
-        monkeypatch.setattr(making, "declare", declare)
+        monkeypatch.setattr(pool, "declare", declare)
         return outcomes
 
     return call

@@ -1,7 +1,12 @@
-"""Having workers declare what the scheduler's book says, whatever happens on the way.
+"""Having workers declare what the scheduler's book says.
 
-What each worker declares is compared with the book, and made so in small steps that can be cut
+What each worker declares is compared with the book, and changed in small steps that can be cut
 off anywhere: a worker or its nanny may die between any two of them.
+
+The scheduler's request to declare other resources goes by another connection than the tasks
+that it sends, and may arrive first. A task that was sent and cancelled at once is forgotten by
+the scheduler while it is on its way; a worker that gets a task for a resource which it does not
+declare breaks down. So a barrier is sent behind the tasks, and the worker waits for it.
 """
 
 from __future__ import annotations
@@ -9,23 +14,25 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
+import uuid
 from collections.abc import Awaitable, Callable, Collection, Iterable
 from typing import Any
 
 from .book import Book, Resources, Seat, seat_key
-from .calls import call
-from .marks import send_mark
 from .nannies import Nannies
 from .placing import hand_off, held_by, recount, show, wake
-from .restarts import declare_on_worker
+from .remote import call
 from .tracing import trace
 
 logger = logging.getLogger(__name__)
 
 LOOK_EVERY_S = 0.01
 
+_HELD_S = 1.0  # how long a worker waits for tasks to give a resource back
+_BARRIER = "poolpart-barrier"
 
-class Settling:
+
+class Reconciler:
     """Makes the book come true; part of the steward.
 
     Parameters
@@ -50,7 +57,7 @@ class Settling:
         self.scheduler, self.book, self.nannies = scheduler, book, nannies
         self._find_place = find_place
         self._declared: dict[str, Resources] = {}  # {address: what the worker itself declares}
-        self._tasks: dict[str, asyncio.Task[None]] = {}  # {address: settling of that worker}
+        self._tasks: dict[str, asyncio.Task[None]] = {}  # {address: work on that worker}
 
     def seat_at(self, address: str) -> Seat | None:
         """Seat of the worker at an address; None if there is no such worker."""
@@ -145,13 +152,13 @@ class Settling:
         await self.nannies.tell(seat, wanted)
         trace("partition.nanny_told", worker=worker.address, declares=dict(wanted))
         if leaving:
-            await send_mark(self.scheduler, worker.address)
+            await send_barrier(self.scheduler, worker.address)
         done = await call(
             self.scheduler,
             worker.address,
             declare_on_worker,
             resources=wanted,
-            after_mark=bool(leaving),
+            after_barrier=bool(leaving),
         )
         if not done:
             return
@@ -181,3 +188,73 @@ class Settling:
                 break
             await asyncio.sleep(LOOK_EVERY_S)
         return late
+
+
+# -- on the worker, but for the first --------------------------------------------------
+
+
+async def send_barrier(scheduler: Any, address: str) -> None:
+    """Send a barrier behind all messages to a worker; runs on the scheduler.
+
+    Raises
+    ------
+    OSError
+        If the worker does not answer.
+    """
+    number = uuid.uuid4().hex
+    await call(scheduler, address, _await_barrier, number=number)
+    if address in scheduler.stream_comms:
+        scheduler.worker_send(address, {"op": _BARRIER, "number": number})
+
+
+def _is_awaited(worker: Any) -> bool:
+    """Whether a barrier is still on its way; runs on the worker."""
+    return _BARRIER in worker.stream_handlers
+
+
+def _await_barrier(number: str, dask_worker: Any = None) -> None:
+    awaited = number
+
+    def arrive(number: str) -> None:
+        # Barriers arrive in the order in which they were sent: behind this one there is none.
+        if number == awaited:
+            del dask_worker.stream_handlers[_BARRIER]
+
+    dask_worker.stream_handlers[_BARRIER] = arrive
+
+
+async def declare_on_worker(
+    resources: Resources, after_barrier: bool = False, dask_worker: Any = None
+) -> bool:
+    """Declare these resources and no others; runs on a worker.
+
+    Parameters
+    ----------
+    resources
+        What to declare.
+    after_barrier
+        Whether to wait for what the scheduler has sent before.
+
+    Returns
+    -------
+    done
+        False if tasks still hold a resource that is to go: they give it back when they end,
+        and must find it then. Such a task may be one that was cancelled, of which the
+        scheduler knows nothing any more; it may even be on its way.
+    """
+    state = dask_worker.state
+    total, available = state.total_resources, state.available_resources
+    leaving = total.keys() - resources.keys()
+    for _ in range(int(_HELD_S / 0.01)):
+        held = any(available[name] < total[name] for name in leaving)
+        if not held and not (after_barrier and _is_awaited(dask_worker)):
+            break
+        await asyncio.sleep(0.01)
+    else:
+        return False
+    for name in leaving:
+        del total[name], available[name]
+    for name, quantity in resources.items():
+        available[name] = available.get(name, 0) + quantity - total.get(name, 0)
+        total[name] = quantity
+    return True

@@ -1,9 +1,9 @@
-"""Where tasks are and how they fared, and which workers give no sign of life."""
+"""What the scheduler knows of a partition now: its tasks, free slots and silent workers."""
 
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from distributed import Client
@@ -80,7 +80,7 @@ def look_for_tasks(
     """
     members, silent, tasks = on_scheduler(
         client,
-        _look,
+        _look_for_tasks,
         resource=resource,
         keys=list(keys),
         patience_s=SILENT_S if patience_s is None else patience_s,
@@ -98,7 +98,7 @@ def silent_workers(scheduler: Any, patience_s: float) -> set[str]:
     return {ws.address for ws in scheduler.workers.values() if now - ws.last_seen > patience_s}
 
 
-def _look(
+def _look_for_tasks(
     resource: str, keys: list[str], patience_s: float, dask_scheduler: Any = None
 ) -> tuple[Any, ...]:
     workers = dask_scheduler.workers.values()
@@ -112,3 +112,76 @@ def _look(
             places = tuple(ws.address for ws in holders)
             tasks[key] = (task.state, places, task.suspicious)
     return members, [address for address in members if address in silent], tasks
+
+
+@dataclass(frozen=True)
+class Slots:
+    """Slots of a partition at one moment.
+
+    Parameters
+    ----------
+    free
+        Slots that no task holds or waits for, by address of the worker; below 0 where more
+        tasks were given to a worker than it has slots for. Workers that take no tasks at the
+        moment, or give no sign of life, are left out.
+    present
+        Addresses of all workers of the partition.
+    running
+        Those of the keys asked for whose tasks run for long, that is, have seceded.
+    known
+        Those of the keys asked for that the scheduler has heard of.
+    silent
+        Addresses of those workers that give no sign of life, see `Whereabouts`.
+    total
+        Slots of the workers that take tasks at the moment, free or not.
+    """
+
+    free: dict[str, int]
+    present: frozenset[str]
+    running: frozenset[str]
+    known: frozenset[str] = frozenset()
+    silent: frozenset[str] = frozenset()
+    total: int = 0
+
+    def without(self, addresses: Collection[str]) -> Slots:
+        """Leave out what is free on some workers."""
+        free = {address: count for address, count in self.free.items() if address not in addresses}
+        return replace(self, free=free)
+
+
+def look_at_slots(client: Client, resource: str, keys: Collection[str] = ()) -> Slots:
+    """See which slots of a partition are free.
+
+    Dask places a task by a worker's total resources, not by what is free, and prefers the
+    worker with the least work ahead; one whose only slot is held by a task that has seceded
+    looks idle to it. A long-running task that lands there waits as long as the other runs.
+    Whoever starts several of them should choose their workers.
+    """
+    free, total, *sets = on_scheduler(
+        client, _look_at_slots, resource=resource, keys=list(keys), patience_s=SILENT_S
+    )
+    present, running, known, silent = map(frozenset, sets)
+    return Slots(free, present, running, known, silent, total)
+
+
+def _look_at_slots(
+    resource: str, keys: list[str], patience_s: float, dask_scheduler: Any = None
+) -> tuple[Any, ...]:
+    silent = silent_workers(dask_scheduler, patience_s)
+    members = [ws for ws in dask_scheduler.workers.values() if ws.resources.get(resource)]
+    usable = [ws for ws in members if ws.status.name == "running" and ws.address not in silent]
+    free = {ws.address: int(ws.resources[resource] - _in_use(ws, resource)) for ws in usable}
+    total = sum(int(ws.resources[resource]) for ws in usable)
+    known = [key for key in keys if key in dask_scheduler.tasks]
+    running = [key for key in known if _runs_for_long(dask_scheduler.tasks[key])]
+    return free, total, [ws.address for ws in members], running, known, list(silent)
+
+
+def _runs_for_long(task: Any) -> bool:
+    return task.processing_on is not None and task in task.processing_on.long_running
+
+
+def _in_use(worker: Any, resource: str) -> float:
+    """Count what the tasks on a worker hold: Dask's own count is off once one was stolen."""
+    held = ((task.resource_restrictions or {}).get(resource, 0) for task in worker.processing)
+    return float(sum(held))

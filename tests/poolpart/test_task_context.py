@@ -1,4 +1,4 @@
-"""Several tasks of one worker that ask for its client at the same moment."""
+"""A task's client, also where several ask at the same moment; tasks whose worker leaves."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from distributed import Client
+from distributed import Client, Status
 from distributed.diagnostics.plugin import SchedulerPlugin
 
-from poolpart import worker_identities
-from poolpart.current_client import own_client
+from poolpart import WorkerLeft, own_client, telling_departure, worker_identities
 
 
 def test_one_asks_at_a_time(monkeypatch):
@@ -24,7 +23,7 @@ def test_one_asks_at_a_time(monkeypatch):
         inside.release()
         return "client"
 
-    monkeypatch.setattr("poolpart.current_client.get_client", slow)
+    monkeypatch.setattr("poolpart.task_context.get_client", slow)
     with ThreadPoolExecutor(4) as threads:
         assert [*threads.map(lambda _: own_client(), range(8))] == ["client"] * 8
     assert together == [False] * 8
@@ -34,7 +33,7 @@ def test_one_that_fails_does_not_keep_others_out(monkeypatch):
     def fail() -> Client:
         raise OSError("no scheduler")
 
-    monkeypatch.setattr("poolpart.current_client.get_client", fail)
+    monkeypatch.setattr("poolpart.task_context.get_client", fail)
     for _ in range(2):
         with pytest.raises(OSError, match="no scheduler"):
             own_client()
@@ -53,7 +52,7 @@ def test_a_coroutine_does_not_wait_for_a_thread_that_needs_its_loop(monkeypatch)
             asyncio.run_coroutine_threadsafe(asyncio.sleep(0.01), loop).result(10)
             return "thread"
 
-        monkeypatch.setattr("poolpart.current_client.get_client", make)
+        monkeypatch.setattr("poolpart.task_context.get_client", make)
         thread = asyncio.create_task(asyncio.to_thread(own_client))
         await asyncio.to_thread(entered.wait)
         return [own_client(), await thread]
@@ -82,6 +81,7 @@ def status_on_worker() -> str:
 
 def test_one_that_was_told_too_much_at_once_is_made_again(nannies):
     """Without a second try the task fails with an AssertionError."""
+    nannies.restart()  # its workers have no client yet
     nannies.register_plugin(TellAtOnce())
     worker = next(iter(worker_identities(nannies)))
     futures = [nannies.submit(status_on_worker, workers=[worker], pure=False) for _ in range(3)]
@@ -89,6 +89,7 @@ def test_one_that_was_told_too_much_at_once_is_made_again(nannies):
     told = nannies.run_on_scheduler(
         lambda dask_scheduler: dask_scheduler.plugins[TellAtOnce.name].told
     )
+    nannies.unregister_scheduler_plugin(TellAtOnce.name)
     assert told == 1
 
 
@@ -102,3 +103,33 @@ def test_tasks_of_a_worker_share_its_client(start):
     told = client.gather(client.map(identity, [str(number) for number in range(8)]))
     assert len({name for name, _ in told}) == 1
     assert {status for _, status in told} == {"running"}
+
+
+# -- a worker that leaves under its task ------------------------------------------------
+
+
+class ClosingWorker:
+    """Stands in for the worker of a task."""
+
+    status = Status.closing
+
+
+def test_what_is_raised_while_a_worker_leaves_says_so(monkeypatch):
+    monkeypatch.setattr("poolpart.task_context.get_worker", ClosingWorker)
+    message = r"the worker has left \(AttributeError: 'NoneType' object has no"
+    with pytest.raises(WorkerLeft, match=message) as caught, telling_departure():
+        None.queue_get  # noqa: B018 - what Dask does with a client that was closed
+    assert caught.value.__cause__ is None
+
+
+@pytest.mark.parametrize("status", [Status.running, Status.paused, Status.closing_gracefully])
+def test_on_a_worker_that_stays_errors_are_what_they_are(monkeypatch, status):
+    monkeypatch.setattr(ClosingWorker, "status", status)
+    monkeypatch.setattr("poolpart.task_context.get_worker", ClosingWorker)
+    with pytest.raises(ZeroDivisionError), telling_departure():
+        1 / 0  # noqa: B018
+
+
+def test_where_there_is_no_worker_errors_are_what_they_are():
+    with pytest.raises(ZeroDivisionError), telling_departure():
+        1 / 0  # noqa: B018
