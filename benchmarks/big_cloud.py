@@ -1,10 +1,10 @@
-"""A cloud larger than memory: delivered, merged and written under a limit on memory.
+"""A cloud larger than memory: read from its parts and written under a limit on memory.
 
 Usage: python -m benchmarks.big_cloud [--points N] [--mebibytes M] [--folder PATH]
 
-The deliveries of a survey are made up, out of order, and go the way that a survey's go: into
-the store on disk, from there in order into pieces, through Open3D into one file. The process
-may allocate only so much memory besides what its libraries take (RLIMIT_DATA).
+The parts of a survey are made up; they go from storage in order into pieces, through Open3D into
+one file. The process may allocate only so much memory besides what its libraries take
+(RLIMIT_DATA).
 """
 
 from __future__ import annotations
@@ -18,11 +18,13 @@ from pathlib import Path
 import numpy as np
 import open3d  # noqa: F401 - counted among the libraries
 
-from lidarpool.ply import save_cloud
-from lidarpool.scan.builder import CloudBuilder
-from lidarpool.scan.messages import POINT, Part
+from lidarpool.columns.parts import PartColumns, StoredCloud, pack
+from lidarpool.columns.storage import Storage
+from lidarpool.columns.table import ALWAYS
+from lidarpool.export.ply import save_cloud
 
-PER_SCAN = 10_000
+PER_SCAN = 20_000
+PER_PART = 10  # scans
 
 
 def limit_memory(extra: int) -> None:
@@ -32,41 +34,45 @@ def limit_memory(extra: int) -> None:
     resource.setrlimit(resource.RLIMIT_DATA, (held + extra, held + extra))
 
 
-def deliver(scans: int) -> CloudBuilder:
-    """Deliver that many scans, out of order."""
-    table = np.zeros(PER_SCAN, POINT)
-    table["cell"] = np.random.default_rng(1).integers(-90_000, 90_000, (PER_SCAN, 3))
-    table["ray"] = np.arange(PER_SCAN)
-    builder = CloudBuilder(scans)
-    for scan in np.random.default_rng(2).permutation(scans).tolist():
-        table["scan"] = scan
-        builder.add(Part((scan,), (PER_SCAN,), table))
-    return builder
+def make_parts(storage: Storage, points: int) -> StoredCloud:
+    """Write parts of that many points."""
+    rows = PER_SCAN * PER_PART
+    chance = np.random.default_rng(1)
+    columns = {
+        column.name: chance.integers(0, 90_000 if column.name in "xyz" else 40, rows).astype(
+            column.dtype
+        )
+        for column in ALWAYS
+    }
+    names = []
+    storage.prepare()
+    for number in range(max(1, points // rows)):
+        counts = np.full(PER_PART, PER_SCAN, np.int64)
+        tally = np.zeros(0, np.int32), np.zeros(0, np.int64)
+        part = PartColumns(number * PER_PART, counts, columns, *tally)
+        names.append(f"{number:08d}.npz")
+        storage.write(names[-1], pack(part))
+    cells = np.array([[0, 0, 0], [90_000] * 3], np.int64)
+    return StoredCloud(storage, names, [rows] * len(names), ALWAYS, cells, 0.01, np.zeros(3))
 
 
-def main(arguments: list[str] | None = None) -> dict[str, float]:
+def main() -> None:
+    """Write a cloud under a limit on memory."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--points", type=float, default=1e8)
-    parser.add_argument("--mebibytes", type=int, default=400)
-    parser.add_argument("--folder", type=Path, help="where the files go; they are removed")
-    options = parser.parse_args(arguments)
-    scans = max(1, int(options.points) // PER_SCAN)
-    with tempfile.TemporaryDirectory(dir=options.folder) as folder:
-        tempfile.tempdir = folder
-        limit_memory(options.mebibytes << 20)
-        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        begun = time.perf_counter()
-        builder = deliver(scans)
-        delivered = time.perf_counter()
-        size = save_cloud(Path(folder) / "cloud.ply", builder.merge(0.01, np.zeros(3)))
-        ended = time.perf_counter()
-        tempfile.tempdir = None
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(f"{scans * PER_SCAN:,} points, {size / 1e9:.2f} GB of .ply")
-    print(f"limit   {options.mebibytes} MiB of data besides the libraries")
-    print(f"peak    {peak:,.0f} MiB resident, {before:,.0f} of them before the first point")
-    print(f"deliver {delivered - begun:.1f} s, merge and write {ended - delivered:.1f} s")
-    return {"points": scans * PER_SCAN, "peak_mib": peak, "seconds": ended - begun}
+    parser.add_argument("--points", type=int, default=100_000_000)
+    parser.add_argument("--mebibytes", type=int, default=300)
+    parser.add_argument("--folder", type=Path)
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory(dir=given.folder) as folder:
+        cloud = make_parts(Storage.at(Path(folder) / "parts"), given.points)
+        limit_memory(given.mebibytes << 20)
+        began = time.perf_counter()
+        size = save_cloud(Path(folder) / "cloud.ply", cloud)
+        seconds = time.perf_counter() - began
+    print(
+        f"{len(cloud):,} points, {size / 1e9:.2f} GB of PLY, in {seconds:.1f} s with at most "
+        f"{given.mebibytes} MiB besides the libraries"
+    )
 
 
 if __name__ == "__main__":

@@ -26,6 +26,7 @@ import numpy as np
 from raybeam import Pattern, RayCaster, available_backends
 from raybeam.cuda_backend import CudaBackend
 from raybeam.mesh import local_mesh
+from raybeam.scan import Scan, check_scan
 
 from . import cuda_limits, cuda_warp
 from .cuda_scenes import Float, Mesh, city, revolution, six_objects
@@ -72,9 +73,9 @@ class Bench:
         self.check_seconds = time.perf_counter() - start
         self.engine = CudaBackend(self.local)
 
-    def whole(self, directions: Float) -> tuple[Any, ...]:
-        """Arguments of the engine's scans: all directions, from the origin, not turned."""
-        return Pattern(directions), (0, len(directions)), self.origin[None], None, (0.0, np.inf)
+    def whole(self, directions: Float) -> Scan:
+        """Ask for all directions, from the origin, not turned."""
+        return check_scan(Pattern(directions), self.origin)
 
     def build(self) -> dict[str, Any]:
         """Time both builds, from the checked mesh on the host to the tables on the device."""
@@ -89,7 +90,11 @@ class Bench:
     def kernels(self, directions: Float) -> dict[str, Any]:
         """Rates of the kernels alone, and of a whole scan up to arrays on the host."""
         cupy, engine, n, repeats = self.cupy, self.engine, len(directions), self.repeats
-        parts = list(engine._turned(*self.whole(directions)))
+        scan = self.whole(directions)
+        parts = list(engine._made(scan))
+        tables = [cupy.asarray(directions[a:b]) for a, b in scan.chunks(engine.chunk)]
+        limits = (np.float64(0.0), np.float64(np.inf))
+        start = cupy.asarray(self.origin[None])
         counts = cupy.zeros(engine._mesh.face_count, np.int64)
         results = [engine._cast("cast_pattern", size, rays) for _, size, rays in parts]
         hits = sum(int((place >= 0).sum()) for _, place in results)
@@ -99,20 +104,20 @@ class Bench:
                 engine._cast("cast_pattern", size, rays)
 
         def tally(every: bool) -> None:
-            for _, size, rays in parts:
-                engine._tally("pattern", size, rays, every, counts)
+            for table in tables:
+                rays = (start, np.int32(0), table, np.int64(len(table)), *limits)
+                engine._tally(len(table), rays, every, counts)
 
         def pack() -> None:
             for t, place in results:
                 engine._packer().add(t, place, 0, 1.0)
 
-        given = self.whole(directions)
         times = {
             "cast": milliseconds(cupy, cast, repeats),
             "count_closest": milliseconds(cupy, lambda: tally(False), repeats),
             "count_every": milliseconds(cupy, lambda: tally(True), repeats),
             "pack": milliseconds(cupy, pack, repeats),
-            "scan_to_host": wall_milliseconds(cupy, lambda: engine.scan(*given), repeats),
+            "scan_to_host": wall_milliseconds(cupy, lambda: engine.scan(scan), repeats),
         }
         rates = {name: n / took["median"] / 1e3 for name, took in times.items()}
         return {"rays": n, "hit_share": hits / n, "ms": times, "mrays_s": rates}
@@ -143,12 +148,17 @@ class Bench:
         wrong = {name: int((getattr(got, name) != getattr(want, name)).sum()) for name in names}
         turn, _ = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))
         pattern = Pattern(sample)
-        scan, turned = (c.scan(pattern, self.origin, turn) for c in (device, reference))
-        wrong["scan"] = len(sample)
-        if np.array_equal(scan.ray, turned.ray):
-            wrong["scan"] = int((scan.distance != turned.distance).sum())
+        track = self.origin + 1e-3 * np.arange(len(sample))[:, None]
+        for name, poses in (("scan", (self.origin, turn)), ("moving scan", (track, turn))):
+            scan, turned = (
+                c.scan(pattern, *poses, rays_per_pose=len(sample) if name == "scan" else 1)
+                for c in (device, reference)
+            )
+            wrong[name] = len(sample)
+            if np.array_equal(scan.ray, turned.ray):
+                wrong[name] = int((scan.distance != turned.distance).sum())
         for every in (False, True):
-            counts = [c.count_scan(pattern, self.origin, every=every) for c in (device, reference)]
+            counts = [c.count(self.origin, sample, every=every) for c in (device, reference)]
             wrong[f"counts, every {every}"] = int((counts[0] != counts[1]).sum())
         return {"sample": len(sample), "hits": int(want.hit.sum()), **wrong}
 

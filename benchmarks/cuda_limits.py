@@ -11,6 +11,7 @@ from raybeam import Pattern, RayCaster, cuda_build
 from raybeam.cuda_backend import CudaBackend
 from raybeam.layout import lay_out
 from raybeam.mesh import LocalMesh, local_mesh
+from raybeam.scan import check_scan
 
 from .cuda_scenes import Float, city, revolution, six_objects
 from .cuda_timing import milliseconds, wall_milliseconds
@@ -72,11 +73,16 @@ def many_rays(engine: CudaBackend, origin: Float, rays: int) -> dict[str, Any]:
     """Count the hits of more rays than one table holds: a pattern cast over and over."""
     pattern = Pattern(revolution(min(rays, 1 << 26)))
     times, counted = -(-rays // len(pattern)), 0
-    given = (pattern, (0, len(pattern)), origin[None], None, (0.0, np.inf), False)
-    once = int(engine.count_scan(*given).sum())
+    scan = check_scan(pattern, origin)
+
+    def count() -> int:
+        casts = (engine._cast("cast_pattern", n, rays) for _, n, rays in engine._made(scan))
+        return sum(int((place >= 0).sum()) for _, place in casts)
+
+    once = count()
     start = time.perf_counter()
     for _ in range(times):
-        counted += int(engine.count_scan(*given).sum())
+        counted += count()
     seconds = time.perf_counter() - start
     total = times * len(pattern)
     return {
@@ -111,7 +117,7 @@ def leaks(rays: int) -> dict[str, int]:
 def attributes(engine: CudaBackend) -> dict[str, dict[str, int]]:
     """Look up registers and local memory of the kernels that walk."""
     out = {}
-    for name in ("cast_table", "cast_pattern", "count_table", "count_pattern"):
+    for name in ("cast_table", "cast_pattern", "count_table"):
         kernel = engine._kernels.module.get_function(name)
         out[name] = {
             "registers": int(kernel.num_regs),

@@ -25,11 +25,11 @@ from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
 from lidarpool import Planning, Scene, Sensor, Survey
-from lidarpool.deliveries import Deliveries
-from lidarpool.job import Job
 from lidarpool.live import live_run
-from lidarpool.run import Run
-from poolpart import local_cluster
+from lidarpool.run.job import Job
+from lidarpool.run.local import local_cluster
+from lidarpool.run.run import Run
+from lidarpool.run.store import RunStore
 
 # The first word of a browser to viser: where its camera is.
 CAMERA = {
@@ -48,22 +48,22 @@ CAMERA = {
 
 def job(poses: int) -> Job:
     """Make a survey of six objects with some 80 points a scan, and a short planning."""
-    sensor = Sensor(rays_per_revolution=3600, layers=64, step_deg=2)
+    sensor = Sensor.grid(rays_per_revolution=3600, layers=64, step_deg=2)
     survey = Survey(sensor, [(0, 0, 1 + i / 100) for i in range(poses)], steps=180)
     return Job(Scene.seed(), survey, Planning((25, 25), (-30, -20), trials=4))
 
 
 def plain(client: Client, work: Job) -> float:
     """Seconds of a survey without a page."""
-    return Run(client, Deliveries(work)).drive(None, None).survey_seconds
+    return Run(client, RunStore(work)).drive(None, None).survey_seconds
 
 
 def watched(client: Client, work: Job) -> tuple[float, int]:
     """Seconds of a survey with a page that somebody looks at, and bytes that were sent."""
     with live_run(work, port=0, browser=False) as live, _looking(live) as taken:
-        kept = Deliveries(work)
-        live.follow(kept)
-        run = Run(client, kept)
+        store = RunStore(work)
+        live.follow(store)
+        run = Run(client, store)
         show = live.with_progress(lambda progress: None, run.partitions)
         seconds = run.drive(live.on_frame, show).survey_seconds
         live.finish()

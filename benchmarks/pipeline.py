@@ -1,10 +1,9 @@
 """What the pipeline itself costs, when casting costs nothing: `python -m benchmarks.pipeline`.
 
 The rays are trivial (a few towards one cube), so what is measured is the pipeline: pipes,
-scheduler, ledgers. All on one local cluster:
+scheduler, parts. All on one local cluster:
 
 - throughput of the four stages; several runs, the median counts;
-- what a journal on the disk takes of it;
 - the way of a scan from stage 1 to `on_frame`, with scans at a sensor's pace;
 - processor time of driver and scheduler, which share a process, for a million rays, in
   surveys of growing length.
@@ -15,7 +14,6 @@ from __future__ import annotations
 import argparse
 import json
 import statistics
-import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -25,8 +23,9 @@ import numpy as np
 from distributed import Client
 
 from lidarpool import Result, Scene, Sensor, Survey, simulate
-from lidarpool.mesh import Mesh
-from poolpart import local_cluster, trace_to
+from lidarpool.run.local import local_cluster
+from lidarpool.scene.mesh import Mesh
+from poolpart import trace_to
 
 STAGES = ("generate", "intersect", "sort", "collect")
 COST_RAYS = 64  # a scan, where the time for a million rays is measured
@@ -43,7 +42,7 @@ def cube() -> Scene:
 
 def measure(client: Client, scans: int, rays: int, **options: Any) -> Result:
     """Run one survey of `scans` scans, each of `rays` rays."""
-    sensor = Sensor(rays_per_revolution=360, layers=rays, step_deg=1)
+    sensor = Sensor.grid(rays_per_revolution=360, layers=rays, step_deg=1)
     poses = [(0.0, 0.0, 0.0)] * -(-scans // 360)
     survey = Survey(sensor, poses=poses, steps=min(scans, 360))
     result = simulate(cube(), survey, client=client, **options)
@@ -71,18 +70,6 @@ def throughput(client: Client, scans: int, rays: int, runs: int) -> dict[str, An
         "driver_and_scheduler_ms_per_scan": round(1e3 * statistics.median(cpu), 3),
         "stage_ms_per_scan": {s: round(1e3 * statistics.median(v), 3) for s, v in per_item.items()},
     }
-
-
-def journal_cost(client: Client, scans: int, rays: int, runs: int) -> dict[str, Any]:
-    """Compare runs that keep a journal with runs that keep none, turn and turn about."""
-    ratios = []
-    with tempfile.TemporaryDirectory() as folder:
-        for run in range(runs):
-            kept = measure(client, scans, rays, journal=Path(folder) / str(run))
-            plain = measure(client, scans, rays)
-            ratios.append(plain.survey_seconds / kept.survey_seconds)
-    spread = [round(min(ratios), 3), round(max(ratios), 3)]
-    return {"throughput_ratio": round(statistics.median(ratios), 3), "spread": spread}
 
 
 def latency(client: Client, scans: int, rays: int, pace: float) -> dict[str, float]:
@@ -151,7 +138,6 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     with local_cluster() as cluster, Client(cluster) as client:
         measure(client, 36, options.rays)  # the first run imports everything on the workers
         figures = throughput(client, options.scans, options.rays, options.runs)
-        figures["journal"] = journal_cost(client, options.scans, options.rays, options.runs)
         figures["latency"] = latency(client, options.paced_scans, options.rays, options.pace)
         figures["cpu_seconds_per_million_rays"] = cost(client, options.sizes, COST_RAYS)
 
@@ -169,11 +155,6 @@ def show(figures: Mapping[str, Any]) -> None:
     print(f"driver and scheduler: {figures['driver_and_scheduler_ms_per_scan']} ms CPU a scan")
     for stage, milliseconds in figures["stage_ms_per_scan"].items():
         print(f"  {stage:<10} {milliseconds:8.3f} ms a scan, waiting included")
-    low, high = figures["journal"]["spread"]
-    print(
-        f"with a journal: {figures['journal']['throughput_ratio']} times as many scans/s "
-        f"({low} to {high})"
-    )
     way = figures["latency"]
     print(
         f"from stage 1 to its frame at {way['scans_per_second']} scans/s: {way['median_ms']} ms "

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidarpool import Scene, Sensor, Survey
-from lidarpool.city import city
-from lidarpool.terrain import terrain
+from lidarpool.scene.city import city
+from lidarpool.scene.terrain import terrain
 from raybeam import RayCaster
 
 Float = NDArray[np.float64]
@@ -65,29 +65,29 @@ def _turned(degrees: float) -> Float:
 
 
 def _job(name: str, scene: Scene, origins: Float, sensor: Sensor) -> Job:
+    """Make a job of one turn of a sensor."""
     return Job(
         name,
         np.array(scene.vertices),
         np.array(scene.faces),
         np.atleast_2d(np.asarray(origins, dtype=np.float64)),
-        sensor.directions.reshape(-1, 3),
+        sensor.directions(np.arange(sensor.period)).reshape(-1, 3),
         _turned(17.0),
     )
 
 
 def _lidar(rays: int) -> Sensor:
     """Make a sensor of 128 rings and 45 degrees, with so many rays in a turn."""
-    return Sensor(rays_per_revolution=max(36, rays // 128), layers=128, vertical_fov_deg=45)
+    return Sensor.grid(rays_per_revolution=max(36, rays // 128), layers=128, vertical_fov_deg=45)
 
 
 def survey_job(rays: int) -> Job:
     """Make the default survey: its scene, its sensor, its three poses."""
     survey = Survey(poses=[(0, 0, 1), (0, 0, 2), (0, 0, 3)])
     origins = np.array([pose.position for pose in survey.poses])
-    turn = max(36, min(survey.sensor.rays_per_revolution, rays // 120))
-    return _job(
-        "default survey", Scene.seed(), origins, replace(survey.sensor, rays_per_revolution=turn)
-    )
+    turn = max(36, min(survey.sensor.period or 0, rays // 120))
+    sensor = replace(survey.sensor, head=replace(survey.sensor.head, firings_per_turn=turn))
+    return _job("default survey", Scene.seed(), origins, sensor)
 
 
 def city_job(triangles: int, rays: int) -> Job:

@@ -60,17 +60,18 @@ def compiled(folder: Path) -> ctypes.CDLL:
 
 def count(library: ctypes.CDLL, layout: Layout, mesh: LocalMesh, job: Job) -> dict[str, float]:
     """Cast a job's rays; what was seen a ray, and the share that hit."""
-    directions = rotated(job.directions, job.rotation)
-    n = len(directions)
+    columns = np.ascontiguousarray(rotated(job.directions, job.rotation).T)
+    n = columns.shape[1]
     distance, place = np.empty(n), np.empty(n, np.int32)
     before = _seen(library)
     hits = 0
     for origin in job.origins:
-        pose = np.concatenate([origin, np.eye(3).reshape(-1)])
         tables = (layout.nodes, layout.triangles, layout.corners, layout.faces, layout.frame)
-        rays = (pose, ctypes.c_int(0), directions, ctypes.c_longlong(n))
-        limits = (ctypes.c_double(0.0), ctypes.c_double(np.inf))
-        _run(library.run_cast_pattern, n, *tables, *rays, *limits, distance, place)
+        # One pose for all rays; the pattern is turned already, and not shifted.
+        poses = (np.array(origin), columns, columns, columns)
+        numbers = (ctypes.c_longlong(n), ctypes.c_longlong(0), *map(ctypes.c_int, (n, n, 0, 0)))
+        limits = (ctypes.c_longlong(n), ctypes.c_double(0.0), ctypes.c_double(np.inf))
+        _run(library.run_cast_pattern, n, *tables, *poses, *numbers, *limits, distance, place)
         hits += int((place >= 0).sum())
     seen = (_seen(library) - before) / job.rays
     return {**dict(zip(KINDS, seen.tolist(), strict=True)), "hit_share": hits / job.rays}

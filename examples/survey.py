@@ -1,6 +1,6 @@
 """The default survey from Python: a local cluster, a cloud on disk, a planned path."""
 
-from lidarpool import Planning, Scene, Survey, simulate, write_cloud
+from lidarpool import Planning, Scene, Survey, save_cloud, simulate
 
 if __name__ == "__main__":
     scene = Scene.seed()
@@ -9,6 +9,5 @@ if __name__ == "__main__":
     planning = Planning((25, 25), (-30, -20), centres, radii, trials=100)
 
     result = simulate(scene, survey, planning)
-    cloud = result.cloud
-    write_cloud("cloud.ply", cloud.positions, cloud.scan, cloud.ring, cloud.object)
-    print(f"{len(cloud)} points, a path of {result.plan.length:.2f} m")
+    save_cloud("cloud.ply", result.points)
+    print(f"{len(result.points)} points, a path of {result.plan.length:.2f} m")

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from distributed import Client, get_client
 
-from poolpart import Ledger, Pipe, Pool, fetch_available, n_workers, per_gpu, rest
+from poolpart import Pipe, Pool, fetch_available, n_workers, per_gpu, rest
 
 SIZE, WINDOW = 30 * 40 * 3, 8  # bytes of a thumbnail; thumbnails under way
 
@@ -34,11 +34,11 @@ def run(client, path, total=24):
     rules = {"WRITER": n_workers(1), "GPU": per_gpu(1), "CPU": rest()}
     writer, gpu, cpu = Pool.from_client(client).divide(rules).values()
     pipes = [Pipe(f"{way}-{client.id}", 2 * WINDOW, client) for way in ("keys", "written")]
-    ledger, futures, sent = Ledger(total), {}, 0  # {number: future of the thumbnail}
+    futures, done, sent = {}, 0, 0  # {number: future of a thumbnail that is not written yet}
     with pipes[0].create() as keys, pipes[1].create() as written:
         task = writer.submit(write, keys, written, path)
-        while not ledger.complete and not task.done():
-            for number in range(ledger.delivered + len(futures), min(sent + WINDOW, total)):
+        while done < total and not task.done():
+            for number in range(done + len(futures), min(done + WINDOW, total)):
                 futures[number] = gpu.submit(shrink, cpu.submit(decode, number))
             while sent in futures and futures[sent].done():
                 if error := futures[sent].exception():
@@ -46,9 +46,9 @@ def run(client, path, total=24):
                 keys.put([sent, futures[sent].key])
                 sent += 1
             for count, again in written.poll():
-                for number in filter(ledger.accept, range(ledger.delivered, count)):
-                    del futures[number]
-                sent = max(ledger.delivered, 0 if again else sent)
+                futures = {number: one for number, one in futures.items() if number >= count}
+                done = max(done, count)
+                sent = max(done, 0 if again else sent)
             time.sleep(0.005)
         keys.close()
         task.result()

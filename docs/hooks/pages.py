@@ -14,7 +14,7 @@ from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 
 # MkDocs puts this folder on the path while it loads hooks.
-from reference_pages import command_page, members_page, scenario_page
+from reference_pages import columns_page, command_page, members_page, scenario_page
 
 ROOT = Path(__file__).parents[2]
 
@@ -25,6 +25,8 @@ _ELSEWHERE = {
     "CHANGELOG.md": "changelog.md",
     "CONTRIBUTING.md": "contributing.md",
 }
+# Sources that the reference shows in a better way. {file: page}
+_SHOWN = {"workflows/lidarpool/columns/table.py": "reference/columns.md"}
 _LINK = re.compile(r"(\]\()([^)#\s]+)([^)]*\))")
 # What a browser would fetch by itself, from elsewhere.
 _FETCHED = re.compile(
@@ -41,8 +43,12 @@ def on_files(files: Files, config: Any) -> Files:
     }
     pages["reference/command.md"] = command_page()
     pages["reference/scenario.md"] = scenario_page()
+    pages["reference/columns.md"] = columns_page()
     for package in ("lidarpool", "poolpart", "raybeam"):
         pages[f"reference/{package}.md"] = members_page(package)
+    # Pages of linked sources must be there before MkDocs reads the first page of docs/.
+    for file in list(files.documentation_pages()):
+        _relinked(file.content_string, f"docs/{file.src_uri}", file.src_uri, files, config)
     for page, content in pages.items():
         files.append(File.generated(config, page, content=content))
     return files
@@ -84,8 +90,8 @@ def _relinked(text: str, file: str, page: str, files: Files, config: Any) -> str
 
 def _page_of(path: str, files: Files, config: Any) -> str:
     """Where the site has a file of the repository; one of the sources gets a page."""
-    if path in _ELSEWHERE:
-        return _ELSEWHERE[path]
+    if shown := (_ELSEWHERE | _SHOWN).get(path):
+        return shown
     if path.startswith("docs/"):
         return path.removeprefix("docs/")
     source = ROOT / path

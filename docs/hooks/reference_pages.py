@@ -7,9 +7,12 @@ from importlib import import_module
 from typing import Any
 
 import click
+import numpy as np
 
-from lidarpool.cli import cli
-from lidarpool.schema import scenario_schema
+from lidarpool.cli.commands import cli
+from lidarpool.columns.table import ALWAYS, AXES, OPTIONAL, SCAN, Column
+from lidarpool.export.ply_format import held_type
+from lidarpool.scenario.schema import scenario_schema
 
 # Sections in the order of a scenario file, and what stands in the sections of another.
 _SECTIONS = {
@@ -26,12 +29,15 @@ _SECTIONS = {
 
 # What a reader of a package looks for first; the rest follows by the alphabet.
 _FIRST = {
-    "lidarpool": ("simulate", "Scene", "Sensor", "Pose", "Survey", "Planning", "Result", "Cloud"),
+    "lidarpool": (
+        *("simulate", "remove_run", "Scene", "Sensor", "Beams", "Spin", "Pose", "Survey"),
+        *("Planning", "Result", "Frame", "Cloud", "Column", "save_cloud", "read_cloud"),
+    ),
     "poolpart": (
         *("Pool", "Partition", "Rule", "per_gpu", "per_host", "n_workers", "named", "rest"),
-        *("Results", "PartitionStats", "StageStats", "Pipe", "Ledger", "local_cluster"),
+        *("Results", "PartitionStats", "StageStats", "Pipe", "local_cluster"),
     ),
-    "raybeam": ("RayCaster", "Pattern", "Hits", "Returns"),
+    "raybeam": ("RayCaster", "Pattern", "Hits", "Returns", "ScanReturns"),
 }
 
 
@@ -85,6 +91,38 @@ def scenario_page() -> str:
     if missing:
         raise ValueError(f"sections of a scenario that its page does not show: {missing}")
     return "\n".join(parts)
+
+
+def columns_page() -> str:
+    """Tables of the columns of a cloud, from the table that the package goes by."""
+    return "\n".join(
+        [
+            "# Columns of a cloud\n",
+            "What a point can have. How to ask for a column and how to add one of your own: "
+            "[Columns](../how-to/columns.md). Open3D writes five types to PLY, so "
+            "that some columns have another one there.\n",
+            "## In every cloud\n",
+            "Positions are `cloud.positions`, (n, 3). In a part they are whole multiples of "
+            "`precision_m` from the scene's local origin, as int32.\n",
+            _columns_table((*AXES, SCAN, *(column for column in ALWAYS if column not in AXES))),
+            "## On request\n",
+            "`columns: [time, range]` in the section `cloud` of a scenario, or "
+            '`Survey(columns=["time", "range"])`.\n',
+            _columns_table(OPTIONAL),
+        ]
+    )
+
+
+def _columns_table(columns: tuple[Column, ...]) -> str:
+    heads = ("column", "in files", "type", "in PLY", "unit", "coordinates", "")
+    rows = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
+    for column in columns:
+        kind, held = np.dtype(column.dtype).name, held_type(column).name
+        if column in AXES:
+            kind, held = "float64", "float32; float64 where needed"
+        cells = (column.in_files, kind, held, column.unit, column.coordinates, column.meaning)
+        rows.append(f"| `{column.name}` | " + " | ".join(cell or "–" for cell in cells) + " |")
+    return "\n".join(rows) + "\n"
 
 
 def _table(fields: dict[str, Any], required: tuple[str, ...] | list[str] = ()) -> str:

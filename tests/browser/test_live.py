@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from lidarpool import Planning, Scene, Survey
-from lidarpool.connection import local_client
-from lidarpool.deliveries import Deliveries
-from lidarpool.job import Job
 from lidarpool.live import live_run
-from lidarpool.run import Run
+from lidarpool.run.connection import local_client
+from lidarpool.run.job import Job
+from lidarpool.run.run import Run
+from lidarpool.run.store import RunStore
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -29,13 +29,13 @@ def client():
 
 @pytest.fixture
 def live():
-    """Return a page, and deliveries that it follows, of a survey that takes its time."""
+    """Return a page, and the store that it follows, of a survey that takes its time."""
     survey = Survey(poses=[(0, 0, 1 + step / 20) for step in range(SCANS // 36)])
     job = Job(Scene.seed(), survey, scans_per_second=60)
-    kept = Deliveries(job)
+    store = RunStore(job)
     with live_run(job, port=0, browser=False) as live:
-        live.follow(kept)
-        yield live, kept
+        live.follow(store)
+        yield live, store
 
 
 class Driven:
@@ -45,13 +45,13 @@ class Driven:
     slower than any run.
     """
 
-    def __init__(self, client, live, kept, most=1):
+    def __init__(self, client, live, store, most=1):
         self.error, self.most = None, most
 
         def wants_pause():
-            return live.wants_pause() or kept.cloud.point_count >= self.most
+            return live.wants_pause() or store.db.point_count >= self.most
 
-        run = Run(client, kept, wants_pause)
+        run = Run(client, store, wants_pause)
         show = live.with_progress(lambda progress: None, run.partitions)
 
         def drive():
@@ -79,9 +79,9 @@ def points_in(text):
 
 
 def test_points_grow_stand_still_and_grow_again(client, live, new_tab, tmp_path):
-    live, kept = live
+    live, store = live
     tab, other = opened(new_tab, live), opened(new_tab, live)
-    run = Driven(client, live, kept)
+    run = Driven(client, live, store)
     try:
         first = tab.wait_for(points_in)
         run.most = first + 1
@@ -89,10 +89,10 @@ def test_points_grow_stand_still_and_grow_again(client, live, new_tab, tmp_path)
         tab.click("Pause")
         tab.wait_for(lambda text: "paused" in text and "Go on" in text)
         other.wait_for(lambda text: "paused" in text)
-        still = kept.cloud.point_count
-        assert not kept.complete
+        still = store.db.point_count
+        assert not store.complete
         time.sleep(2)
-        assert kept.cloud.point_count == still
+        assert store.db.point_count == still
         run.most = still + 1
         other.click("Go on")
         tab.wait_for(lambda text: "running" in text)
@@ -103,8 +103,8 @@ def test_points_grow_stand_still_and_grow_again(client, live, new_tab, tmp_path)
             live.control.go_on()
         run.thread.join(120)
     assert run.error is None
-    assert kept.complete  # nothing was lost by the pause
-    total = f"{kept.cloud.point_count:,} points"
+    assert store.complete  # nothing was lost by the pause
+    total = f"{store.db.point_count:,} points"
     tab.wait_for(lambda text: "done" in text and total in text)
     other.wait_for(lambda text: "done" in text and total in text)
     tab.wait_for(lambda _: len(colours(tab.picture(tmp_path / "live.png"))) > 200)
@@ -114,9 +114,9 @@ def test_points_grow_stand_still_and_grow_again(client, live, new_tab, tmp_path)
 
 
 def test_stop_ends_the_run_as_an_interrupt_does(client, live, new_tab):
-    live, kept = live
+    live, store = live
     tab = opened(new_tab, live)
-    run = Driven(client, live, kept)
+    run = Driven(client, live, store)
     try:
         tab.wait_for(points_in)
         tab.click("Stop")
@@ -124,19 +124,19 @@ def test_stop_ends_the_run_as_an_interrupt_does(client, live, new_tab):
         run.thread.join(120)
         live.control.stop()
     assert isinstance(run.error, KeyboardInterrupt)
-    assert not kept.complete
+    assert not store.complete
 
 
 def test_a_closed_tab_is_not_waited_for(client, live, new_tab):
-    live, kept = live
+    live, store = live
     tab = opened(new_tab, live)
-    run = Driven(client, live, kept)
+    run = Driven(client, live, store)
     tab.wait_for(points_in)
     tab.open("about:blank")
     run.most = ALL
     run.thread.join(120)
     assert run.error is None
-    assert kept.complete
+    assert store.complete
     frames = live._scene.frames
     frames.take()
     assert frames.dropped > frames.taken
@@ -146,11 +146,11 @@ def test_a_closed_tab_is_not_waited_for(client, live, new_tab):
 def test_the_path_is_shown_when_it_is_planned(client, new_tab):
     planning = Planning((25, 25), (-30, -20), [(0, 0)], 2.0, trials=2, iterations=20)
     job = Job(Scene.seed(), Survey(poses=[(0, 0, 1)]), planning)
-    kept = Deliveries(job)
+    store = RunStore(job)
     with live_run(job, port=0, browser=False) as live:
-        live.follow(kept)
+        live.follow(store)
         tab = opened(new_tab, live)
-        run = Driven(client, live, kept, ALL)
+        run = Driven(client, live, store, ALL)
         run.thread.join(120)
         tab.wait_for(lambda text: "done" in text and "2 / 2" in text)
         for name in ("/path", "/path/start", "/path/target", "/discs/0"):

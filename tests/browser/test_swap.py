@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from lidarpool.live.glb import coloured_triangles
-from lidarpool.live.mesh_node import MeshNode
+from lidarpool.live.mesh_node import MeshNode, coloured_triangles
 from lidarpool.live.page import live_page
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]

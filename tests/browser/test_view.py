@@ -5,10 +5,12 @@ import re
 import numpy as np
 import pytest
 
+from lidarpool import Column
+from lidarpool.columns.table import SCAN
+from lidarpool.export.ply_format import header, row_type
 from lidarpool.live.page import live_page
 from lidarpool.live.result_file import ResultFile
-from lidarpool.live.viewing import ResultView
-from lidarpool.ply_format import header, row_type
+from lidarpool.live.result_page import ResultView
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -17,11 +19,14 @@ pytestmark = [pytest.mark.browser, pytest.mark.slow]
 def cloud(tmp_path):
     """Return a file with a spiral of 30,000 points in 300 scans."""
     turn = np.linspace(0, 20 * np.pi, 30_000)
-    rows = np.zeros(30_000, row_type(np.dtype(np.float32)))
+    wet = Column("wetness", "float32", "%", "how wet it is", source="wetness")
+    row = row_type(np.dtype(np.float32), (SCAN, wet))
+    rows = np.zeros(30_000, row)
+    rows["wetness"] = np.linspace(0, 100, 30_000)
     rows["x"], rows["y"], rows["z"] = 9 * np.cos(turn), 9 * np.sin(turn), turn / 8
     rows["scan"] = np.arange(30_000) // 100
     path = tmp_path / "cloud.ply"
-    path.write_bytes(header(np.dtype(np.float32), 30_000) + rows.tobytes())
+    path.write_bytes(header(row, 30_000) + rows.tobytes())
     return path
 
 
@@ -62,6 +67,17 @@ def test_the_slider_shows_some_scans_with_all_their_points(served, new_tab):
     view._scans.value = (100, 149)
     view.painter.ask()
     tab.wait_for(lambda text: re.search(r"5,000 of 30,000 points, all\s+shown", text))
+
+
+def test_a_column_that_nobody_knows_colours_the_points(served, new_tab, tmp_path):
+    page, view = served
+    tab = new_tab(page.url)
+    tab.wait_for(lambda text: "height, m" in text)
+    view._cloud._colour.value = "wetness"
+    view.painter.ask()
+    tab.wait_for(lambda text: "wetness" in text and "height, m" not in text)
+    tab.wait_for(lambda _: colourful(tab.picture(tmp_path / "a.png")) > 3000)
+    assert tab.errors == []
 
 
 def colourful(picture):

@@ -26,7 +26,7 @@ SPARE_FAULTS = 0.05  # part that may find nobody to strike
 VAIN_RUNS_MOST = 2  # one after the other in which nothing that was left to do could be done
 
 # Points that many a run does not come to: what is to happen there waits for one that does.
-RARE_POINTS = ("driver.duplicate", "driver.stale", "driver.recast")
+RARE_POINTS = ("driver.duplicate", "driver.stale", "driver.replay")
 WORKER_POINTS = tuple(point for points in STAGE_POINTS.values() for point in points)
 
 

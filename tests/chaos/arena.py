@@ -13,7 +13,8 @@ from types import TracebackType
 import dask
 from distributed import Client, SpecCluster
 
-from poolpart import local_cluster, trace_to
+from lidarpool.run.local import local_cluster
+from poolpart import trace_to
 
 from .events import Board, ChaosPlugin
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from distributed import Client
 
 from lidarpool import Planning, Survey, simulate
-from lidarpool.scan import caster, pump
+from lidarpool.scan import driver
 from poolpart import placement_violations, trace_to
 
 from .events import Board, Sink
@@ -104,7 +104,7 @@ def _drive(
             start.wait(START_S)
 
     if start is not None:
-        pump.STALL_SECONDS = caster.LATE_S = float("inf")
+        driver.STALL_S = driver.LATE_S = float("inf")
     trace_to(note)
     try:
         with Client(address) as client:

@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from lidarpool import Planning, Result, Scene, Sensor, Survey, simulate
-from lidarpool.mesh import Mesh
+from lidarpool.scene.mesh import Mesh
 from poolpart import placement_violations
 
 from .arena import Arena
@@ -37,7 +37,7 @@ def room() -> Scene:
 
 def survey(poses: int = POSES, layers: int = 8) -> Survey:
     """Describe `poses` times 360 scans, each of two azimuths."""
-    sensor = Sensor(rays_per_revolution=720, layers=layers, vertical_fov_deg=60, step_deg=1)
+    sensor = Sensor.grid(rays_per_revolution=720, layers=layers, vertical_fov_deg=60, step_deg=1)
     places = [(0.5 * (pose % 7), 0.25 * (pose % 5), 0.0) for pose in range(poses)]
     return Survey(sensor, places, STEPS, keep_every=3)
 
@@ -46,7 +46,7 @@ def digest(result: Result) -> str:
     """SHA-256 of everything that a run delivers and that must not depend on luck."""
     cloud = result.cloud
     plan = () if result.plan is None else (result.plan.path,)
-    arrays = (cloud.positions, cloud.scan, cloud.ring, cloud.object, result.hit_counts, *plan)
+    arrays = (cloud.positions, cloud.scan, cloud.channel, cloud.object, result.hit_counts, *plan)
     sha = hashlib.sha256()
     for array in arrays:
         array = np.asarray(array)

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from lidarpool import LidarpoolError
-from lidarpool.city import city
-from lidarpool.city.city import _catalogue
-from lidarpool.city.solids import box, gable, joined, loft, lying, rectangle, regular
+from lidarpool.scene.city import city
+from lidarpool.scene.city.city import _catalogue
+from lidarpool.scene.city.solids import box, gable, joined, loft, lying, rectangle, regular
 from raybeam import RayCaster
 
 
 def test_examples_in_the_docstrings():
-    found = doctest.testmod(sys.modules["lidarpool.city.city"])
+    found = doctest.testmod(sys.modules["lidarpool.scene.city.city"])
     assert found.failed == 0 < found.attempted
 
 
@@ -155,7 +155,7 @@ def test_out_of_range(triangles, seed):
 
 def test_memory_for_two_million_triangles():
     code = (
-        "import resource; from lidarpool.city import city; "
+        "import resource; from lidarpool.scene.city import city; "
         "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss; scene = city(2_000_000); "
         "after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss; "
         "print(len(scene.faces), (after - before) // 1024)"

@@ -6,7 +6,7 @@ import signal
 
 import pytest
 
-from lidarpool.interrupts import deferred_interrupts
+from lidarpool.base.interrupts import deferred_interrupts
 
 
 def raise_within(number):

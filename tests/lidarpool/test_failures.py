@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 from distributed.scheduler import NoValidWorkerError
 
-from lidarpool.errors import LidarpoolError
+from lidarpool.base.errors import LidarpoolError
 from lidarpool.scan.failures import raise_if_failed
 
 

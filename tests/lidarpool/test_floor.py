@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from lidarpool.floor import floor_under
-from lidarpool.mesh import Mesh
-from lidarpool.scene import Scene
-from lidarpool.terrain import terrain
+from lidarpool.scene.floor import floor_under
+from lidarpool.scene.mesh import Mesh
+from lidarpool.scene.scene import Scene
+from lidarpool.scene.terrain import terrain
 
 
 def boxes(*sizes_and_middles):

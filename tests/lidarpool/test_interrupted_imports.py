@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lidarpool import Cloud, save_cloud
-from lidarpool.checks import check_backend_here
+from lidarpool.run.checks import check_backend_here
 
 # What an extension module makes of an interrupt in its first lines.
 INTERRUPTED = """
@@ -36,7 +36,7 @@ def test_while_it_is_looked_for_backends(interrupted_open3d, wanted):
 
 def test_while_a_cloud_is_written(interrupted_open3d, tmp_path):
     one = np.zeros(1, np.int32)
-    cloud = Cloud(np.zeros((1, 3)), one, one.astype(np.uint16), one)
+    cloud = Cloud(np.zeros((1, 3)), {"scan": one, "channel": one, "object": one})
     with pytest.raises(KeyboardInterrupt):
         save_cloud(tmp_path / "cloud.ply", cloud)
     assert not list(tmp_path.glob("*cloud*"))

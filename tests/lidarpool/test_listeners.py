@@ -10,7 +10,7 @@ import click
 import pytest
 
 from lidarpool import LidarpoolError
-from lidarpool.listeners import leaving_listeners
+from lidarpool.cli.listeners import leaving_listeners
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has other errors")
 

@@ -5,10 +5,9 @@ import pytest
 import trimesh
 
 from lidarpool import Scene
-from lidarpool.live.clipping import lines_below, triangles_below
-from lidarpool.live.inside import InsideView
-from lidarpool.live.walls import Walls, facing_triangles
-from lidarpool.mesh import Mesh
+from lidarpool.live.height_cut import lines_below, triangles_below
+from lidarpool.live.inside import InsideView, Walls, facing_triangles
+from lidarpool.scene.mesh import Mesh
 
 LENGTH, WIDTH, HEIGHT, WALL = 40.0, 24.0, 8.0, 0.3
 SENSORS = np.array([[0.0, 0.0, 1.0], [5.0, 3.0, 2.0]])

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from lidarpool.log_file import LogFile, log_to, logged_to
+from lidarpool.cli.log_file import LogFile, log_to, logged_to
 
 
 @pytest.fixture
@@ -122,7 +122,7 @@ def test_a_worker_appends_to_what_is_there(tmp_path, monkeypatch):
     (tmp_path / "log").write_text("before\n")
     root = logging.Logger("root", logging.WARNING)
     monkeypatch.setattr(logging, "root", root)
-    monkeypatch.setattr("lidarpool.log_file._with_handlers", list)
+    monkeypatch.setattr("lidarpool.cli.log_file._with_handlers", list)
     monkeypatch.setattr(logging, "captureWarnings", lambda wanted: None)
     log_to(tmp_path / "log")
     root.warning("after \udcff")  # as names of files may be

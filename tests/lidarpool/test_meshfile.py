@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from lidarpool import meshfile
-from lidarpool.errors import LidarpoolError
-from lidarpool.meshfile import SUFFIXES, load_meshes
-from lidarpool.scene import Scene
-from lidarpool.transform import Transform
+from lidarpool.base.errors import LidarpoolError
+from lidarpool.scene import meshfile
+from lidarpool.scene.meshfile import SUFFIXES, load_meshes
+from lidarpool.scene.scene import Scene
+from lidarpool.scene.transform import Transform
 
 OBJ = """# two objects
 o Box
@@ -463,19 +463,15 @@ def test_damage_ends_in_meshes_or_in_one_clear_line(tmp_path, two_objects, suffi
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-@pytest.mark.parametrize("content", ["noise", "text", "zeros"])
-def test_junk(tmp_path, suffix, content):
-    junk = {
-        "noise": np.random.default_rng(5).bytes(3000),
-        "text": b"This is not a mesh.\n" * 20,
-        "zeros": bytes(2000),
-    }
-    path = write(tmp_path / f"junk{suffix}", junk[content])
-    with pytest.raises(LidarpoolError) as caught:
-        load_meshes(path)
-    assert str(path) in str(caught.value)
-    assert str(caught.value).count("\n") <= 1
-    assert len(str(caught.value)) < 400 + len(str(path))
+def test_junk(tmp_path, suffix):
+    noise = np.random.default_rng(5).bytes(3000)
+    for content in (noise, b"This is not a mesh.\n" * 20, bytes(2000)):
+        path = write(tmp_path / f"junk{suffix}", content)
+        with pytest.raises(LidarpoolError) as caught:
+            load_meshes(path)
+        assert str(path) in str(caught.value)
+        assert str(caught.value).count("\n") <= 1
+        assert len(str(caught.value)) < 400 + len(str(path))
 
 
 @pytest.mark.parametrize(

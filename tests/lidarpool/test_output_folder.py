@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from lidarpool import LidarpoolError
-from lidarpool.output import result_folder
+from lidarpool.report.output import result_folder
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="has no locks on folders")
 
@@ -45,6 +45,6 @@ def test_a_folder_is_not_removed_when_another_run_may_use_it_already(tmp_path, m
 
 def test_a_folder_that_was_removed_before_it_could_be_locked_is_not_used(tmp_path, monkeypatch):
     out = tmp_path / "out"
-    monkeypatch.setattr("lidarpool.output.fcntl.flock", lambda *_: out.rmdir())
+    monkeypatch.setattr("lidarpool.report.output.fcntl.flock", lambda *_: out.rmdir())
     assert_in_use(out)
     assert not out.exists()

@@ -5,8 +5,8 @@ from io import StringIO
 
 import pytest
 
-from lidarpool.progress import Progress
-from lidarpool.terminal import PlainLines, time_in_words
+from lidarpool.cli.terminal import PlainLines, time_in_words
+from lidarpool.run.progress import Progress
 
 
 def progress(seconds: float, scans: int, trials: int = 0) -> Progress:

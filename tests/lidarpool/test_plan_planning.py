@@ -3,7 +3,7 @@ import pickle
 import numpy as np
 import pytest
 
-from lidarpool.errors import LidarpoolError
+from lidarpool.base.errors import LidarpoolError
 from lidarpool.plan import Planning
 
 BAD = {

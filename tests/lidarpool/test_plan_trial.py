@@ -10,7 +10,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from lidarpool.errors import LidarpoolError
+from lidarpool.base.errors import LidarpoolError
 from lidarpool.plan import (
     Plan,
     Planning,

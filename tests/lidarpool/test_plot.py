@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from lidarpool import LidarpoolError, Planning, Scene
-from lidarpool.cli import cli
-from lidarpool.mesh import Mesh
-from lidarpool.picture_file import PICTURE_FILE, PICTURES, Pictured, TrialPath
+from lidarpool import Cloud, LidarpoolError, Planning, Scene
+from lidarpool.cli.commands import cli
+from lidarpool.export.ply import read_positions, save_cloud
 from lidarpool.plan import best
 from lidarpool.plan.trial import run_trial
-from lidarpool.ply import read_positions, write_cloud
-from lidarpool.shapes import seed_objects
+from lidarpool.run.picture_file import PICTURE_FILE, PICTURES, Pictured, TrialPath
+from lidarpool.scene.mesh import Mesh
+from lidarpool.scene.shapes import seed_objects
 
 SIZE = (480, 300)
 SMALL = ("--size", "480x480")
@@ -59,12 +59,16 @@ def unplanned(planned: Pictured) -> Pictured:
     )
 
 
+def cloud_at(positions: Any) -> Cloud:
+    zeros = np.zeros(len(positions), np.int32)
+    return Cloud(positions, {"scan": zeros, "channel": zeros, "object": zeros})
+
+
 def make(folder: Path, shown: Pictured) -> Path:
     """Write the folder of a result."""
     folder.mkdir()
     positions = shown.scene.vertices[::2]
-    zeros = np.zeros(len(positions), np.int32)
-    write_cloud(folder / "cloud.ply", positions, zeros, zeros, zeros)
+    save_cloud(folder / "cloud.ply", cloud_at(positions))
     shown.save(folder / PICTURE_FILE)
     return folder
 
@@ -167,7 +171,7 @@ def test_a_damaged_file_is_refused(damage, said, result):
 def test_positions_are_read_evenly(tmp_path):
     path = tmp_path / "cloud.ply"
     positions = np.arange(30.0).reshape(10, 3)
-    write_cloud(path, positions, *np.zeros((3, 10), np.int32))
+    save_cloud(path, cloud_at(positions))
     chosen, count = read_positions(path, 4)
     rows = (chosen[:, 0] / 3).astype(int)
     assert count == 10 and np.array_equal(chosen, positions[rows])
@@ -176,16 +180,16 @@ def test_positions_are_read_evenly(tmp_path):
     )
     for most in (10, 1000):
         assert np.array_equal(read_positions(path, most)[0], positions)
-    write_cloud(path, np.empty((0, 3)), *np.zeros((3, 0), np.int32))
+    save_cloud(path, cloud_at(np.empty((0, 3))))
     empty, none = read_positions(path, 4)
     assert empty.shape == (0, 3) and none == 0
 
 
-def test_some_of_the_points_are_of_every_ring(tmp_path):
+def test_some_of_the_points_are_of_every_channel(tmp_path):
     path = tmp_path / "cloud.ply"
-    layers, rays = 40, 500  # a ray's points follow those of the ray beside it, ring by ring
+    layers, rays = 40, 500  # a ray's points follow those of the ray beside it, channel by channel
     ring = np.tile(np.arange(layers), rays).astype(np.int32)
-    write_cloud(path, np.stack([ring] * 3, axis=1).astype(float), 0 * ring, ring, 0 * ring)
+    save_cloud(path, cloud_at(np.stack([ring] * 3, axis=1).astype(float)))
     chosen, _ = read_positions(path, len(ring) // 20)  # every 20th would be of two rings
     assert len(np.unique(chosen[:, 2])) == layers
 

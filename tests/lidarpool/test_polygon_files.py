@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from lidarpool.errors import LidarpoolError
-from lidarpool.meshfile import load_meshes
+from lidarpool.base.errors import LidarpoolError
+from lidarpool.scene.meshfile import load_meshes
 
 PLY = """ply
 format ascii 1.0

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidarpool.errors import LidarpoolError
-from lidarpool.mesh import Mesh
-from lidarpool.scene import Scene, local_origin, unique_names
+from lidarpool.base.errors import LidarpoolError
+from lidarpool.scene.mesh import Mesh
+from lidarpool.scene.scene import Scene, local_origin, unique_names
 
 FACES = np.array([[0, 1, 2]])
 

@@ -10,9 +10,9 @@ import pytest
 from click.testing import CliRunner
 
 from lidarpool import LidarpoolError, Scene
-from lidarpool.city import city
-from lidarpool.scene_commands import scene as command
-from lidarpool.scene_file import write_scene
+from lidarpool.cli.scene_commands import scene as command
+from lidarpool.scene.city import city
+from lidarpool.scene.scene_file import write_scene
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".glb", ".obj", ".GLB"])

@@ -11,9 +11,9 @@ import yaml
 from jsonschema import Draft202012Validator
 
 from lidarpool import LidarpoolError
-from lidarpool.scenario import Scenario
-from lidarpool.schema import scenario_schema, schema_text
-from lidarpool.template import scenario_template
+from lidarpool.scenario.scenario import Scenario
+from lidarpool.scenario.schema import scenario_schema, schema_text
+from lidarpool.scenario.template import scenario_template
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.yaml"))
 

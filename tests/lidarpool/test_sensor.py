@@ -1,31 +1,35 @@
+"""Sensors: beams and the head that moves them, and what follows for each ray."""
+
 from __future__ import annotations
 
 import doctest
 import itertools
+from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import lidarpool.sensor
-from lidarpool import LidarpoolError, Sensor
+import lidarpool.sensor.beams
+import lidarpool.sensor.sensor
+from lidarpool import Beams, LidarpoolError, Sensor, Spin
 
 
-def test_examples_in_the_docstrings():
-    assert doctest.testmod(lidarpool.sensor).failed == 0
+@pytest.mark.parametrize("module", [lidarpool.sensor.beams, lidarpool.sensor.sensor])
+def test_examples_in_the_docstrings(module):
+    found = doctest.testmod(module)
+    assert found.attempted and not found.failed
 
 
-@given(
-    rays=st.integers(1, 5000),
-    steps=st.integers(1, 720),
-)
-def test_the_sectors_of_a_revolution_hold_each_azimuth_once(rays, steps):
-    """360 / steps is rarely exact, in decimal or in binary; the sectors must meet all the same."""
+@given(rays=st.integers(1, 5000), steps=st.integers(1, 720))
+def test_the_steps_of_a_turn_hold_each_firing_once(rays, steps):
+    """360 / steps is rarely exact, in decimal or in binary; the steps must meet all the same."""
     if steps > rays:
         return
-    sensor = Sensor(rays_per_revolution=rays, layers=1, step_deg=360 / steps)
-    sectors = [sensor.sector(step) for step in range(steps)]
+    sensor = Sensor.grid(rays_per_revolution=rays, layers=1, step_deg=360 / steps)
+    sectors = [sensor.firings(step) for step in range(steps)]
     assert sectors[0][0] == 0
     assert all(a[1] == b[0] for a, b in itertools.pairwise(sectors))
     assert all(first < stop for first, stop in sectors)
@@ -34,38 +38,89 @@ def test_the_sectors_of_a_revolution_hold_each_azimuth_once(rays, steps):
 
 @pytest.mark.parametrize(("rays", "step", "steps"), [(1000, 10, 36), (720, 0.5, 720), (7, 72, 5)])
 def test_decimal_steps_are_exact(rays, step, steps):
-    sensor = Sensor(rays_per_revolution=rays, layers=1, step_deg=step)
-    assert sensor.sector(steps - 1)[1] == rays
+    sensor = Sensor.grid(rays_per_revolution=rays, layers=1, step_deg=step)
+    assert sensor.firings(steps - 1)[1] == rays == sensor.period
+    assert sensor.firings(10 * steps - 1)[1] == 10 * rays, "and the numbers go on"
 
 
-def test_directions_are_unit_vectors_in_lidar_order():
-    sensor = Sensor(rays_per_revolution=4, layers=3, vertical_fov_deg=90, step_deg=90)
-    assert sensor.directions.shape == (4, 3, 3)
-    assert np.allclose(np.linalg.norm(sensor.directions, axis=-1), 1, atol=1e-15)
-    assert np.allclose(sensor.directions[:, 1], [[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]])
-    assert np.allclose(np.degrees(np.arcsin(sensor.directions[0, :, 2])), [-45, 0, 45])
+def test_a_grid_fires_from_plus_x_counter_clockwise_lowest_channel_first():
+    sensor = Sensor.grid(rays_per_revolution=4, layers=3, vertical_fov_deg=90, step_deg=90)
+    found = sensor.directions(np.arange(8))
+    assert found.shape == (8, 3, 3)
+    assert np.allclose(np.linalg.norm(found, axis=-1), 1, atol=1e-15)
+    assert np.allclose(found[:4, 1], [[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]])
+    assert np.allclose(np.degrees(np.arcsin(found[0, :, 2])), [-45, 0, 45])
+    assert np.array_equal(found[:4], found[4:]), "after a turn it stands as before"
+    assert sensor.origins(np.arange(4)) is None
+    assert Sensor.grid(layers=1).beams.elevation.tolist() == [0.0]
 
 
-def test_one_layer_looks_straight_ahead():
-    assert Sensor(layers=1).elevations.tolist() == [0.0]
+def test_a_turn_that_is_no_whole_number_of_firings():
+    """Firing rate and turning rate of real sensors do not fit: each turn begins elsewhere."""
+    head = Spin(firings_per_turn=1808.449, step_deg=360, rate_hz=10)
+    assert head.period is None
+    turns = [head.firings(turn) for turn in range(1000)]
+    assert all(a[1] == b[0] for a, b in itertools.pairwise(turns))
+    assert {stop - first for first, stop in turns} == {1808, 1809}
+    assert turns[-1][1] == 1_808_449
+    firings = np.array([0, 1808, 1809, 1_808_448])
+    expected = [float(Fraction(int(f)) % Fraction("1808.449")) for f in firings]
+    assert np.allclose(head.azimuths(firings), 2 * np.pi * np.array(expected) / 1808.449, atol=1e-9)
+    assert np.allclose(head.times_ns(np.array([1_808_449])), 1000 * 1e9 / 10)
+
+
+def test_beams_have_offsets_in_azimuth_time_and_origin():
+    beams = Beams(
+        np.radians([-10, 0, 20]),
+        azimuth=np.radians([1, 0, -2]),
+        time_ns=[0, 1152, 2304.4],
+        origin=[[0, 0, 0], [0.1, 0, 0], [0, 0.2, 0.3]],
+    )
+    sensor = Sensor(beams, Spin(firings_per_turn=8, step_deg=90, rate_hz=5))
+    firings = np.array([0, 2, 9])
+    x, y, z = sensor.directions(firings).transpose(2, 0, 1)
+    azimuth = np.array([[1, 0, -2], [91, 90, 88], [46, 45, 43]])
+    assert np.allclose(np.degrees(np.arctan2(y, x)), azimuth)
+    assert np.allclose(np.degrees(np.arcsin(z)), [-10, 0, 20])
+    origins = sensor.origins(firings)
+    assert np.allclose(origins[0], beams.origin), "as given where the head is at azimuth 0"
+    assert np.allclose(origins[1], [[0, 0, 0], [0, 0.1, 0], [-0.2, 0, 0.3]]), "turned with it"
+    times = sensor.times_ns(firings)
+    assert times.dtype == np.int64
+    assert times.tolist() == [[f * 25_000_000 + t for t in (0, 1152, 2304)] for f in firings]
+
+
+def test_beams_cannot_be_changed_in_place():
+    """The fingerprint of a run is taken once."""
+    given = np.array([0.0, 0.1])
+    beams = Beams(given)
+    given[0] = 5
+    assert beams.elevation.tolist() == [0, 0.1]
+    with pytest.raises(ValueError, match="read-only"):
+        beams.elevation[0] = 5
 
 
 @pytest.mark.parametrize(
-    ("field", "value"),
+    ("make", "message"),
     [
-        ("rays_per_revolution", 0),
-        ("layers", 0),
-        ("layers", 65_536),
-        ("vertical_fov_deg", 0),
-        ("vertical_fov_deg", 181),
-        ("vertical_fov_deg", float("nan")),
-        ("step_deg", 0),
-        ("step_deg", 361),
-        ("step_deg", 0.1),
-        ("min_range_m", -1),
-        ("max_range_m", 0),
+        (lambda: Beams([]), "1 to 65535 beams, not 0"),
+        (lambda: Beams(np.zeros(65_536)), "not 65536"),
+        (lambda: Beams([0, 1], azimuth=[0]), r"Beams\.azimuth must be \(2,\)"),
+        (lambda: Beams([0, np.nan]), r"Beams\.elevation"),
+        (lambda: Beams([0], time_ns=[np.inf]), r"Beams\.time_ns"),
+        (lambda: Beams([0, 1], origin=[0, 0, 0]), r"Beams\.origin must be \(2, 3\)"),
+        (lambda: Spin(firings_per_turn=0.5), "firings_per_turn"),
+        (lambda: Spin(step_deg=361), "step_deg"),
+        (lambda: Spin(rate_hz=0), "rate_hz"),
+        (lambda: Spin(step_deg=0.1), r"less than one firing \(0.36 degrees\)"),
+        (lambda: replace(Sensor(), min_range_m=-1), "min_range_m"),
+        (lambda: replace(Sensor(), min_range_m=5, max_range_m=5), "max_range_m"),
+        (lambda: Sensor.grid(rays_per_revolution=0), "rays_per_revolution"),
+        (lambda: Sensor.grid(layers=65_536), "layers"),
+        (lambda: Sensor.grid(vertical_fov_deg=float("nan")), "vertical_fov_deg"),
+        (lambda: Sensor.grid(step_deg=float("nan")), "step_deg"),
     ],
 )
-def test_values_out_of_range_name_the_field(field, value):
-    with pytest.raises(LidarpoolError, match=field):
-        Sensor(**{field: value})
+def test_values_out_of_range_name_the_field(make, message):
+    with pytest.raises(LidarpoolError, match=message):
+        make()

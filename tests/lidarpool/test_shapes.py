@@ -6,8 +6,8 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidarpool.errors import LidarpoolError
-from lidarpool.shapes import (
+from lidarpool.base.errors import LidarpoolError
+from lidarpool.scene.shapes import (
     SEED_OUTLINES,
     SEED_POSITIONS,
     resample,

@@ -1,32 +1,68 @@
+"""Surveys: scans, poses and times of a sensor that stands or moves."""
+
 from __future__ import annotations
 
 import doctest
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.lidarpool.carts import Cart
 
-import lidarpool.survey
-from lidarpool import LidarpoolError, Pose, ScanSpec, Sensor, Survey
+import lidarpool.sensor.survey
+from lidarpool import Column, LidarpoolError, Pose, Sensor, Spin, Survey
+from lidarpool.sensor import Stations
 
 
 def test_examples_in_the_docstrings():
-    assert doctest.testmod(lidarpool.survey).failed == 0
+    found = doctest.testmod(lidarpool.sensor.survey)
+    assert found.attempted and not found.failed
 
 
-def test_the_default_survey_fires_every_ray_of_every_revolution_once():
-    survey = Survey(Sensor(), poses=[(0, 0, 1), (0, 0, 2), (0, 0, 3)])
+def test_the_default_survey_fires_every_ray_of_every_turn_once():
+    survey = Survey(Sensor.grid(), poses=[(0, 0, 1), (0, 0, 2), (0, 0, 3)])
     specs = list(survey.scans())
     assert len(specs) == 108
     assert sum(spec.ray_count(survey.sensor) for spec in specs) == 120_000 == survey.ray_count
     assert [spec.scan for spec in specs] == list(range(108))
     for pose in range(3):
-        sectors = [spec.azimuths for spec in specs[36 * pose : 36 * pose + 36]]
-        assert [a for first, stop in sectors for a in range(first, stop)] == list(range(1000))
+        mine = specs[36 * pose : 36 * pose + 36]
+        assert [a for spec in mine for a in range(*spec.firings)] == list(range(1000))
+        assert {spec.station for spec in mine} == {pose}
+        assert {survey.pose(spec.scan).position[2] for spec in mine} == {pose + 1}
 
 
-def test_a_scan_travels_as_numbers():
-    spec = ScanSpec(7, Pose((1.5, -2, 1e6 + 0.1), 10, 20, 30), (28, 56))
-    assert ScanSpec.from_wire(tuple(spec.wire())) == spec
+def test_stations_follow_one_another_in_time():
+    survey = Survey(Sensor.grid(rate_hz=20), poses=[(0, 0, 1), (0, 0, 2)], steps=72)
+    assert [survey.scan(i).start_ns for i in (0, 71, 72)] == [0, 0, 100_000_000]
+
+
+def test_a_survey_may_have_a_trajectory_in_place_of_poses():
+    sensor = Sensor(head=Spin(100, step_deg=36, rate_hz=10))
+    survey = Survey(sensor, steps=20, trajectory=Cart())
+    assert survey.scan_count == 40 and survey.poses == ()
+    for scan, seconds, y in ((0, 0, 0), (5, 0.05, 0), (19, 0.19, 0), (20, 0, 10), (25, 0.05, 10)):
+        assert survey.pose(scan).position == pytest.approx((5 * seconds, y, 1))
+        assert survey.pose(scan).yaw_deg == pytest.approx(90 * seconds)
+
+
+def test_poses_are_a_trajectory_too():
+    poses = (Pose((0, 0, 1)), Pose((1, 2, 3), 10))
+    by_poses, by_path = Survey(poses=poses), Survey(trajectory=Stations(poses))
+    assert by_poses.path == by_path.path
+    assert replace(by_poses, steps=7).path == by_poses.path
+    positions, rotations = by_poses.path.poses(1, np.zeros(4))
+    assert positions.tolist() == [[1, 2, 3]] * 4
+    assert np.array_equal(rotations, [poses[1].rotation] * 4)
+    assert by_poses.path.poses(0, np.zeros(4))[1] is None
+
+
+def test_columns_are_looked_up_and_stored_after_those_that_are_always_there():
+    own = Column("twice", "float32", "m", "range, doubled", lambda returns: 2 * returns.range)
+    survey = Survey(poses=[(0, 0, 1)], columns=["time", own, "ring"])
+    assert [c.name for c in survey.columns] == ["time", "twice"]
+    names = [c.name for c in survey.stored_columns]
+    assert names == ["x", "y", "z", "channel", "object", "time", "twice"]
 
 
 def test_rotation_is_yaw_then_pitch_then_roll():
@@ -49,13 +85,16 @@ def test_rotation_is_yaw_then_pitch_then_roll():
     [
         ({"poses": []}, "at least one pose"),
         ({"poses": [(0, 0)]}, "three finite"),
+        ({"poses": [5]}, "three coordinates"),
         ({"poses": [(0, 0, float("nan"))]}, "three finite"),
-        ({"poses": [(0, 0, 0)], "steps": 0}, "steps"),
-        ({"poses": [(0, 0, 0)], "keep_every": 0}, "keep_every"),
-        ({"poses": [(0, 0, 0)], "precision_m": 0}, "precision_m"),
-        ({"poses": [(0, 0, 0)], "precision_m": float("inf")}, "precision_m"),
+        ({"steps": 0}, "steps"),
+        ({"keep_every": 0}, "keep_every"),
+        ({"precision_m": 0}, "precision_m"),
+        ({"precision_m": float("inf")}, "precision_m"),
+        ({"trajectory": Cart()}, "either poses or a trajectory"),
+        ({"columns": ["tiem"]}, "There is no column 'tiem'.*'time'"),
     ],
 )
 def test_values_out_of_range_say_which(arguments, message):
     with pytest.raises(LidarpoolError, match=message):
-        Survey(**arguments)
+        Survey(**({"poses": [(0, 0, 0)]} | arguments))

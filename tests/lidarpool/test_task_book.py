@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import pytest
 
-from lidarpool.task_book import (
+from lidarpool.base.task_book import (
     MISPLACED_MOST,
     RECORDS_MOST,
     SPANS_MOST,

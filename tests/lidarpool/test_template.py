@@ -6,10 +6,10 @@ import pytest
 import yaml
 
 from lidarpool import LidarpoolError
-from lidarpool.scenario import Scenario
-from lidarpool.sections import CloudSection, PlanningSection, PoolSection, SceneSection
-from lidarpool.sections import SensorSection as Sensor
-from lidarpool.template import scenario_template
+from lidarpool.scenario.scenario import Scenario
+from lidarpool.scenario.sections import CloudSection, PlanningSection, PoolSection, SceneSection
+from lidarpool.scenario.sections import SensorSection as Sensor
+from lidarpool.scenario.template import scenario_template
 
 TEXT = scenario_template(("lidarpool run scenario.yaml",), "scenario.schema.json")
 # A field that is commented out: its name, a colon and a value in YAML.

@@ -6,8 +6,8 @@ from contextlib import suppress
 
 import pytest
 
-from lidarpool.progress import Progress
-from lidarpool.terminal import shown_progress, shown_status
+from lidarpool.cli.terminal import shown_progress, shown_status
+from lidarpool.run.progress import Progress
 
 pty = pytest.importorskip("pty", reason="there are no pseudo-terminals here", exc_type=ImportError)
 

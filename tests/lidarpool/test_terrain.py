@@ -7,14 +7,14 @@ import doctest
 import numpy as np
 import pytest
 
-import lidarpool.terrain
+import lidarpool.scene.terrain
 from lidarpool import LidarpoolError
-from lidarpool.terrain import terrain
+from lidarpool.scene.terrain import terrain
 from raybeam import RayCaster
 
 
 def test_examples_in_the_docstrings():
-    found = doctest.testmod(lidarpool.terrain)
+    found = doctest.testmod(lidarpool.scene.terrain)
     assert found.failed == 0 < found.attempted
 
 

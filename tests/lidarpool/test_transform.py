@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from lidarpool.errors import LidarpoolError
-from lidarpool.transform import UP_AXES, Transform
+from lidarpool.base.errors import LidarpoolError
+from lidarpool.scene.transform import UP_AXES, Transform
 
 
 @pytest.mark.parametrize("axis", "xyz")

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidarpool.view.camera import Camera, fit_camera
+from lidarpool.render.camera import Camera, fit_camera
 
 FRAME = (0.1, 0.2, 0.8, 0.9)
 BOX = np.array([[x, y, z] for x in (-3, 5) for y in (1, 4) for z in (0, 2)], dtype=float)

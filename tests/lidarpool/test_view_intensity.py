@@ -4,9 +4,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lidarpool import LidarpoolError
-from lidarpool.mesh import Mesh
-from lidarpool.scene import Scene
-from lidarpool.view.intensity import checked_counts, hit_density
+from lidarpool.render.intensity import checked_counts, hit_density
+from lidarpool.scene.mesh import Mesh
+from lidarpool.scene.scene import Scene
 
 
 def sheet(n):

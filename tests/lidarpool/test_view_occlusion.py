@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from lidarpool.mesh import Mesh
-from lidarpool.scene import Scene
-from lidarpool.view.cloud_picture import on_shown_surfaces
-from lidarpool.view.overlay import splat, visible, visible_runs
-from lidarpool.view.samples import GROUND, SKY
-from lidarpool.view.shot import take_shot
-from lidarpool.view.theme import LIGHT
+from lidarpool.render.cloud_picture import on_shown_surfaces
+from lidarpool.render.overlay import splat, visible, visible_runs
+from lidarpool.render.samples import GROUND, SKY
+from lidarpool.render.shot import take_shot
+from lidarpool.render.theme import LIGHT
+from lidarpool.scene.mesh import Mesh
+from lidarpool.scene.scene import Scene
 
 SIZE = (320, 200)
 

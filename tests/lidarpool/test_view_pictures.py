@@ -6,14 +6,18 @@ import pytest
 from PIL import Image
 
 from lidarpool import LidarpoolError
-from lidarpool.mesh import Mesh
 from lidarpool.plan import Plan, Planning, best, run_trial
-from lidarpool.scene import Scene
-from lidarpool.shapes import seed_objects
-from lidarpool.view import draw_cloud, draw_intensity, draw_path, draw_scene, take_shot
-from lidarpool.view.captions import facts, without_common_prefix
-from lidarpool.view.page import shortened
-from lidarpool.view.theme import object_colours
+from lidarpool.render.captions import facts, without_common_prefix
+from lidarpool.render.cloud_picture import draw_cloud
+from lidarpool.render.intensity_picture import draw_intensity
+from lidarpool.render.page import shortened
+from lidarpool.render.scene_picture import draw_scene
+from lidarpool.render.shot import take_shot
+from lidarpool.render.theme import object_colours
+from lidarpool.report.path_picture import draw_path
+from lidarpool.scene.mesh import Mesh
+from lidarpool.scene.scene import Scene
+from lidarpool.scene.shapes import seed_objects
 
 SIZE = (320, 200)
 SMALL = {"size": SIZE, "backend": "numpy"}
@@ -145,9 +149,15 @@ def test_backends_draw_the_same_picture(scene):
 NAN, INF = np.nan, np.inf
 
 
-@pytest.mark.parametrize("size", [0.1, 1.0, 10_000.0])
 @pytest.mark.parametrize(
-    "poses", [[], [[0, 0, 1]], [[NAN, 0, 0], [0, INF, 0]], [[1e9, 0, 0]], [[0.2, 0.2, 0.0]] * 1000]
+    ("size", "poses"),
+    [
+        (0.1, [[0, 0, 1]]),
+        (1.0, []),
+        (1.0, [[NAN, 0, 0], [0, INF, 0]]),
+        (1.0, [[1e9, 0, 0]]),
+        (10_000.0, [[0.2, 0.2, 0.0]] * 1000),
+    ],
 )
 def test_any_scene_and_poses_can_be_drawn(tmp_path, size, poses):
     scene = triangle(size)
@@ -186,7 +196,7 @@ def test_many_objects_fit_the_legend(tmp_path):
 
 @pytest.mark.parametrize("name", ["$\\frac{x$", "_hidden", "a\x1b]0;b\x07\nc", "\u202egnp", " "])
 def test_names_from_files_are_words_and_nothing_else(tmp_path, monkeypatch, name):
-    from lidarpool.view.page import Page
+    from lidarpool.render.page import Page
 
     kept = []
     save = Page.save
@@ -223,7 +233,7 @@ def test_the_path_is_drawn_with_its_discs_and_trials(tmp_path, planned):
 
 
 def test_the_path_plot_has_equal_axes(tmp_path, planned, monkeypatch):
-    from lidarpool.view.page import Page
+    from lidarpool.render.page import Page
 
     kept = []
     monkeypatch.setattr(Page, "save", lambda page, path: kept.append(page.figure))
@@ -238,7 +248,7 @@ def test_the_path_plot_has_equal_axes(tmp_path, planned, monkeypatch):
 
 
 def test_the_path_plot_tells_world_coordinates(tmp_path, planned, monkeypatch):
-    from lidarpool.view.page import Page
+    from lidarpool.render.page import Page
 
     kept = []
     monkeypatch.setattr(Page, "save", lambda page, path: kept.append(page.figure))

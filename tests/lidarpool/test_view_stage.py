@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidarpool.view.camera import fit_camera
-from lidarpool.view.labels import axis_labels
-from lidarpool.view.stage import Stage, axis, nice_step, robust_bounds
+from lidarpool.render.camera import fit_camera
+from lidarpool.render.labels import axis_labels
+from lidarpool.render.stage import Stage, axis, nice_step, robust_bounds
 
 
 @given(st.floats(1e-6, 1e9))

@@ -4,8 +4,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from lidarpool import LidarpoolError, watch
-from lidarpool.watch import Watch
+from lidarpool import LidarpoolError
+from lidarpool.scan import watch
+from lidarpool.scan.watch import Watch
 
 
 @pytest.fixture

@@ -13,23 +13,85 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
+import dask
 import numpy as np
 import pytest
-from distributed import Client, Scheduler, SpecCluster, Worker
+from distributed import Client, Scheduler, SpecCluster, Worker, WorkerPlugin
 
-import lidarpool.pictures
-import lidarpool.scan.pump
+import lidarpool.report.pictures
+import lidarpool.scan.driver
 from lidarpool import Cloud
-from lidarpool.cli import main
-from poolpart import fetch_available, local_cluster, worker_identities
+from lidarpool.cli.commands import main
+from lidarpool.run.local import local_cluster
+from poolpart import fetch_available, trace_to, worker_identities
 
 
-@pytest.fixture(scope="module")
-def client() -> Iterator[Client]:
-    """A local cluster with two casting workers, so that one can die."""
-    with local_cluster(gpu_workers=2, other_workers=1) as cluster, Client(cluster) as client:
+@pytest.fixture(scope="session")
+def local_client() -> Iterator[Client]:
+    """A local cluster of processes: three casting workers, one each of LIDAR and OTHER."""
+    # Dask's memory manager drops what no task needs at that moment; here it does so very often.
+    often = {"distributed.scheduler.active-memory-manager.interval": "200ms"}
+    with (
+        dask.config.set(often),
+        local_cluster(gpu_workers=3, other_workers=1) as cluster,
+        Client(cluster, set_as_default=False) as client,
+    ):
         yield client
+
+
+@pytest.fixture
+def client(local_client: Client, wait_for_all: Callable[[Client, int], None]) -> Client:
+    """The local cluster with all its workers: an earlier test may have killed some."""
+    wait_for_all(local_client, 5)
+    return local_client
+
+
+@pytest.fixture(scope="session")
+def cluster_client(cluster: str) -> Iterator[Client]:
+    """Client of the cluster whose workers are threads."""
+    with Client(cluster, set_as_default=False) as client:
+        yield client
+
+
+class _Saboteur(WorkerPlugin):
+    """Ends a worker that comes to a point with one of some scans, as long as lives are left."""
+
+    name = "saboteur"
+
+    def __init__(self, point: str, scans: set[int], lives: Path) -> None:
+        self.point, self.scans, self.lives = point, scans, lives
+
+    def setup(self, worker: Worker) -> None:
+        trace_to(self._strike)
+
+    def teardown(self, worker: Worker) -> None:
+        trace_to(None)
+
+    def _strike(self, point: str, fields: dict[str, Any]) -> None:
+        if point == self.point and self.scans & set(fields["scans"]):
+            left = self.lives.stat().st_size
+            if left:
+                os.truncate(self.lives, left - 1)
+                os.kill(os.getpid(), signal.SIGKILL)
+
+
+@pytest.fixture
+def sabotage(client: Client, tmp_path: Path) -> Iterator[Callable[..., Path]]:
+    """Have workers die when they pass a point with one of some scans, so many times.
+
+    Returns a file with as many bytes as lives are left; an empty one ends the sabotage.
+    """
+
+    def sabotage(point: str, scans: set[int], lives: int = 1000) -> Path:
+        file = tmp_path / "lives"
+        file.write_bytes(bytes(lives))
+        client.register_plugin(_Saboteur(point, scans, file))
+        return file
+
+    yield sabotage
+    client.unregister_worker_plugin("saboteur")
 
 
 @pytest.fixture
@@ -65,15 +127,15 @@ def wait_for_all() -> Callable[[Client, int], None]:
 @pytest.fixture
 def same_cloud() -> Callable[[Cloud, Cloud], bool]:
     def same(one: Cloud, two: Cloud) -> bool:
-        return all(
-            np.array_equal(getattr(one, name), getattr(two, name))
-            for name in ("positions", "scan", "ring", "object")
+        return np.array_equal(one.positions, two.positions) and all(
+            np.array_equal(one.columns[name], two.columns[name])
+            for name in one.columns.keys() | two.columns.keys()
         )
 
     return same
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def cluster() -> Iterator[str]:
     """A cluster whose workers are threads of this process, for speed; its address."""
     quiet = {"host": "127.0.0.1", "dashboard": False}
@@ -81,7 +143,7 @@ def cluster() -> Iterator[str]:
         name: {"cls": Worker, "options": {"resources": {name: n}, "nthreads": n, **quiet}}
         for name, n in {"GPU": 1, "LIDAR": 4, "OTHER": 1}.items()
     }
-    scheduler = {"cls": Scheduler, "options": {"port": 0, **quiet}}
+    scheduler = {"cls": Scheduler, "options": {"port": 0, "dashboard_address": ":0", **quiet}}
     with SpecCluster(workers=workers, scheduler=scheduler, silence_logs=50) as cluster:
         yield cluster.scheduler_address
 
@@ -112,17 +174,18 @@ _CLIENT_HUNG_UP = (
 class OutsideCluster:
     """A scheduler and workers from the `dask` command line, each a process of its own."""
 
-    def __init__(self, folder: Path, *options: str) -> None:
+    def __init__(self, folder: Path, *options: str, **environment: str) -> None:
         self.folder, self.options = folder, options  # of scheduler and workers
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
         file = folder / "scheduler.json"
         self._start(
-            "scheduler", "scheduler", "--port", "0", "--no-dashboard", "--scheduler-file", str(file)
-        )
+            "scheduler", "scheduler", "--port", "0", "--no-dashboard",
+            "--scheduler-file", str(file), **environment,
+        )  # fmt: skip
         _wait(lambda: file.exists() and file.read_text().endswith("}"))  # it is written in pieces
         self.address = json.loads(file.read_text())["address"]
 
-    def _start(self, name: str, *arguments: str) -> None:
+    def _start(self, name: str, *arguments: str, **environment: str) -> None:
         log = (self.folder / f"{name}.log").open("wb")
         self.processes[name] = subprocess.Popen(
             [
@@ -134,10 +197,12 @@ class OutsideCluster:
             ],
             stdout=log,
             stderr=log,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), **environment},
         )
 
-    def add(self, partition: str, count: int = 1, slots: int = 1, preload: str = "") -> None:
+    def add(
+        self, partition: str, count: int = 1, slots: int = 1, preload: str = "", **environment: str
+    ) -> None:
         """Start workers of a partition; `preload` is Python that each runs first."""
         for _ in range(count):
             name = f"{partition}-{len(self.processes)}"
@@ -148,7 +213,7 @@ class OutsideCluster:
                 options += ["--preload", str(file)]
             self._start(
                 name, "worker", self.address, "--name", name, "--no-dashboard", "--no-nanny",
-                "--local-directory", str(self.folder), *options,
+                "--local-directory", str(self.folder), *options, **environment,
             )  # fmt: skip
 
     def wait(self) -> None:
@@ -195,8 +260,9 @@ def outside(
     """Start clusters from the `dask` command line that end with the module."""
     clusters: list[OutsideCluster] = []
 
-    def start(*options: str) -> OutsideCluster:
-        clusters.append(OutsideCluster(tmp_path_factory.mktemp("cluster"), *options))
+    def start(*options: str, **environment: str) -> OutsideCluster:
+        folder = tmp_path_factory.mktemp("cluster")
+        clusters.append(OutsideCluster(folder, *options, **environment))
         return clusters[-1]
 
     yield start
@@ -243,17 +309,19 @@ def run_lidarpool(
 @pytest.fixture
 def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave the drawing out, which takes longer than a small survey."""
-    monkeypatch.setattr(lidarpool.pictures, "take_shot", lambda *_, **__: None)
+    monkeypatch.setattr(lidarpool.report.pictures, "take_shot", lambda *_, **__: None)
     for name in ("draw_scene", "draw_intensity", "draw_cloud", "draw_path"):
-        monkeypatch.setattr(lidarpool.pictures, name, lambda path, *_, **__: path.write_bytes(b"x"))
+        monkeypatch.setattr(
+            lidarpool.report.pictures, name, lambda path, *_, **__: path.write_bytes(b"x")
+        )
 
 
 @pytest.fixture
 def all_records(monkeypatch: pytest.MonkeyPatch) -> None:
     """Wait for the records of the long stages: a run does without those that come too late."""
-    monkeypatch.setattr(lidarpool.scan.pump, "LAST_WORDS_S", 120.0)
+    monkeypatch.setattr(lidarpool.scan.driver, "LAST_WORDS_S", 120.0)
     patient = partial(fetch_available, patience_s=120.0)
-    monkeypatch.setattr(lidarpool.scan.pump, "fetch_available", patient)
+    monkeypatch.setattr(lidarpool.scan.driver, "fetch_available", patient)
 
 
 @pytest.fixture
@@ -263,7 +331,7 @@ def small_batches(monkeypatch: pytest.MonkeyPatch) -> None:
     By default the machine's speed decides, and a survey of small scans may be under way as a
     whole, or stage 1 have ended, when the driver sees the first frames.
     """
-    monkeypatch.setattr(lidarpool.scan.pump, "wished_scans", lambda *_: 10)
+    monkeypatch.setattr(lidarpool.scan.driver.SurveyDriver, "_wished_scans", lambda *_: 10)
 
 
 # -- the command as a process of its own ---------------------------------------------------------

@@ -18,8 +18,9 @@ import pytest
 import trimesh
 from distributed import Scheduler, SpecCluster, Worker
 
-import lidarpool.connection
-from lidarpool.log_file import LOG
+import lidarpool.run.checks as lidarpool_checks
+import lidarpool.run.connection
+from lidarpool.cli.log_file import LOG
 from raybeam import available_backends
 
 BOX = trimesh.creation.box((2, 4, 6))
@@ -118,7 +119,7 @@ SCENARIOS: dict[str, tuple[str | bytes, str]] = {
     "NaN": ("sensor: {step_deg: .nan}\n", "sensor.step_deg is nan"),
     "infinite": ("sensor: {vertical_fov_deg: .inf}\n", "sensor.vertical_fov_deg is inf"),
     "ranges the wrong way": ("sensor: {min_range_m: 5, max_range_m: 4}\n", "above min_range_m"),
-    "step below an azimuth": ("sensor: {step_deg: 0.1}\n", "less than one azimuth"),
+    "step below an azimuth": ("sensor: {step_deg: 0.1}\n", "less than one firing"),
     "too many rays": (
         "sensor: {rays_per_revolution: 10000000, layers: 65535}\n",
         "at most 100,000,000 rays",
@@ -215,7 +216,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Give up soon; for addresses where nobody answers. On a busy machine a scheduler may not."""
-    monkeypatch.setattr(lidarpool.connection, "CONNECT_TIMEOUT_S", 1)
+    monkeypatch.setattr(lidarpool.run.connection, "CONNECT_TIMEOUT_S", 1)
 
 
 def content(folder: Path) -> dict[str, bytes | None]:
@@ -417,7 +418,7 @@ def cluster() -> Iterator[Callable[..., str]]:
             i: {"cls": Worker, "options": {"resources": r, "nthreads": 1, **quiet}}
             for i, r in enumerate(resources)
         }
-        scheduler = {"cls": Scheduler, "options": {"port": 0, **quiet}}
+        scheduler = {"cls": Scheduler, "options": {"port": 0, "dashboard_address": ":0", **quiet}}
         started.append(SpecCluster(workers=workers, scheduler=scheduler, silence_logs=50))
         return started[-1].scheduler_address
 
@@ -443,7 +444,20 @@ CLUSTERS: dict[str, tuple[list[dict[str, int]], str]] = {
 @pytest.mark.parametrize("case", CLUSTERS)
 def test_a_cluster_that_lacks_something(case, cluster, refused):
     resources, says = CLUSTERS[case]
-    refused(["run", "good.yaml", "--scheduler", cluster(*resources)], says)
+    command = ["run", "good.yaml", "--scheduler", cluster(*resources)]
+    refused(command if case == "two resources" else [*command, "--wait", "0s"], says)
+
+
+def test_workers_that_are_waited_for_are_named_meanwhile(cluster, place, lidarpool, monkeypatch):
+    monkeypatch.setattr(lidarpool_checks, "TELL_EVERY_S", 0.1)
+    address = cluster({"GPU": 1}, {"OTHER": 1})
+    outcome = lidarpool("run", "good.yaml", "--scheduler", address, "--wait", "0.5s")
+    assert outcome.code == 2
+    assert re.match(
+        r"note: waiting for workers, for another \d s: Partition 'LIDAR' has 0 of the 4 slots",
+        outcome.err,
+    )
+    assert outcome.err.splitlines()[-1].startswith("lidarpool: Partition 'LIDAR' has 0 of the 4")
 
 
 def test_a_backend_that_the_workers_lack(cluster, refused):
@@ -508,7 +522,7 @@ def test_workers_whose_lidarpool_is_not_ours(preload, says, outside, place, refu
 )
 def test_the_installed_command_says_the_same(arguments, says, place):
     before = content(place)
-    command = [sys.executable, "-c", "from lidarpool.cli import main; main()", *arguments]
+    command = [sys.executable, "-c", "from lidarpool.cli.commands import main; main()", *arguments]
     env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     ended = subprocess.run(command, capture_output=True, text=True, env=env, check=False)
     assert ended.stderr == f"lidarpool: {says}\n"

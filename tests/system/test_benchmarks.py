@@ -15,7 +15,6 @@ def test_pipeline(tmp_path, capsys):
     assert json.loads(path.read_text()) == figures
     assert figures["scans_per_second"] > 0
     assert set(figures["stage_ms_per_scan"]) == {"generate", "intersect", "sort", "collect"}
-    assert figures["journal"]["throughput_ratio"] > 0
     assert 0 < figures["latency"]["median_ms"] <= figures["latency"]["p95_ms"]
     assert figures["cpu_seconds_per_million_rays"]["20"] > 0
     assert "scans/s" in capsys.readouterr().out
@@ -35,7 +34,7 @@ def test_scale(tmp_path, capsys):
 
 def test_live(tmp_path, capsys):
     path = tmp_path / "figures.json"
-    figures = live.main(["--poses", "1", "--runs", "1", "--json", str(path)])
+    figures = live.main(["--poses", "3", "--runs", "1", "--json", str(path)])
     assert json.loads(path.read_text()) == figures
     assert figures["ratio"] > 0
     assert figures["megabytes_sent"] > 0.1  # or nobody looked

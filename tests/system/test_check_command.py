@@ -14,13 +14,14 @@ import pytest
 import trimesh
 from distributed import Client, Scheduler, SpecCluster, Worker
 
-import lidarpool.forecast
-import lidarpool.sampling
+import lidarpool.cli.forecast
+import lidarpool.run.connection
+import lidarpool.scenario.sampling
 from lidarpool import simulate
-from lidarpool.needs import needs_of
-from lidarpool.run_command import make_job
-from lidarpool.sampling import sample_survey
-from lidarpool.scenario import Scenario
+from lidarpool.cli.needs import needs_of
+from lidarpool.cli.run_command import make_job
+from lidarpool.scenario.sampling import sample_survey
+from lidarpool.scenario.scenario import Scenario
 
 SHORT = {"sensor": {"layers": 8}, "planning": {"trials": 4}, "pool": {"backend": "numpy"}}
 Usage = namedtuple("Usage", "total used free")
@@ -34,7 +35,7 @@ def cluster() -> Iterator[str]:
         name: {"cls": Worker, "options": {"resources": {name: n}, "nthreads": n, **quiet}}
         for name, n in {"GPU": 1, "LIDAR": 4}.items()
     }
-    scheduler = {"cls": Scheduler, "options": {"port": 0, **quiet}}
+    scheduler = {"cls": Scheduler, "options": {"port": 0, "dashboard_address": ":0", **quiet}}
     with SpecCluster(workers=workers, scheduler=scheduler, silence_logs=50) as cluster:
         yield cluster.scheduler_address
 
@@ -56,13 +57,13 @@ def test_what_is_counted_and_needed_is_what_a_run_gives(cluster, tmp_path):
     needs = needs_of(job, sample.points)
     with Client(cluster, set_as_default=False) as client:
         result = simulate(
-            job.scene, job.survey, client=client, backend="numpy", journal=tmp_path / "journal"
+            job.scene, job.survey, client=client, backend="numpy", folder=tmp_path / "run"
         )
     assert job.survey.ray_count > sample.rays == 108 * (20_000 // 108)
     assert sample.hits == pytest.approx(result.hits, rel=0.1)
     assert sample.points == pytest.approx(len(result.points), rel=0.1)
-    kept = sum(path.stat().st_size for path in (tmp_path / "journal").iterdir())
-    assert 0.5 * kept < needs_of(job, len(result.points)).journal
+    kept = sum(path.stat().st_size for path in (tmp_path / "run" / "parts").iterdir())
+    assert 0.5 * kept < needs_of(job, len(result.points)).parts
     assert needs.cloud > len(result.points) * 22
 
 
@@ -78,10 +79,10 @@ def test_where_all_rays_are_cast_they_are_counted(cluster):
 @pytest.mark.parametrize(("rays", "scans"), [(20_000, 500), (20_000, 50), (3_000, 36)])
 def test_an_estimate_from_few_rays_is_near(rays, scans, monkeypatch):
     job = make_job(Scenario(), no_plan=True)
-    monkeypatch.setitem(lidarpool.sampling.RAYS_MOST, "numpy", 120_000)
+    monkeypatch.setitem(lidarpool.scenario.sampling.RAYS_MOST, "numpy", 120_000)
     whole = sample_survey(job.scene, job.survey, "numpy")
-    monkeypatch.setitem(lidarpool.sampling.RAYS_MOST, "numpy", rays)
-    monkeypatch.setattr(lidarpool.sampling, "SCANS_MOST", scans)
+    monkeypatch.setitem(lidarpool.scenario.sampling.RAYS_MOST, "numpy", rays)
+    monkeypatch.setattr(lidarpool.scenario.sampling, "SCANS_MOST", scans)
     part = sample_survey(job.scene, job.survey, "numpy")
     assert part.rays <= rays and whole.rays == 120_000
     assert part.hits == pytest.approx(whole.hits, rel=0.3)
@@ -125,14 +126,14 @@ def test_a_disk_without_room(check, as_json, monkeypatch):
 
 
 def test_too_little_memory(check, monkeypatch):
-    monkeypatch.setattr(lidarpool.forecast, "MEMORY_LIMIT", 300_000_000)
+    monkeypatch.setattr(lidarpool.cli.forecast, "MEMORY_LIMIT", 300_000_000)
     outcome = check()
     assert outcome.code == 2
     assert "There are 300 MB of memory and the run needs about" in outcome.err
 
 
 def test_all_reasons_are_given_at_once(check, tmp_path, monkeypatch):
-    monkeypatch.setattr(lidarpool.forecast, "MEMORY_LIMIT", 1_000_000)
+    monkeypatch.setattr(lidarpool.cli.forecast, "MEMORY_LIMIT", 1_000_000)
     (tmp_path / "out").write_text("")
     said = json.loads(check("--json").out)
     assert len(said["reasons"]) == 2 and said["estimate"] is None
@@ -158,8 +159,8 @@ def test_a_survey_that_hits_nothing_is_told_of(check):
 
 
 def test_an_unfinished_run_is_told_of(check, tmp_path):
-    (tmp_path / "out" / "journal").mkdir(parents=True)
-    (tmp_path / "out" / "journal" / lidarpool.forecast.RECORDS).write_bytes(b"")
+    (tmp_path / "out" / "run").mkdir(parents=True)
+    (tmp_path / "out" / "run" / "run.db").write_bytes(b"")
     outcome = check()
     assert outcome.code == 0
     assert "holds an unfinished run: --resume goes on with it" in outcome.out
@@ -188,7 +189,8 @@ def test_certificates_without_a_cluster(check, tmp_path):
     assert outcome.code == 2 and "are for the cluster of --scheduler" in outcome.err
 
 
-def test_no_scheduler_answers(check):
+def test_no_scheduler_answers(check, monkeypatch):
+    monkeypatch.setattr(lidarpool.run.connection, "CONNECT_TIMEOUT_S", 1)
     outcome = check("--scheduler", "tcp://127.0.0.1:1")
     assert outcome.code == 2 and "No Dask scheduler answers" in outcome.err
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-import lidarpool.run_command
+import lidarpool.cli.run_command
 from lidarpool import read_cloud
 
 SHORT = "sensor: {layers: 8}\nplanning: {trials: 4, iterations: 20}\n"
@@ -56,13 +56,13 @@ def test_json_of_a_run_that_fails_is_nothing(run):
 
 
 def test_warnings_of_libraries_are_in_the_log_and_not_on_the_terminal(run, tmp_path, monkeypatch):
-    make_result = lidarpool.run_command.shown_progress
+    make_result = lidarpool.cli.run_command.shown_progress
 
     def warn(quiet: bool) -> Any:
         logging.getLogger("distributed.worker").warning("memory is nearly full")
         return make_result(quiet)
 
-    monkeypatch.setattr(lidarpool.run_command, "shown_progress", warn)
+    monkeypatch.setattr(lidarpool.cli.run_command, "shown_progress", warn)
     outcome = run("--no-plan")
     assert outcome.code == 0
     assert "memory is nearly full" not in outcome.err + outcome.out

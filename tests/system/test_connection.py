@@ -11,8 +11,8 @@ import time
 import psutil
 import pytest
 
-from lidarpool import interrupts
-from lidarpool.interrupts import deferred_interrupts, interrupt_on_signals
+from lidarpool.base import interrupts
+from lidarpool.base.interrupts import deferred_interrupts, interrupt_on_signals
 
 SCRIPT = """
 from lidarpool import Scene, Survey, simulate

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from lidarpool.output import FILES, result_folder
+from lidarpool.report.output import FILES, result_folder
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="forks")
 
@@ -21,7 +21,7 @@ DRAWN_AGAIN = ("scene-dark.png", "path.pdf")
 SCRIPT = """
 import json, os, signal, sys
 from pathlib import Path
-from lidarpool.output import _publish
+from lidarpool.report.output import _publish
 
 root, files, earlier = Path(sys.argv[1]), json.loads(sys.argv[2]), json.loads(sys.argv[3])
 

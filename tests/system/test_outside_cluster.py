@@ -3,41 +3,44 @@
 from __future__ import annotations
 
 import json
-from collections import Counter
+import os
+import shutil
+import sys
 from collections.abc import Callable
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from distributed import Client
 
-from lidarpool import Cloud, read_cloud
+import lidarpool as package
+from lidarpool import Frame, Scene, Sensor, Survey, __version__, simulate
+from poolpart import worker_identities
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "seed.yaml"
-
-
-@pytest.fixture(scope="module")
-def seed(tmp_path_factory) -> Path:
-    """The default survey with less planning."""
-    text = EXAMPLE.read_text()
-    fewer = text.replace("trials: 100 ", "trials: 40 ").replace("keep_every: 5 ", "keep_every: 1 ")
-    assert fewer != text
-    path = tmp_path_factory.mktemp("seed") / "seed.yaml"
-    path.write_text(fewer)
-    return path
+# Of the default survey, with Embree as well as with NumPy.
+CLOUD_SHA256 = "9012bcbf7aa44d9d07c95fae78e707887c40225f1bde1fcb304c674c220c0228"
 
 
 @pytest.fixture
-def run(
-    lidarpool, tmp_path, seed, no_pictures, all_records
-) -> Callable[..., tuple[bytes, dict[str, Any]]]:
-    """Run the survey; the cloud's bytes and the report."""
+def run(lidarpool, tmp_path, no_pictures, all_records) -> Callable[..., dict[str, Any]]:
+    """Run the default survey with less planning, and check its cloud; the report."""
+    fewer = EXAMPLE.read_text().replace("trials: 100 ", "trials: 10 ")
+    assert "trials: 10 " in fewer
+    (tmp_path / "seed.yaml").write_text(fewer)
 
-    def run(name: str, *options: str) -> tuple[bytes, dict[str, Any]]:
-        outcome = lidarpool("run", seed, "--out", tmp_path / name, "--quiet", *options)
+    def run(cluster: Any, *options: str) -> dict[str, Any]:
+        out = tmp_path / "out"
+        arguments = ["--out", out, "--quiet", "--scheduler", cluster.address, *options]
+        outcome = lidarpool("run", tmp_path / "seed.yaml", *arguments)
         assert (outcome.code, outcome.err) == (0, "")
-        report = json.loads((tmp_path / name / "report.json").read_text())
-        return (tmp_path / name / "cloud.ply").read_bytes(), report
+        report = json.loads((out / "report.json").read_text())
+        assert [report[name] for name in ("rays", "hits", "points")] == [120_000, 4926, 995]
+        assert sha256((out / "cloud.ply").read_bytes()).hexdigest() == CLOUD_SHA256
+        assert not (out / "run").exists()
+        return report
 
     return run
 
@@ -46,32 +49,28 @@ def check_places(report: dict[str, Any], gpu_workers: int) -> None:
     assert report["placement_violations"] == 0
     assert report["tasks"]["GPU"].keys() == {"intersect"}
     assert report["tasks"]["LIDAR"] == {"generate": 1, "sort": 1, "collect": 2}
-    assert report["tasks"]["OTHER"] == {"trial": 40}
+    assert report["tasks"]["OTHER"] == {"trial": 10}
     assert 1 <= len(report["stages"]["intersect"]["workers"]) <= gpu_workers
 
 
 def test_an_outside_cluster_gives_the_same_bytes(run, lidarpool, outside):
-    local, report = run("local")
-    check_places(report, gpu_workers=report["stages"]["intersect"]["tasks"])
-
     cluster = outside()
     cluster.add("GPU")
     cluster.add("LIDAR", count=4)
     cluster.add("OTHER")
     cluster.wait()
-    cloud, report = run("six", "--scheduler", cluster.address)
-    assert cloud == local
+    report = run(cluster, "--backend", "embree")
     check_places(report, gpu_workers=1)
     lidar = {w for s in ("generate", "sort", "collect") for w in report["stages"][s]["workers"]}
     assert len(lidar) == 4  # a long task each, since each has one slot
+    assert report["backend"] == "embree"
 
     cluster.add("GPU")
     cluster.add("OTHER")
     cluster.wait()
-    cloud, report = run("eight", "--scheduler", cluster.address)
-    assert cloud == local
+    report = run(cluster, "--backend", "numpy")
     check_places(report, gpu_workers=2)
-    assert len(report["stages"]["trial"]["workers"]) == 2
+    assert report["backend"] == "numpy"
 
     told = lidarpool("info", "--scheduler", cluster.address)
     assert told.code == 0
@@ -83,35 +82,65 @@ def test_an_outside_cluster_gives_the_same_bytes(run, lidarpool, outside):
     assert cluster.complaints() == []
 
 
-def test_backends_agree_on_one_worker_with_four_slots(run, outside, tmp_path):
+# What a worker in a container of its own has: the folder's name, and another folder.
+BLIND = """
+from lidarpool.columns.storage import Storage
+def fail(*_): raise FileNotFoundError("there is no such folder here")
+Storage.read = Storage.write = fail
+"""
+
+
+def test_workers_that_do_not_see_the_folder_hand_their_parts_to_the_driver(run, outside):
+    cluster = outside()
+    cluster.add("GPU")
+    cluster.add("LIDAR", slots=2)
+    cluster.add("LIDAR", slots=2, preload=BLIND)
+    cluster.add("OTHER")
+    cluster.wait()
+    report = run(cluster)
+    blind = list(cluster.processes)[3]
+    assert len(report["notes"]) == 2
+    assert report["notes"][1].startswith(f"{blind} of partition LIDAR cannot see ")
+    assert report["notes"][1].endswith(": parts came to it through the driver")
+
+
+def test_a_worker_of_another_version_that_joins_late_casts_nothing(
+    outside, cluster_client, tmp_path, same_cloud
+):
+    copy = tmp_path / "other" / "lidarpool"
+    shutil.copytree(Path(package.__file__).parent, copy)
+    (copy / "_version.py").write_text('__version__ = "0.0.1"\n')
+    returns = copy / "scan" / "returns.py"
+    text = returns.read_text()
+    assert "found.distance" in text
+    returns.write_text(text.replace("found.distance", "found.distance * 1.01"))
+
+    survey = Survey(
+        Sensor.grid(rays_per_revolution=360, layers=8, step_deg=5), [(0, 0, 1)], steps=72
+    )
+    expected = simulate(Scene.seed(), survey, client=cluster_client, backend="numpy")
     cluster = outside()
     cluster.add("GPU")
     cluster.add("LIDAR", slots=4)
-    cluster.add("OTHER")
     cluster.wait()
-    for backend in ("embree", "numpy"):
-        _, report = run(backend, "--scheduler", cluster.address, "--backend", backend)
-        check_places(report, gpu_workers=1)
-        assert report["backend"] == backend
-    check_agreement(*(read_cloud(tmp_path / b / "cloud.ply") for b in ("embree", "numpy")))
+    with Client(cluster.address, set_as_default=False) as client:
 
+        def on_frame(frame: Frame) -> None:
+            if frame.scan == 10:
+                path = os.pathsep.join([str(copy.parent), *sys.path])
+                cluster.add("GPU", PYTHONPATH=path)
+                cluster.wait()
 
-def check_agreement(one: Cloud, other: Cloud) -> None:
-    """At least 99.5% of the points are the same; others a rounding step or a silhouette apart."""
-    assert len(one) > 4000
-    assert abs(len(one) - len(other)) <= 1e-3 * len(one)
-    rows = [
-        Counter(zip(c.scan, c.ring, c.object, map(bytes, c.positions), strict=True))
-        for c in (one, other)
-    ]
-    same = (rows[0] & rows[1]).total()
-    assert same >= 0.995 * max(len(one), len(other))
-    # What differs lies within a step of a point that the other has, or is one of the few rays
-    # that pass an edge: at most a thousandth.
-    far = 0
-    for mine, other_positions in ((rows[0] - rows[1], other), (rows[1] - rows[0], one)):
-        for scan, _, _, position in mine:
-            near = other_positions.positions[other_positions.scan == scan]
-            here = np.frombuffer(position, other_positions.positions.dtype)
-            far += not (np.abs(near - here).max(axis=1, initial=0) <= 0.0101).any()
-    assert far <= 2e-3 * len(one)
+        result = simulate(
+            Scene.seed(), survey, client=client, backend="numpy", on_frame=on_frame,
+            scans_per_second=15,
+        )  # fmt: skip
+        late = list(cluster.processes)[-1]
+        (address,) = (a for a, w in worker_identities(client).items() if w["name"] == late)
+    assert same_cloud(result.cloud, expected.cloud)
+    assert (
+        f"worker {late} at {address} has lidarpool 0.0.1, the run {__version__}: it cast nothing"
+    ) in result.notes
+    casts = {record.worker for record in result.records if record.stage == "intersect"}
+    assert casts == {list(cluster.processes)[1]}
+    assert np.array_equal(result.hit_counts, expected.hit_counts)

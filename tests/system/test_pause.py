@@ -16,14 +16,15 @@ import pytest
 from distributed import Client
 
 from lidarpool import LidarpoolError, Planning, ScanSpec, Scene, Sensor, Survey, simulate
-from lidarpool.job import Job
-from lidarpool.journal import Journal, open_journal
-from lidarpool.live.control import RunControl
-from lidarpool.progress import Progress
-from lidarpool.run import Run
+from lidarpool.live.run_panel import RunControl
+from lidarpool.run.database import FILE, RunDatabase
+from lidarpool.run.job import Job
+from lidarpool.run.progress import Progress
+from lidarpool.run.run import Run
+from lidarpool.run.store import RunStore
 
 LONG_S = 120.0
-SENSOR = Sensor(rays_per_revolution=720, layers=8)
+SENSOR = Sensor.grid(rays_per_revolution=720, layers=8)
 POSES = [(0, 0, 1 + step / 40) for step in range(20)]
 
 
@@ -73,10 +74,10 @@ def all_due(monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
 
 
 class Driven:
-    """A run with a journal, which is paused as soon as it has some points."""
+    """A run in a folder, which is paused as soon as it has some points."""
 
     def __init__(self, client: Client, folder: Path, job: Job | None = None) -> None:
-        self.kept: Journal = open_journal(folder / "journal", job or make_job(), resume=True)
+        self.kept = RunStore(job or make_job(), folder / "run", resume=True)
         self.control = RunControl()
         self.run = Run(client, self.kept, lambda: self.control.paused)
         self.seen: list[Progress] = []
@@ -137,18 +138,16 @@ def test_a_paused_run_stands_still_for_long_and_then_goes_on(client, tmp_path, c
     def look_and_go_on() -> None:
         all_due.set()
         found["busy"] = busy_tasks(client)
-        before = driven.kept.cloud.ledger.delivered, driven.kept.totals.frames
-        # As after a crash at this moment, and of the kind that loses what was not synced.
-        found["unsynced"] = driven.kept._store.file.end - driven.kept._store.file._durable
-        shutil.copytree(tmp_path / "journal", tmp_path / "crashed" / "journal")
+        before = driven.kept.db.scans_done, driven.kept.db.frames
+        shutil.copytree(tmp_path / "run", tmp_path / "crashed" / "run")  # as after a crash now
         wait_for_looks(5)
         clock.ahead_s = 1000.0
         wait_for_looks(10)  # of which each takes a tenth of a second
-        found["stood"] = (driven.kept.cloud.ledger.delivered, driven.kept.totals.frames) == before
+        found["stood"] = (driven.kept.db.scans_done, driven.kept.db.frames) == before
         driven.control.go_on()
 
     driven.drive(look_and_go_on)
-    assert found == {"busy": [], "unsynced": 0, "stood": True}
+    assert found == {"busy": [], "stood": True}
     paused = [progress for progress in driven.seen if progress.paused]
     first = paused[0]
     assert len(paused) > 10
@@ -161,8 +160,8 @@ def test_a_paused_run_stands_still_for_long_and_then_goes_on(client, tmp_path, c
     whole = simulate(job.scene, job.survey, job.planning, client=client, backend="numpy")
     assert np.array_equal(driven.result.cloud.positions, whole.cloud.positions)
     # What a crash during the pause would have left.
-    left = open_journal(tmp_path / "crashed" / "journal", make_job(), resume=True)
-    assert left.resumed == left.totals.frames == first.collected
+    left = RunDatabase(tmp_path / "crashed" / "run" / FILE, job.survey.scan_count)
+    assert left.scans_done == left.frames == first.collected
     assert len(left.trials) == first.trials_done
     left.close()
 
@@ -200,6 +199,6 @@ def test_a_cluster_that_is_lost_during_a_pause_ends_the_run(outside, tmp_path):
         with pytest.raises(LidarpoolError, match="cannot be reached any more") as ended:
             driven.drive(lambda: cluster.kill("scheduler"))
     assert "continue with" in "".join(ended.value.__notes__)
-    kept = open_journal(tmp_path / "journal", make_job(), resume=True)
+    kept = RunStore(make_job(), tmp_path / "run", resume=True)
     assert kept.resumed == driven.seen[-1].collected > 0
-    kept.close()
+    kept.remove()

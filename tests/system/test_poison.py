@@ -5,200 +5,102 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
+from typing import Any
 
 import pytest
 from distributed import Client
 
-import lidarpool.scan.caster
-import lidarpool.scan.crew
+import lidarpool.run.trials
 import lidarpool.scan.long_stages
-import lidarpool.trials
-from lidarpool import LidarpoolError, Planning, Scene, Sensor, Survey, simulate
-from lidarpool.scan import CloudBuilder, SurveyPump
-from lidarpool.scan import casting as casting_module
+import lidarpool.scan.workers
+from lidarpool import Frame, LidarpoolError, Planning, Scene, Sensor, Survey, simulate
 from lidarpool.scan.failures import words_on_memory
-from poolpart import local_cluster, trace_to
+from poolpart import trace_to
 
-SURVEY = Survey(
-    Sensor(rays_per_revolution=720, layers=16, step_deg=1), poses=[(0, 0, 1), (1, 0, 2)], steps=360
+SURVEY = Survey(Sensor.grid(rays_per_revolution=360, layers=8, step_deg=2), [(0, 0, 1)], steps=180)
+POISON = 57
+
+pytestmark = pytest.mark.usefixtures("small_batches")
+
+
+@pytest.fixture(scope="module")
+def undisturbed(cluster_client):
+    return simulate(Scene.seed(), SURVEY, client=cluster_client).cloud
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("point", "stage"), [("intersect.cast", "intersect"), ("collect.part", "collect")]
 )
-POISON = 217
-
-
-@pytest.fixture(scope="module")
-def client() -> Iterator[Client]:
-    """A local cluster with two casting workers."""
-    with local_cluster(gpu_workers=2, other_workers=1) as cluster, Client(cluster) as client:
-        yield client
-
-
-@pytest.fixture(scope="module")
-def undisturbed(client):
-    client.wait_for_workers(4, timeout=120)
-    return simulate(Scene.seed(), SURVEY, client=client).cloud
-
-
-@pytest.fixture(autouse=True)
-def all_workers(client, wait_for_all, small_batches) -> None:
-    """Begin with all workers, also behind a test that killed some.
-
-    A batch of ten scans costs a worker before the poison in it is alone, at any speed.
-    """
-    wait_for_all(client, 4)
-
-
-@pytest.fixture
-def clouds(monkeypatch) -> list[CloudBuilder]:
-    """What the pumps of a test collect."""
-    made: list[CloudBuilder] = []
-    original = SurveyPump.__init__
-
-    def spy(self, *arguments, **options) -> None:
-        original(self, *arguments, **options)
-        made.append(self.cloud)
-
-    monkeypatch.setattr(SurveyPump, "__init__", spy)
-    return made
-
-
-def dying_at(scans: set[int], deaths_left: Path | None = None) -> Callable[[int], None]:
-    """A function of a scan that ends its process, each time or as often as a file is long."""
-
-    def die(scan: int) -> None:
-        if scan not in scans:
-            return
-        if deaths_left is not None:
-            left = deaths_left.stat().st_size
-            if not left:
-                return
-            os.truncate(deaths_left, left - 1)
-        os.kill(os.getpid(), signal.SIGKILL)
-
-    return die
-
-
-def poisoned_intersect(die: Callable[[int], None]) -> Callable:
-    original = casting_module.intersect
-
-    def intersect(setup, wire, run):
-        batch = original(setup, wire, run)
-        for numbers in wire:
-            die(int(numbers[0]))
-        return batch
-
-    return intersect
-
-
-def poisoned_collect(die: Callable[[int], None]) -> Callable:
-    def collect(attempt, *arguments):
-        from lidarpool.scan import stages
-
-        original = stages.points_of
-
-        def points_of(sensor, spec, *others):
-            die(spec.scan)
-            return original(sensor, spec, *others)
-
-        stages.points_of = points_of
-        return stages.collect(attempt, *arguments)
-
-    return collect
-
-
-def poisoned_sort(die: Callable[[int], None]) -> Callable:
-    def sort_frames(attempt, *arguments):
-        from lidarpool.scan import stages
-
-        original = stages._frame_runs
-
-        def frame_runs(frames, records):
-            for frame in frames:
-                die(frame.scan)
-            return original(frames, records)
-
-        stages._frame_runs = frame_runs
-        return stages.sort_frames(attempt, *arguments)
-
-    return sort_frames
-
-
-def tasks_left(client: Client) -> list[str]:
-    """Keys that the scheduler still knows, after a moment."""
-    until = time.monotonic() + 120
-    while True:
-        keys = client.run_on_scheduler(lambda dask_scheduler: list(map(str, dask_scheduler.tasks)))
-        if not keys or time.monotonic() > until:
-            return keys
-        time.sleep(0.05)
-
-
-def test_a_scan_that_kills_its_worker_is_named_and_all_others_are_kept(client, clouds, monkeypatch):
-    poisoned = poisoned_intersect(dying_at({POISON}))
-    monkeypatch.setattr(lidarpool.scan.caster, "intersect", poisoned)
-    frames = []
-    message = rf"^scan {POISON} kills the worker that casts it: 3 of them died"
-    with pytest.raises(LidarpoolError, match=message):
-        simulate(
-            Scene.seed(), SURVEY, client=client, on_frame=lambda frame: frames.append(frame.scan)
-        )
-    # Everything that was under way beside it has arrived; frames are in order, up to it.
-    missing = list(clouds[0].ledger.missing())
-    assert missing[0] == POISON
-    assert missing[1:] == list(range(missing[1], SURVEY.scan_count))
-    assert frames == list(range(len(frames)))
-    assert len(frames) <= POISON
-    assert tasks_left(client) == []
-
-
-def test_a_scan_that_stops_killing_is_not_to_blame(
-    client, undisturbed, same_cloud, monkeypatch, tmp_path
+def test_a_scan_that_kills_its_worker_is_named_and_all_others_are_kept(
+    client, sabotage, undisturbed, same_cloud, tmp_path, left_over, point, stage
 ):
+    lives = sabotage(point, {POISON})
+    frames: list[int] = []
+
+    def on_frame(frame: Frame) -> None:
+        frames.append(frame.scan)
+
+    def run(**options: Any):
+        return simulate(
+            Scene.seed(), SURVEY, client=client, on_frame=on_frame, folder=tmp_path / "run",
+            **options,
+        )  # fmt: skip
+
+    message = rf"^scan {POISON} kills the worker that runs stage {stage}: 3 of them died"
+    with pytest.raises(LidarpoolError, match=message) as caught:
+        run()
+    assert frames == list(range(POISON))  # the others of its batch among them
+    (kept,) = caught.value.__notes__
+    assert int(kept.split()[0]) > POISON
+    assert left_over(client) == ([], [], [])
+    lives.write_bytes(b"")
+    result = run(resume=True)
+    assert str(result.resumed) == kept.split()[0]
+    assert frames == list(range(SURVEY.scan_count))
+    assert same_cloud(result.cloud, undisturbed)
+
+
+def test_a_scan_that_stops_killing_is_not_to_blame(client, sabotage, undisturbed, same_cloud):
     """Whoever is hit some times by others is cast in the end, and nothing is lost."""
-    deaths_left = tmp_path / "deaths"
-    deaths_left.write_bytes(b"x" * 5)
-    poisoned = poisoned_intersect(dying_at({POISON}, deaths_left))
-    monkeypatch.setattr(lidarpool.scan.caster, "intersect", poisoned)
-    points = []
-    trace_to(lambda point, fields: points.append((point, fields.get("reason"))))
+    lives = sabotage("intersect.cast", {POISON}, lives=3)
+    points: set[tuple[str, str | None]] = set()
+    trace_to(lambda point, fields: points.add((point, fields.get("reason"))))
     try:
         cloud = simulate(Scene.seed(), SURVEY, client=client).cloud
     finally:
         trace_to(None)
     assert same_cloud(cloud, undisturbed)
-    assert deaths_left.stat().st_size == 0
-    assert ("driver.recast", "on trial") in points
+    assert lives.stat().st_size == 0
+    assert ("driver.replay", "its worker died") in points
 
 
-@pytest.mark.parametrize(
-    ("function", "poisoned", "stage"),
-    [("collect", poisoned_collect, "collect"), ("sort_frames", poisoned_sort, "sort")],
-)
 @pytest.mark.slow
-def test_a_scan_that_kills_a_long_stage_is_named(
-    client, clouds, monkeypatch, function, poisoned, stage
-):
-    monkeypatch.setattr(lidarpool.scan.long_stages, function, poisoned(dying_at({POISON})))
-    message = rf"^scan {POISON} kills the worker that runs stage {stage}: 3 of them died"
-    with pytest.raises(LidarpoolError, match=message):
+def test_summaries_that_kill_the_sorter_end_the_run(client, sabotage, monkeypatch, left_over):
+    monkeypatch.setattr(lidarpool.scan.long_stages, "DEATHS_MOST", 2)
+    sabotage("sort.get", {POISON})
+    with pytest.raises(LidarpoolError, match=r"stage \w+ was started 3 times, and each time"):
         simulate(Scene.seed(), SURVEY, client=client)
-    assert all(scan in clouds[0].ledger for scan in range(POISON))
-    assert tasks_left(client) == []
+    assert left_over(client) == ([], [], [])
 
 
 @pytest.mark.slow
-def test_a_scene_that_kills_its_workers_ends_the_run(client, monkeypatch):
-    def prepare(setup) -> None:
-        os.kill(os.getpid(), signal.SIGKILL)
-
-    monkeypatch.setattr(lidarpool.scan.crew, "_prepare", prepare)
+def test_a_scene_that_kills_its_workers_ends_the_run(client, monkeypatch, left_over):
+    monkeypatch.setattr(lidarpool.scan.workers, "_preparation", lambda _: _deadly())
     with pytest.raises(LidarpoolError, match="preparing the scene on the GPU workers has ended"):
         simulate(Scene.seed(), SURVEY, client=client)
-    assert tasks_left(client) == []
+    assert left_over(client) == ([], [], [])
 
 
-def test_a_worker_that_was_ended_for_its_memory_is_known(client):
+def _deadly() -> Callable[[str, bytes], None]:
+    def prepare(handle: str, packed: bytes) -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    return prepare
+
+
+def test_a_worker_that_was_ended_for_its_memory_is_known(client: Client):
     client.log_event("worker-restart-memory", {"worker": "tcp://127.0.0.1:1", "rss": 1})
     assert words_on_memory(client, ["tcp://127.0.0.1:2"]) == ""
     until = time.monotonic() + 120
@@ -208,19 +110,22 @@ def test_a_worker_that_was_ended_for_its_memory_is_known(client):
 
 
 @pytest.mark.slow
-def test_a_trial_whose_workers_were_killed_is_tried_again(client, monkeypatch, tmp_path):
+def test_a_trial_whose_workers_were_killed_is_tried_again(client, monkeypatch, tmp_path, left_over):
     """Dask gives a task up at the fourth death, whoever is to blame for it."""
-    deaths_left = tmp_path / "deaths"
-    deaths_left.write_bytes(b"x" * 4)
-    die, original = dying_at({2}, deaths_left), lidarpool.trials.run_trial
+    lives = tmp_path / "lives"
+    lives.write_bytes(bytes(4))
+    original = lidarpool.run.trials.run_trial
 
     def run_trial(planning, number):
-        die(number)
+        left = lives.stat().st_size
+        if number == 2 and left:
+            os.truncate(lives, left - 1)
+            os.kill(os.getpid(), signal.SIGKILL)
         return original(planning, number)
 
-    monkeypatch.setattr(lidarpool.trials, "run_trial", run_trial)
+    monkeypatch.setattr(lidarpool.run.trials, "run_trial", run_trial)
     planning = Planning((25, 25), (-30, -20), trials=5, particles=50, iterations=20)
     result = simulate(Scene.seed(), Survey(poses=[(0, 0, 1)]), planning, client=client)
     assert sorted(trial.trial for trial in result.trials) == list(range(5))
-    assert deaths_left.stat().st_size == 0
-    assert tasks_left(client) == []
+    assert lives.stat().st_size == 0
+    assert left_over(client) == ([], [], [])

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 import random
 import re
 import signal
-import time
+import sqlite3
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,286 +18,318 @@ import pytest
 import yaml
 from distributed import Client
 
-from lidarpool import LidarpoolError, Scene, Sensor, Survey, remove_journal, save_cloud, simulate
-from lidarpool.report import make_report
-from lidarpool.scenario import Scenario
+from lidarpool import Frame, LidarpoolError, Scene, Sensor, Survey, remove_run, save_cloud, simulate
+from lidarpool.cli.log_file import LOG
+from lidarpool.scenario.scenario import Scenario
 
-pytestmark = pytest.mark.skipif(
-    not Path("/proc/self/environ").exists(), reason="finds the processes of a run through /proc"
-)
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="forks")
 
-# Some seconds of work, in many small batches.
 SCENARIO = """
-sensor: {rays_per_revolution: 1800, layers: 16, step_deg: 2}
+sensor: {rays_per_revolution: 900, layers: 8, step_deg: 2}
 poses: [[0, 0, 1], [0, 0, 2], [3, 0, 1], [0, 3, 1]]
 steps: 180
 cloud: {keep_every: 2}
-planning: {trials: 30, iterations: 40}
+planning: {trials: 10, iterations: 40}
 pool: {backend: numpy, gpu: 1, other: 1}
 """
 SCANS = 4 * 180
 SMALL = "sensor: {layers: 4}\nplanning: {trials: 2}\n"
+KEPT = r"holds an unfinished run, [\d,]+ of \d+ scans: continue it with"
 
-# Drawing takes longer than the survey, and is not what is asked after.
-NO_PICTURES = """
-import lidarpool.pictures as pictures
+# Each driver is a process of its own, forked from one that has imported everything. It is killed
+# when it passes a point for the n-th time; a point in capitals stands for a call.
+DRIVERS = """
+import json, os, signal, sys, traceback
+import lidarpool.cli.run_command, lidarpool.report.output, lidarpool.report.pictures as pictures
+from lidarpool.__main__ import main
+from lidarpool.run.database import RunDatabase
+from lidarpool.scan.driver import SurveyDriver
+from poolpart import trace_to
+
 pictures.take_shot = lambda *_, **__: None
 def draw(path, *_, **__): path.write_bytes(b"x")
-pictures.draw_scene = pictures.draw_intensity = draw
-pictures.draw_cloud = pictures.draw_path = draw
+pictures.draw_scene = pictures.draw_intensity = pictures.draw_cloud = pictures.draw_path = draw
+SurveyDriver._wished_scans = lambda *_: 10
+
+def drive(point, times):
+    left = [times]
+    def strike(passed, fields=None):
+        left[0] -= passed == point
+        if not left[0]:
+            os.kill(os.getpid(), signal.SIGKILL)
+    def before(owner, name, label):
+        function = getattr(owner, name)
+        def call(*arguments, **options):
+            strike(label)
+            return function(*arguments, **options)
+        setattr(owner, name, call)
+    trace_to(strike)
+    before(RunDatabase, "commit", "COMMIT")
+    before(RunDatabase, "__init__", "OPEN")
+    before(lidarpool.report.output, "save_cloud", "SAVE")
+    before(lidarpool.cli.run_command, "remove_run", "REMOVE")
+    before(lidarpool.cli.run_command.RunStore, "remove", "REMOVE")
+    sys.argv = ["lidarpool", *json.loads(sys.argv[1])]
+    main()
+
+for point, times in json.loads(sys.argv[2]):
+    if not (child := os.fork()):
+        try:
+            drive(point, times)
+        except SystemExit as ended:
+            sys.stderr.flush()
+            sys.stdout.flush()
+            os._exit(ended.code or 0)
+        except BaseException:
+            traceback.print_exc()
+        os._exit(70)
+    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    print(json.dumps(["ended", code]), flush=True)
+    if code >= 0:
+        break
 """
 
 
 @pytest.fixture(scope="module")
-def undisturbed(cluster: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Result of the scenario in one go."""
+def undisturbed(cluster: str, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """Cloud of the scenario in one go."""
     scenario = Scenario.from_data(yaml.safe_load(SCENARIO))
     scene = scenario.build_scene()
-    survey, planning = scenario.survey(scene), scenario.plan(scene)
     with Client(cluster, set_as_default=False) as client:
-        result = simulate(scene, survey, planning, client=client, backend="numpy")
-    out = tmp_path_factory.mktemp("undisturbed")
-    save_cloud(out / "cloud.ply", result.points)
-    report = make_report(result, scene, survey, planning, [])
-    (out / "report.json").write_text(json.dumps(report))
-    return out
+        result = simulate(scene, scenario.survey(scene), client=client, backend="numpy")
+    path = tmp_path_factory.mktemp("undisturbed") / "cloud.ply"
+    save_cloud(path, result.points)
+    return path.read_bytes()
 
 
-def same_result(out: Path, expected: Path) -> bool:
-    """Whether two results agree in all that does not depend on time and place."""
-    reports = [json.loads((folder / "report.json").read_text()) for folder in (out, expected)]
-    names = ("hits", "points", "points_by_object", "planning", "backend", "scans")
-    return (out / "cloud.ply").read_bytes() == (expected / "cloud.ply").read_bytes() and all(
-        reports[0][name] == reports[1][name] for name in names
-    )
+@pytest.fixture
+def drive(tmp_path: Path, cluster: str) -> Callable[..., list[int]]:
+    """Run the scenario again and again, each killed at a point; how they ended."""
+
+    def drive(kills: list[tuple[str, int]], *options: str) -> list[int]:
+        (tmp_path / "s.yaml").write_text(SCENARIO)
+        arguments = ["run", "s.yaml", "--out", "out", "--resume", "--scheduler", cluster, *options]
+        done = subprocess.run(
+            [sys.executable, "-c", DRIVERS, json.dumps(arguments), json.dumps(kills)],
+            cwd=tmp_path,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        assert "Traceback" not in done.stderr, done.stderr
+        return [json.loads(line)[1] for line in done.stdout.splitlines() if '"ended"' in line]
+
+    return drive
 
 
-def kept_in(journal: Path) -> int:
-    try:
-        return (journal / "records").stat().st_size
-    except FileNotFoundError:  # not yet, or no longer
-        return 0
+def committed(folder: Path) -> int:
+    """Scans in a run's database."""
+    with sqlite3.connect(f"file:{folder / 'run.db'}?mode=ro", uri=True) as sql:
+        return sql.execute("SELECT coalesce(sum(stop - first), 0) FROM parts").fetchone()[0]
 
 
-def kill_and_resume(
-    start: Callable[..., Any], folder: Path, times: int, seed: int, *options: str
-) -> list[int]:
-    """Kill the driver so many times, each going on from the one before; sizes of the journal."""
-    dice = random.Random(seed)
-    sizes = []
-    for _ in range(times):
-        # Once it has delivered something more, or at any time from its start on.
-        enough = kept_in(folder / "out" / "journal") + dice.randrange(16_000)
-        run = start(SCENARIO, "--resume", *options, prelude=NO_PICTURES + dying(enough))
-        if dice.random() < 0.2:
-            time.sleep(dice.uniform(0, 3))
-            run.process.kill()
-        assert run.process.wait(300) == -signal.SIGKILL, run.said
-        run.wait_until_alone()
-        sizes.append(kept_in(folder / "out" / "journal"))
-    last = start(SCENARIO, "--resume", *options, prelude=NO_PICTURES)
-    assert last.process.wait(300) == 0, last.said
-    assert "Traceback" not in last.said
-    return sizes
+def report_of(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / "report.json").read_text())
 
 
-def dying(size: int) -> str:
-    """Code that kills its own process when the journal has grown over so many bytes.
-
-    From outside it may come too late: the survey can end before the one that waits for its
-    journal has its turn.
-    """
-    return f"""
-import os, signal
-from lidarpool.records import RecordFile
-append = RecordFile.append
-def append_or_die(self, *record):
-    if self.end > {size}:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return append(self, *record)
-RecordFile.append = append_or_die
-"""
+MOMENTS = [
+    ("COMMIT", 1),  # parts are in storage, and nothing is in the database
+    ("driver.points", 3),
+    ("driver.frame", 150),
+    ("driver.submit", 12),
+    ("COMMIT", 9),
+    ("OPEN", 1),
+    ("SAVE", 1),
+    ("REMOVE", 1),
+]
 
 
-def test_a_driver_is_killed_three_times(cluster, start_command, undisturbed, tmp_path):
-    options = (SCENARIO, "--resume", "--scheduler", cluster)
-    for size in (5_000, 30_000, 60_000):
-        run = start_command(*options, prelude=NO_PICTURES + dying(size))
-        assert run.process.wait(300) == -signal.SIGKILL, run.said
-        assert size < kept_in(tmp_path / "out" / "journal") < 100_000
-    run = start_command(*options, prelude=NO_PICTURES)
-    assert run.process.wait(300) == 0, run.said
-    assert same_result(tmp_path / "out", undisturbed)
-    assert not (tmp_path / "out" / "journal").exists()
-    report = json.loads((tmp_path / "out" / "report.json").read_text())
-    assert 0 < report["resumed_scans"] < SCANS
+def test_a_driver_is_killed_at_several_moments(drive, undisturbed, tmp_path):
+    out = tmp_path / "out"
+    assert drive([*MOMENTS, ("", 1)]) == [-signal.SIGKILL] * len(MOMENTS) + [0]
+    assert (out / "cloud.ply").read_bytes() == undisturbed
+    assert not (out / "run").exists()
+    report = report_of(out)
+    assert report["resumed_scans"] == report["scans"] == SCANS
+    assert report["placement_violations"] == 0
+    assert {path.name for path in out.iterdir()} >= {"cloud.ply", "report.json", "report.html"}
+    assert not [path.name for path in out.iterdir() if path.name.startswith(".")]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(4))
-def test_a_driver_is_killed_twenty_times(seed, start_command, undisturbed, tmp_path):
-    """Five times in each of four runs, with clusters of their own that end by themselves."""
-    sizes = kill_and_resume(start_command, tmp_path, 5, seed)
-    assert sizes[-1] > 0
-    assert same_result(tmp_path / "out", undisturbed)
+def test_a_driver_is_killed_twenty_times(drive, undisturbed, tmp_path):
+    dice = random.Random(20)
+    points = ["driver.points", "driver.frame", "driver.submit", "driver.handon", "COMMIT"]
+    kills = [(dice.choice(points), dice.randint(1, 4)) for _ in range(20)]
+    assert drive(kills) == [-signal.SIGKILL] * 20
+    before = committed(tmp_path / "out" / "run")
+    assert 0 < before < SCANS
+    assert drive([("", 1)]) == [0]
+    assert (tmp_path / "out" / "cloud.ply").read_bytes() == undisturbed
+    assert report_of(tmp_path / "out")["resumed_scans"] == before
 
 
 def test_an_unfinished_run_is_refused_resumed_or_dropped(
-    cluster, start_command, lidarpool, undisturbed, tmp_path, no_pictures
+    cluster, drive, lidarpool, undisturbed, tmp_path, no_pictures
 ):
-    run = start_command(SCENARIO, "--scheduler", cluster, prelude=NO_PICTURES + dying(60_000))
-    journal = tmp_path / "out" / "journal"
-    assert run.process.wait(300) == -signal.SIGKILL, run.said
-    before = (journal / "records").read_bytes()
-    arguments = ["run", tmp_path / "s.yaml", "--out", tmp_path / "out", "--scheduler", cluster]
-
-    refused = lidarpool(*arguments, "-q")
+    out = tmp_path / "out"
+    assert drive([("driver.points", 10)]) == [-signal.SIGKILL]
+    before = committed(out / "run")
+    arguments = ["run", tmp_path / "s.yaml", "--out", out, "--scheduler", cluster, "-q"]
+    refused = lidarpool(*arguments)
     assert (refused.code, refused.out) == (2, "")
     assert re.fullmatch(
-        r"lidarpool: \S+/out/journal holds an unfinished run, \d+ of 720 scans: continue it with "
-        r"--resume, or drop it with --fresh\.\n",
-        refused.err,
+        rf"lidarpool: \S+/out/run {KEPT} --resume, or drop it with --fresh\.\n", refused.err
     )
-    other = lidarpool(*arguments, "-q", "--resume", "--no-plan")
+    other = lidarpool(*arguments, "--resume", "--no-plan")
     assert other.code == 2 and "is of another planning. Drop it with --fresh" in other.err
-    wrong = lidarpool(*arguments, "-q", "--resume", "--backend", "embree")
+    wrong = lidarpool(*arguments, "--resume", "--backend", "embree")
     assert wrong.code == 2 and "were cast with 'numpy': continue with that" in wrong.err
-    both = lidarpool(*arguments, "-q", "--resume", "--fresh")
+    both = lidarpool(*arguments, "--resume", "--fresh")
     assert both.code == 2 and "give one of them" in both.err
-    assert (journal / "records").read_bytes() == before
+    elsewhere = lidarpool(*arguments, "--resume", "--parts", tmp_path / "elsewhere")
+    assert elsewhere.code == 2 and f"has its parts in {out / 'run' / 'parts'}" in elsewhere.err
+    assert committed(out / "run") == before
 
     # Nothing is said of backends; those of the scans there are taken.
-    resumed = lidarpool(*arguments, "-q", "--resume", "--backend", "auto")
+    resumed = lidarpool(*arguments, "--resume", "--backend", "auto")
     assert (resumed.code, resumed.err) == (0, "")
-    assert same_result(tmp_path / "out", undisturbed)
+    assert (out / "cloud.ply").read_bytes() == undisturbed
+    assert report_of(out)["resumed_scans"] == before
 
 
-def test_a_dropped_run_starts_anew(cluster, lidarpool, tmp_path, no_pictures):
+def test_parts_that_are_gone_are_made_again(drive, undisturbed, lidarpool, cluster, tmp_path):
+    out = tmp_path / "out"
+    assert drive([("driver.points", 12)]) == [-signal.SIGKILL]
+    parts = sorted((out / "run" / "parts").glob("*.npz"))
+    os.truncate(parts[2], 100)
+    parts[5].unlink()
+    assert drive([("", 1)]) == [0]
+    assert (out / "cloud.ply").read_bytes() == undisturbed
+    assert re.fullmatch(
+        r"\d+ scans were made again: their parts were missing or cut short in \S+/out/run/parts",
+        report_of(out)["notes"][0],
+    )
+
+
+def test_a_dropped_run_starts_anew(cluster_client, cluster, lidarpool, tmp_path, no_pictures):
     (tmp_path / "s.yaml").write_text(SMALL)
     arguments = ["run", tmp_path / "s.yaml", "--out", tmp_path / "out", "--scheduler", cluster]
     scenario = Scenario.from_data(yaml.safe_load(SMALL))
     scene = scenario.build_scene()
     (tmp_path / "out").mkdir()
-
-    def enough(frame: Any) -> None:
-        # Frames may be ahead of the points, without which there is nothing to keep.
-        if frame.scan >= 30 and kept_in(tmp_path / "out" / "journal"):
-            raise ZeroDivisionError
-
-    with Client(cluster, set_as_default=False) as client, pytest.raises(ZeroDivisionError):
+    with pytest.raises(ZeroDivisionError):
         simulate(
-            scene, scenario.survey(scene), client=client, journal=tmp_path / "out" / "journal",
-            on_frame=enough,
+            scene, scenario.survey(scene), client=cluster_client, folder=tmp_path / "out" / "run",
+            on_frame=raise_at(30),
         )  # fmt: skip
     refused = lidarpool(*arguments, "-q", "--resume")
     assert refused.code == 2 and "is of another planning" in refused.err
     done = lidarpool(*arguments, "-q", "--fresh")
     assert (done.code, done.err) == (0, "")
-    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    report = report_of(tmp_path / "out")
     assert report["resumed_scans"] == 0 and report["scans"] == 108
-    assert not (tmp_path / "out" / "journal").exists()
+    assert not (tmp_path / "out" / "run").exists()
 
 
-def test_nothing_to_resume_is_no_error(cluster, lidarpool, tmp_path, no_pictures):
+def test_nothing_to_resume_is_no_error(cluster, lidarpool, tmp_path):
     (tmp_path / "s.yaml").write_text(SMALL)
     arguments = ["run", tmp_path / "s.yaml", "--out", tmp_path / "out", "--scheduler", cluster]
-    done = lidarpool(*arguments, "-q", "--resume")
+    arguments += ["--only", "cloud", "-q"]
+    done = lidarpool(*arguments, "--resume")
     assert (done.code, done.err) == (0, "")
     assert f"note: there was nothing to resume in {tmp_path / 'out'}" in done.out
-    again = lidarpool(*arguments, "-q")
+    assert {path.name for path in (tmp_path / "out").iterdir()} - {LOG} == {
+        "cloud.ply", "report.json",
+    }  # fmt: skip
+    again = lidarpool(*arguments)
     assert again.code == 0 and "nothing to resume" not in again.out
 
 
 # -- from Python ---------------------------------------------------------------------------------
 
-SURVEY = Survey(Sensor(rays_per_revolution=360, layers=8, step_deg=5), [(0, 0, 1), (0, 0, 2)], 72)
+SURVEY = Survey(
+    Sensor.grid(rays_per_revolution=360, layers=8, step_deg=5), [(0, 0, 1), (0, 0, 2)], 72
+)
 
 
-def test_frames_go_on_where_they_were(cluster, tmp_path):
-    journal = tmp_path / "kept"
+def raise_at(scan: int, seen: list[int] | None = None) -> Callable[[Frame], None]:
+    """A callback that fails at a frame; a frame comes when its points are committed."""
+
+    def on_frame(frame: Frame) -> None:
+        if seen is not None:
+            seen.append(frame.scan)
+        if frame.scan >= scan:
+            raise ZeroDivisionError("enough")
+
+    return on_frame
+
+
+def test_frames_go_on_where_they_were(cluster_client, tmp_path, same_cloud):
+    folder = tmp_path / "kept"
     first: list[int] = []
     second: list[int] = []
 
-    def fail(frame: Any) -> None:
-        first.append(frame.scan)
-        if frame.scan >= 50 and kept_in(journal):  # frames may be ahead of the points
-            raise ZeroDivisionError("enough")
+    def run(**options: Any):
+        return simulate(Scene.seed(), SURVEY, client=cluster_client, **options)
 
-    with Client(cluster, set_as_default=False) as client:
-        whole = simulate(Scene.seed(), SURVEY, client=client)
-        with pytest.raises(ZeroDivisionError) as caught:
-            simulate(Scene.seed(), SURVEY, client=client, journal=journal, on_frame=fail)
-        assert re.fullmatch(
-            rf"\d+ of 144 scans are kept in {journal}: continue with resume=True\.",
-            *caught.value.__notes__,
-        )
-        with pytest.raises(LidarpoolError, match=r"continue it with resume=True, or drop it with"):
-            simulate(Scene.seed(), SURVEY, client=client, journal=journal)
-        result = simulate(
-            Scene.seed(), SURVEY, client=client, journal=journal, resume=True,
-            on_frame=lambda frame: second.append(frame.scan),
-        )  # fmt: skip
-    assert first == list(range(first[-1] + 1))
-    assert second == list(range(first[-1], 144))  # the one that it failed on is handed out again
-    assert result.resumed > 0
+    whole = run()
+    with pytest.raises(ZeroDivisionError) as caught:
+        run(folder=folder, on_frame=raise_at(50, first))
+    assert re.fullmatch(
+        rf"\d+ of 144 scans are kept in {folder}: continue with resume=True\.",
+        *caught.value.__notes__,
+    )
+    with pytest.raises(LidarpoolError, match=rf"{KEPT} resume=True, or drop it with remove_run"):
+        run(folder=folder)
+    result = run(folder=folder, resume=True, on_frame=lambda frame: second.append(frame.scan))
+    assert first == list(range(51))
+    assert second == list(range(50, 144))  # the one that it failed on is handed out again
+    assert result.resumed > 50
     assert (result.hit_counts == whole.hit_counts).all() and result.hits == whole.hits
     assert (result.sample_rays == whole.sample_rays).all()
-    assert result.cloud.positions.tobytes() == whole.cloud.positions.tobytes()
-    assert result.cloud.object.tobytes() == whole.cloud.object.tobytes()
+    assert same_cloud(result.cloud, whole.cloud)
 
 
-def test_a_complete_journal_needs_no_cluster(cluster, tmp_path, monkeypatch):
-    journal = tmp_path / "kept"
-    with Client(cluster, set_as_default=False) as client:
-        first = simulate(Scene.seed(), SURVEY, client=client, journal=journal)
-    monkeypatch.setattr("lidarpool.simulation.local_client", None)
-    again = simulate(Scene.seed(), SURVEY, journal=journal, resume=True)
+def test_a_complete_run_needs_no_cluster(cluster_client, tmp_path, monkeypatch, same_cloud):
+    folder = tmp_path / "kept"
+    first = simulate(Scene.seed(), SURVEY, client=cluster_client, folder=folder)
+    monkeypatch.setattr("lidarpool.run.simulation.local_client", None)
+    again = simulate(Scene.seed(), SURVEY, folder=folder, resume=True)
     assert again.resumed == SURVEY.scan_count and again.records == ()
     assert again.backend == first.backend
-    assert again.cloud.positions.tobytes() == first.cloud.positions.tobytes()
-    remove_journal(journal)
-    assert not journal.exists()
-    assert len(again.points.load()) == len(first.points)  # as long as the result is in use
+    assert same_cloud(again.cloud, first.cloud)
+    remove_run(folder)
+    assert not folder.exists()
 
 
-def test_a_backend_that_is_not_to_be_had_any_more(cluster, tmp_path, monkeypatch):
-    journal = tmp_path / "kept"
-
-    def fail(frame: Any) -> None:
-        if frame.scan >= 50 and kept_in(journal):
-            raise ZeroDivisionError
-
-    with Client(cluster, set_as_default=False) as client:
-        with pytest.raises(ZeroDivisionError):
-            simulate(Scene.seed(), SURVEY, client=client, journal=journal, on_frame=fail,
-                     backend="numpy")  # fmt: skip
-        lost = {"cuda": "no GPU", "embree": "", "numpy": "it was forgotten"}
-        monkeypatch.setattr("lidarpool.checks.available_backends", lambda: lost)
-        with pytest.raises(
-            LidarpoolError,
-            match=r"'numpy' cannot be used on .*: it was forgotten\. The scans in the journal .* "
-            r"were cast with it: continue where it is to be had, or drop them",
-        ):
-            simulate(Scene.seed(), SURVEY, client=client, journal=journal, resume=True)
-
-
-def test_a_journal_that_others_write_to_makes_no_result(cluster, tmp_path):
-    cut: list[int] = []  # at which frame
-
-    def meddle(frame):
-        if not cut and kept_in(tmp_path / "journal") > 40:
-            cut.append(frame.scan)
-            with (tmp_path / "journal" / "records").open("r+b") as file:
-                file.truncate(40)  # what comes behind it leaves a gap of zeros
-
-    survey = Survey(Sensor(rays_per_revolution=360, layers=8, step_deg=10), [(0, 0, 1)], steps=36)
-    refused = pytest.raises(LidarpoolError, match="was changed while this run wrote to it")
-    with Client(cluster, set_as_default=False) as client, refused:
+def test_a_backend_that_is_not_to_be_had_any_more(cluster_client, tmp_path, monkeypatch):
+    folder = tmp_path / "kept"
+    with pytest.raises(ZeroDivisionError):
         simulate(
-            Scene.seed(),
-            survey,
-            client=client,
+            Scene.seed(), SURVEY, client=cluster_client, folder=folder, on_frame=raise_at(50),
             backend="numpy",
-            on_frame=meddle,
-            journal=tmp_path / "journal",
-        )
+        )  # fmt: skip
+    lost = {"cuda": "no GPU", "embree": "", "numpy": "it was forgotten"}
+    monkeypatch.setattr("lidarpool.run.checks.available_backends", lambda: lost)
+    with pytest.raises(
+        LidarpoolError,
+        match=r"'numpy' cannot be used on .*: it was forgotten\. The scans in .* were cast "
+        r"with it: "
+        r"continue where it is to be had, or drop them with remove_run",
+    ):
+        simulate(Scene.seed(), SURVEY, client=cluster_client, folder=folder, resume=True)
+
+
+def test_a_folder_is_of_one_run_at_a_time(cluster_client, tmp_path):
+    def begin_another(frame: Frame) -> None:
+        with pytest.raises(LidarpoolError, match=f"Another run is using {tmp_path / 'kept'}"):
+            simulate(Scene.seed(), SURVEY, client=cluster_client, folder=tmp_path / "kept")
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        simulate(
+            Scene.seed(), SURVEY, client=cluster_client, folder=tmp_path / "kept",
+            on_frame=begin_another,
+        )  # fmt: skip

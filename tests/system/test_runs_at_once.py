@@ -4,22 +4,20 @@ from __future__ import annotations
 
 import threading
 
-import numpy as np
 import pytest
 from distributed import Client
 
 from lidarpool import Frame, LidarpoolError, Result, Scene, Sensor, Survey, simulate
-from lidarpool.progress import Progress
-from poolpart import Claim
+from lidarpool.run.progress import Progress
+from poolpart import Pool
 
-SURVEY = Survey(Sensor(rays_per_revolution=180, layers=4, step_deg=5), [(0, 0, 1)], steps=72)
+SURVEY = Survey(Sensor.grid(rays_per_revolution=180, layers=4, step_deg=5), [(0, 0, 1)], steps=72)
 
 
-def test_they_run_one_after_the_other(cluster, left_over):
+def test_they_run_one_after_the_other(cluster, left_over, same_cloud):
     """If each had some of the slots, all would wait for each other for ever."""
     results: list[Result] = []
     waited: set[str] = set()
-
     refused = threading.Event()
 
     def told(progress: Progress) -> None:
@@ -41,35 +39,27 @@ def test_they_run_one_after_the_other(cluster, left_over):
                 )
             )  # fmt: skip
 
-    for _ in range(3):
-        go = threading.Barrier(3)
-        threads = [threading.Thread(target=run, args=[go], daemon=True) for _ in range(3)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join(120)
-            assert not thread.is_alive(), "it waits for slots"
-    assert len(results) == 9
-    assert all(np.array_equal(results[0].hit_counts, other.hit_counts) for other in results)
+    go = threading.Barrier(3)
+    threads = [threading.Thread(target=run, args=[go], daemon=True) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(120)
+        assert not thread.is_alive(), "it waits for slots"
+    assert len(results) == 3
+    assert all(same_cloud(results[0].cloud, other.cloud) for other in results)
     assert waited == {"", "LIDAR"}
     assert any("until other runs had left it 4 slots" in n for r in results for n in r.notes)
     with Client(cluster, set_as_default=False) as client:
         assert left_over(client) == ([], [], [])
-        assert not client.run_on_scheduler(claims)
 
 
-def claims(dask_scheduler=None) -> bool:
-    return "poolpart-claims" in dask_scheduler.plugins
-
-
-def test_slots_that_others_do_not_hold_are_not_waited_for_forever(cluster, monkeypatch, left_over):
-    monkeypatch.setattr(
-        "lidarpool.scan.stage_tasks.claim_slots", lambda *_: Claim(False, {"tcp://here": 0}, 3)
-    )
-    monkeypatch.setattr("lidarpool.watch.PATIENCE_S", 0.5)
+def test_slots_that_are_gone_are_not_waited_for_forever(cluster, monkeypatch, left_over):
+    """They were there when the run was checked."""
+    monkeypatch.setattr(Pool, "require", lambda *_: None)
     with Client(cluster, set_as_default=False) as client:
         with pytest.raises(
-            LidarpoolError, match=r"'LIDAR' has had 3 of the 4 slots needed for 0 s: start another"
+            LidarpoolError, match=r"'LIDAR' has had 4 of the 7 slots needed for 0 s: start another"
         ):
-            simulate(Scene.seed(), SURVEY, client=client, backend="numpy")
+            simulate(Scene.seed(), SURVEY, client=client, collectors=5, patience_s=0.5)
         assert left_over(client) == ([], [], [])

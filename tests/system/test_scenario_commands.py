@@ -12,8 +12,8 @@ import sys
 import pytest
 import trimesh
 
-from lidarpool.cli import cli
-from lidarpool.scenario import Scenario
+from lidarpool.cli.commands import cli
+from lidarpool.scenario.scenario import Scenario
 
 
 def test_init_writes_a_scenario_and_says_what_to_do_next(tmp_path, lidarpool):
@@ -119,9 +119,7 @@ def test_bash_completes(tmp_path, lidarpool):
         pytest.skip("there is no bash here")
     script = lidarpool("completion", "bash").out
     command = tmp_path / "lidarpool"
-    command.write_text(
-        f'#!/bin/sh\nexec {sys.executable} -c "from lidarpool.cli import main; main()" "$@"\n'
-    )
+    command.write_text(f'#!/bin/sh\nexec {sys.executable} -m lidarpool "$@"\n')
     command.chmod(0o755)
     asked = "COMP_WORDS=(lidarpool run --no-pl)\nCOMP_CWORD=2\n_lidarpool_completion lidarpool\n"
     path = os.pathsep.join([str(tmp_path), os.environ["PATH"]])

@@ -7,7 +7,7 @@ import pytest
 from distributed import Client, Scheduler, SpecCluster, Worker
 
 from lidarpool import LidarpoolError, Planning, Pose, ScanSpec, Scene, Sensor, Survey, simulate
-from lidarpool.mesh import Mesh
+from lidarpool.scene.mesh import Mesh
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,7 @@ def room(offset=(0.0, 0.0, 0.0)) -> Scene:
     )
 
 
-SENSOR = Sensor(rays_per_revolution=90, layers=8, vertical_fov_deg=80, step_deg=7)
+SENSOR = Sensor.grid(rays_per_revolution=90, layers=8, vertical_fov_deg=80, step_deg=7)
 
 
 def test_every_ray_from_within_a_closed_room_hits_its_sides(client):
@@ -67,9 +67,9 @@ def test_every_ray_from_within_a_closed_room_hits_its_sides(client):
         assert np.abs(cloud.positions[side == number, k] - value).max() <= 0.005 + 1e-9
     # 60 steps of 7 degrees are more than one revolution, so sectors wrap around.
     rays = np.concatenate(
-        [np.arange(spec.ray_count(SENSOR)) % SENSOR.layers for spec in survey.scans()]
+        [np.arange(spec.ray_count(SENSOR)) % SENSOR.channels for spec in survey.scans()]
     )
-    assert np.array_equal(cloud.ring, rays)
+    assert np.array_equal(cloud.channel, rays)
 
 
 def test_keep_every_takes_every_nth_hit_of_each_scan(client):
@@ -84,8 +84,8 @@ def test_keep_every_takes_every_nth_hit_of_each_scan(client):
 
 def test_a_turned_sensor_sees_the_turned_directions(client):
     """In a sphere-like room a yaw of one azimuth step moves the points by one azimuth."""
-    azimuth = 360 / SENSOR.rays_per_revolution
-    sensor = Sensor(rays_per_revolution=90, layers=8, vertical_fov_deg=80, step_deg=360)
+    azimuth = 360 / SENSOR.period
+    sensor = Sensor.grid(rays_per_revolution=90, layers=8, vertical_fov_deg=80, step_deg=360)
     straight, turned = (
         simulate(
             room(), Survey(sensor, [Pose((1, 1, 0), yaw)], 1, keep_every=1), client=client
@@ -96,7 +96,7 @@ def test_a_turned_sensor_sees_the_turned_directions(client):
 
 
 def test_ranges_bound_what_is_seen(client):
-    sensor = Sensor(
+    sensor = Sensor.grid(
         rays_per_revolution=90, layers=8, vertical_fov_deg=80, step_deg=7, max_range_m=4.5
     )
     cloud = simulate(room(), Survey(sensor, [(0, 0, 0)], 52, keep_every=1), client=client).cloud
@@ -118,7 +118,7 @@ def test_far_from_zero_the_cloud_is_in_world_coordinates(client):
     local = tuple(there + np.array([1, 1, 0]) - scene.origin)
     here = simulate(room(), near, client=client).cloud
     far = simulate(scene, Survey(SENSOR, [local], 10, keep_every=1), client=client).cloud
-    assert np.array_equal(far.ring, here.ring)
+    assert np.array_equal(far.channel, here.channel)
     assert np.abs(far.positions - there - here.positions).max() <= 0.0101
 
 
@@ -164,7 +164,7 @@ def test_a_client_that_has_given_its_scheduler_up_is_told_of_in_one_sentence(cli
 
 def test_too_few_slots_are_told_before_anything_runs(client):
     with pytest.raises(LidarpoolError, match="Partition 'LIDAR' has 4 of the 7 slots"):
-        simulate(room(), Survey(SENSOR, [(0, 0, 0)], 5), client=client, collectors=5)
+        simulate(room(), Survey(SENSOR, [(0, 0, 0)], 5), client=client, collectors=5, wait_s=0)
 
 
 def raise_at(scan: int | None, scan_of=None):
@@ -173,7 +173,7 @@ def raise_at(scan: int | None, scan_of=None):
     def fail(*arguments, **_):
         if scan is None or scan_of(arguments) == scan:
             raise FloatingPointError("the mirror is loose")
-        return ScanSpec(0, Pose((0, 0, 0)), (0, 1))
+        return ScanSpec(0, 0, (0, 1))
 
     return fail
 
@@ -182,27 +182,31 @@ def raise_at(scan: int | None, scan_of=None):
     ("target", "stand_in", "message"),
     [
         (
-            "lidarpool.survey.Survey.scan",
+            "lidarpool.sensor.survey.Survey.scan",
             raise_at(0, lambda arguments: arguments[1]),
             "stage generate failed: scan 0: FloatingPointError",
         ),
         (
-            "lidarpool.scan.setup.SurveySetup.cast",
+            "lidarpool.scan.rig.Rig.cast",
             raise_at(None),
-            r"stage intersect, scans (\d+) to \d+ failed: scan \1: FloatingPointError",
+            r"stage intersect, scan (\d+) failed: scan \1: FloatingPointError",
         ),
         (
-            "lidarpool.scan.setup.SurveySetup.prepare",
+            "lidarpool.scan.rig.RayCaster",
             raise_at(None),
             "preparing the scene on the GPU workers failed: .*the mirror is loose",
         ),
         (
-            "lidarpool.scan.stages.points_of",
+            "lidarpool.scan.stages.pack",
             raise_at(None),
             r"stage collect-\d failed: scan \d+: FloatingPointError",
         ),
-        ("lidarpool.scan.stages._frame_runs", raise_at(None), "stage sort failed: scan"),
-        ("lidarpool.trials.run_trial", raise_at(None), "Planning trial 0 failed: .*the mirror"),
+        (
+            "lidarpool.scan.stages._scans",
+            raise_at(None),
+            "stage sort failed: the mirror is loose",
+        ),
+        ("lidarpool.run.trials.run_trial", raise_at(None), "Planning trial 0 failed: .*the mirror"),
     ],
 )
 def test_a_failure_anywhere_ends_the_run_and_says_where(

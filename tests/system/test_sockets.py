@@ -94,7 +94,7 @@ def test_the_look_at_sockets_sees_them_all(host, tag):
 @pytest.mark.parametrize("options", [[], ["--tls"]], ids=["plain", "tls"])
 def test_the_demo_listens_on_loopback_only(options, tag, tmp_path):
     log = tmp_path / "log"
-    command = "from lidarpool.cli import main; main()"
+    command = "from lidarpool.cli.commands import main; main()"
     with log.open("wb") as file:
         process = subprocess.Popen(
             [sys.executable, "-c", command, "demo", "--out", tmp_path / "out", *options],

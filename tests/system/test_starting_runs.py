@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import dask
 import pytest
 from distributed import Client
 
-import lidarpool.checks
+import lidarpool.run.checks
 from lidarpool import LidarpoolError, Scene, Sensor, Survey, simulate
-from lidarpool.checks import common_backend
-from poolpart import Pool, local_cluster, worker_identities
+from lidarpool.run.checks import common_backend
+from poolpart import Pool, worker_identities
 
-SURVEY = Survey(Sensor(rays_per_revolution=180, layers=16, step_deg=10), [(0, 0, 1)], steps=36)
+SURVEY = Survey(Sensor.grid(rays_per_revolution=180, layers=16, step_deg=10), [(0, 0, 1)], steps=36)
 
 
 @pytest.fixture
@@ -71,50 +73,56 @@ def lose_gpu(monkeypatch) -> Callable[[Callable[[], object]], None]:
                 acts.pop()()
             return common_backend(*arguments)
 
-        monkeypatch.setattr(lidarpool.checks, "common_backend", ask)
+        monkeypatch.setattr(lidarpool.run.checks, "common_backend", ask)
 
     return lose_gpu
 
 
-def test_workers_that_die_when_a_run_starts_are_waited_for(lose_gpu):
-    with local_cluster(gpu_workers=1, other_workers=1) as cluster, Client(cluster) as client:
-        address = Pool.from_client(client).partitions()["GPU"].workers[0].address
-        pid = client.run(os.getpid, workers=[address])[address]
-        lose_gpu(lambda: os.kill(pid, signal.SIGKILL))
-        result = simulate(Scene.seed(), SURVEY, client=client, backend="numpy")
+def test_workers_that_die_when_a_run_starts_are_waited_for(client, lose_gpu):
+    def kill_all() -> None:
+        for worker in Pool.from_client(client).partitions()["GPU"].workers:
+            pid = client.run(os.getpid, workers=[worker.address])[worker.address]
+            os.kill(pid, signal.SIGKILL)
+
+    lose_gpu(kill_all)
+    result = simulate(Scene.seed(), SURVEY, client=client, backend="numpy")
     assert result.hits > 0
 
 
-def test_workers_that_do_not_come_back_are_named(outside, lose_gpu, monkeypatch):
-    monkeypatch.setattr(lidarpool.checks, "RETURN_S", 0.5)
-    cluster = outside()
+@pytest.fixture
+def lost(outside) -> Iterator[tuple[Any, Client]]:
+    """A cluster that is to lose something, and notices it within seconds, as its client does."""
+    cluster = outside(DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT="2s")
     cluster.add("GPU")
     cluster.add("LIDAR", slots=4)
     cluster.wait()
+    with (
+        dask.config.set({"distributed.comm.timeouts.connect": "2s"}),
+        Client(cluster.address, set_as_default=False) as client,
+    ):
+        yield cluster, client
+
+
+def test_workers_that_do_not_come_back_are_named(lost, lose_gpu, monkeypatch):
+    monkeypatch.setattr(lidarpool.run.checks, "RETURN_S", 0.5)
+    cluster, client = lost
     name = next(name for name in cluster.processes if name.startswith("GPU"))
     lose_gpu(lambda: cluster.kill(name))
-    with (
-        Client(cluster.address, set_as_default=False) as client,
-        pytest.raises(LidarpoolError, match="GPU"),
-    ):
-        simulate(Scene.seed(), SURVEY, client=client, backend="numpy")
+    with pytest.raises(LidarpoolError, match="GPU"):
+        simulate(Scene.seed(), SURVEY, client=client, backend="numpy", wait_s=0)
 
 
-def test_a_cluster_that_is_lost_before_the_run_has_begun_is_named(outside, monkeypatch):
-    cluster = outside()
-    cluster.add("GPU")
-    cluster.add("LIDAR", slots=4)
-    cluster.wait()
+def test_workers_that_come_late_are_waited_for(lost):
+    cluster, client = lost
+    cluster.kill(next(name for name in cluster.processes if name.startswith("GPU")))
+    comes = threading.Timer(0.5, cluster.add, ["GPU"])
+    comes.start()
+    assert simulate(Scene.seed(), SURVEY, client=client, backend="numpy").hits > 0
+    comes.join()
 
-    def lose(client, *rest):
-        cluster.kill("scheduler")
-        return common_backend(client, *rest)
 
-    monkeypatch.setattr(lidarpool.checks, "common_backend", lose)
-    lost = pytest.raises(LidarpoolError, match=f"{cluster.address} cannot be reached any more")
-    with (
-        dask.config.set({"distributed.comm.timeouts.connect": "5s"}),
-        Client(cluster.address, set_as_default=False) as client,
-        lost,
-    ):
+def test_a_cluster_that_is_lost_before_the_run_has_begun_is_named(lost, lose_gpu):
+    cluster, client = lost
+    lose_gpu(lambda: cluster.kill("scheduler"))
+    with pytest.raises(LidarpoolError, match=f"{cluster.address} cannot be reached any more"):
         simulate(Scene.seed(), SURVEY, client=client, backend="numpy")

@@ -18,11 +18,12 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 from distributed import Client, Scheduler, Security, SpecCluster
 
-import lidarpool.run
-from lidarpool import LidarpoolError, Scene, Survey
-from lidarpool.connection import connected
-from lidarpool.tls import NO_FILES, TlsFiles, security_for
-from poolpart import Pool, PoolError, local_cluster
+import lidarpool.run.run
+from lidarpool import LidarpoolError, Scene, Sensor, Survey
+from lidarpool.run.connection import connected
+from lidarpool.run.local import local_cluster
+from lidarpool.run.tls import NO_FILES, TlsFiles, security_for
+from poolpart import Pool, PoolError
 
 ADDRESS = "tls://127.0.0.1:1"
 
@@ -322,14 +323,14 @@ def test_without_cryptography_one_is_told_what_to_install(monkeypatch):
 
 def test_simulate_with_tls(monkeypatch):
     seen: list[str] = []
-    before = lidarpool.checks.survey_pool
+    before = lidarpool.run.checks.survey_pool
 
     def look(client: Client, *rest: Any) -> Any:
         seen.append(client.scheduler.address)
         return before(client, *rest)
 
-    monkeypatch.setattr(lidarpool.checks, "survey_pool", look)
-    survey = Survey(poses=[(0, 0, 1)], sensor=lidarpool.Sensor(layers=2, step_deg=30))
+    monkeypatch.setattr(lidarpool.run.checks, "survey_pool", look)
+    survey = Survey(poses=[(0, 0, 1)], sensor=Sensor.grid(layers=2, step_deg=30))
     result = lidarpool.simulate(Scene.seed(), survey, gpu_workers=1, other_workers=1, tls=True)
     assert result.rays > 0
     assert seen[0].startswith("tls://")

@@ -6,20 +6,22 @@ from typing import TYPE_CHECKING, Any
 from ._version import __version__
 
 if TYPE_CHECKING:
-    from .cloud import Cloud
-    from .errors import LidarpoolError
-    from .journal_folder import remove_journal
+    from .base.errors import LidarpoolError
+    from .columns.cloud import Cloud
+    from .columns.table import Column
+    from .export.ply import read_cloud, save_cloud
     from .plan import Plan, Planning
-    from .ply import read_cloud, save_cloud, write_cloud
-    from .result import Result
+    from .run.result import Result
+    from .run.simulation import simulate
+    from .run.store import remove_run
     from .scan import Frame
-    from .scene import Scene
-    from .sensor import Sensor
-    from .simulation import simulate
-    from .survey import Pose, ScanSpec, Survey
+    from .scene.scene import Scene
+    from .sensor import Beams, Pose, ScanSpec, Sensor, Spin, Survey
 
 __all__ = [
+    "Beams",
     "Cloud",
+    "Column",
     "Frame",
     "LidarpoolError",
     "Plan",
@@ -29,29 +31,29 @@ __all__ = [
     "ScanSpec",
     "Scene",
     "Sensor",
+    "Spin",
     "Survey",
     "__version__",
     "read_cloud",
-    "remove_journal",
+    "remove_run",
     "save_cloud",
     "simulate",
-    "write_cloud",
 ]
 
 # Where the names above are. They are imported when they are asked for, which takes a second:
 # the command has to see to its signals before (`__main__.py`).
 _MODULES = {
-    "cloud": ("Cloud",),
-    "errors": ("LidarpoolError",),
-    "journal_folder": ("remove_journal",),
+    "base.errors": ("LidarpoolError",),
+    "columns.cloud": ("Cloud",),
+    "columns.table": ("Column",),
+    "export.ply": ("read_cloud", "save_cloud"),
     "plan": ("Plan", "Planning"),
-    "ply": ("read_cloud", "save_cloud", "write_cloud"),
-    "result": ("Result",),
+    "run.result": ("Result",),
+    "run.simulation": ("simulate",),
+    "run.store": ("remove_run",),
     "scan": ("Frame",),
-    "scene": ("Scene",),
-    "sensor": ("Sensor",),
-    "simulation": ("simulate",),
-    "survey": ("Pose", "ScanSpec", "Survey"),
+    "scene.scene": ("Scene",),
+    "sensor": ("Beams", "Pose", "ScanSpec", "Sensor", "Spin", "Survey"),
 }
 
 

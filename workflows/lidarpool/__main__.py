@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import NoReturn
 
-from .interrupts import end_on_signals
+from .base.interrupts import end_on_signals
 
 
 def main() -> NoReturn:
     """Run the command, see `cli.main`."""
     end_on_signals()
     # A second of imports, in which Python would answer an interrupt with a traceback of its own.
-    from .cli import main as command
+    from .cli.commands import main as command
 
     command()
 

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..columns.table import Column
 from .colouring import colours_of
-from .glb import coloured_triangles
-from .mesh_node import MeshNode
+from .display import POSITION
+from .inside import facing_triangles
+from .mesh_node import MeshNode, coloured_triangles
 from .page import LivePage
-from .walls import facing_triangles
 
 # Size of a point as a share of the scene's diagonal: that they can be seen where there are few,
 # and told apart where there are many.
@@ -27,10 +28,10 @@ class CloudLayer:
     ----------
     page
         Where they are shown.
-    names
-        Names of the objects, by number.
     quantities
-        Those of `QUANTITIES` that the points have.
+        What the points can be coloured by, see `display.quantities`.
+    names
+        {label: names of its values 0, 1, 2, …}, for those that have names.
     size_m
         Diagonal of the scene in metres.
     on_change
@@ -40,18 +41,19 @@ class CloudLayer:
     def __init__(
         self,
         page: LivePage,
-        names: Sequence[str],
-        quantities: Sequence[str],
+        quantities: Sequence[Column],
+        names: Mapping[str, Sequence[str]],
         size_m: float,
         on_change: Callable[[Any], None],
     ) -> None:
         self._page, self._names, self._size_m = page, names, size_m
+        self._quantities = {column.name: column for column in quantities}
         self._share = MOST_SHARE
         self._node: Any = None  # viser shows no cloud without points
         self._walls = MeshNode(page, "/cloud-on-walls")
         with page.gui.add_folder("cloud"):
             self._shown = page.gui.add_checkbox("show", initial_value=True)
-            self._colour = page.gui.add_dropdown("colour", tuple(quantities))
+            self._colour = page.gui.add_dropdown("colour", tuple(self._quantities))
             self._size = page.gui.add_slider("point size", 0.1, 4.0, 0.1, 1.0)
             self._legend = page.gui.add_html("")
         self._colour.on_update(on_change)
@@ -76,7 +78,7 @@ class CloudLayer:
     def draw(
         self, rows: NDArray[np.void], facing: NDArray[np.float32] | None = None, key: Hashable = 0
     ) -> None:
-        """Show these points (DISPLAY) instead of those before.
+        """Show these points (see `display_rows`) instead of those before.
 
         Parameters
         ----------
@@ -86,10 +88,12 @@ class CloudLayer:
         key
             What differs where these are other points, and not some more.
         """
-        colours, legend = colours_of(rows, self._colour.value, self._names)
+        column = self._quantities[self._colour.value]
+        names = self._names.get(column.name, ())
+        colours, legend = colours_of(rows[column.name], column, names)
         self._legend.content = legend.html if len(rows) else ""
         self._share = min(MOST_SHARE, SHARE_OF_MANY / max(1, len(rows)) ** 0.5)
-        positions = np.ascontiguousarray(rows["position"])
+        positions = np.ascontiguousarray(rows[POSITION])
         on_wall = np.zeros(len(rows), np.bool_) if facing is None else facing.any(axis=1)
         self._draw_free(positions[~on_wall], colours[~on_wall])
         if facing is None or not on_wall.any():

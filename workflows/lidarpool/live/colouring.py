@@ -1,24 +1,25 @@
-"""Colours of points by one of their quantities, and the legend that explains them."""
+"""Colours of points by one of their columns, and the legend that explains them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..view.theme import mapped, object_colours
-
-QUANTITIES = ("height", "range", "ring", "object", "scan")
+from ..columns.table import Column
+from ..render.theme import mapped, object_colours
 
 TURBO: NDArray[np.uint8] = np.round(255 * mapped("turbo", np.linspace(0.04, 0.97, 256))).astype(
     np.uint8
 )  # (256, 3); its very ends are nearly black
 
-MOST_ENTRIES = 12  # objects that a legend names
-_SPREAD = (0.5, 99.5)  # percentiles between which the colours of lengths are spread
+MOST_ENTRIES = 12  # labels that a legend names
+MOST_COLOURS = 1 << 16  # of labels
+_SPREAD = (0.5, 99.5)  # percentiles between which the colours of numbers are spread
 _GREY = (128, 128, 128)
 
 
@@ -61,15 +62,15 @@ class ColourBar:
 
 
 @dataclass(frozen=True)
-class ObjectKey:
-    """Names of objects beside their colours, written as HTML by `html`."""
+class LabelKey:
+    """Names of labels beside their colours, written as HTML by `html`."""
 
     names: Sequence[str]
     colours: NDArray[np.uint8]  # (n, 3)
 
     @property
     def html(self) -> str:
-        """A line for each object, up to a number."""
+        """A line for each label, up to a number."""
         lines = [
             f'<div style="display:flex;align-items:center;gap:0.5em"><span style="width:0.8em;'
             f'height:0.8em;border-radius:2px;background:rgb({r},{g},{b})"></span>'
@@ -81,53 +82,71 @@ class ObjectKey:
         return f'<div style="font-size:0.75em;padding:0.25em 0.8em">{"".join(lines)}</div>'
 
 
-Legend = ColourBar | ObjectKey
+Legend = ColourBar | LabelKey
 
 
 def colours_of(
-    rows: NDArray[np.void], quantity: str, names: Sequence[str]
+    values: NDArray[Any], column: Column, names: Sequence[str] = ()
 ) -> tuple[NDArray[np.uint8], Legend]:
-    """Colours (n, 3) of rows (DISPLAY) by one of `QUANTITIES`, and what they mean.
+    """Colours (n, 3) of the values (n,) of a column, and what they mean.
+
+    Labels have a colour each. Those of more values than a legend can tell, and without names,
+    are on a scale like numbers.
 
     Parameters
     ----------
     names
-        Names of the objects, by number.
+        Names of the values 0, 1, 2, … of a label.
     """
-    if quantity == "object":
-        return _object_colours(rows["object"], names)
-    if quantity == "height":
-        values, title, spread = rows["position"][:, 2], "height, m", True
-    elif quantity == "range":
-        values, title, spread = rows["range"], "range, m", True
-    else:
-        values, title, spread = rows[quantity].astype(np.float32), quantity, False
-    return turbo_colours(values, title, _limits(values, spread))
+    is_label = column.kind == "label" and values.dtype.kind in "iu"
+    if is_label:
+        found = np.unique(values)
+        if len(names):
+            return _named_colours(values, column, names)
+        if len(found) <= MOST_ENTRIES:
+            palette = _palette(int(found.max(initial=0)) + 1)
+            words = [f"{column.name} {value}" for value in found.tolist()]
+            return _of(palette, values), LabelKey(words, _of(palette, found))
+    return turbo_colours(values, _title(column), _limits(values, spread=not is_label))
+
+
+def _title(column: Column) -> str:
+    """Name, unit and meaning of a column."""
+    name = f"{column.name}, {column.unit}" if column.unit else column.name
+    return f"{name}: {column.meaning}" if column.meaning else name
 
 
 def turbo_colours(
-    values: NDArray[np.floating], title: str, limits: tuple[float, float]
+    values: NDArray[Any], title: str, limits: tuple[float, float]
 ) -> tuple[NDArray[np.uint8], ColourBar]:
     """Colours (n, 3) of values (n,) between two limits; grey where a value is NaN."""
     low, high = limits
-    scaled = (values - low) * (255 / (high - low if high > low else 1.0))
+    scaled = (values.astype(np.float64) - low) * (255 / (high - low if high > low else 1.0))
     known = np.isfinite(scaled)
     colours = TURBO[np.clip(np.where(known, scaled, 0), 0, 255).astype(np.uint8)]
     colours[~known] = _GREY
     return colours, ColourBar(title, low, high)
 
 
-def _object_colours(
-    owners: NDArray[np.int32], names: Sequence[str]
-) -> tuple[NDArray[np.uint8], ObjectKey]:
-    count = max(len(names), int(owners.max(initial=-1)) + 1, 1)
-    palette = np.round(255 * object_colours(count)).astype(np.uint8)
-    shown = [*names, *(f"object {i}" for i in range(len(names), count))][:count]
-    return palette[owners.clip(0)], ObjectKey(shown, palette)
+def _named_colours(
+    values: NDArray[Any], column: Column, names: Sequence[str]
+) -> tuple[NDArray[np.uint8], LabelKey]:
+    palette = _palette(max(len(names), int(values.max(initial=0)) + 1))
+    rest = (f"{column.name} {i}" for i in range(len(names), len(palette)))
+    return _of(palette, values), LabelKey([*names, *rest][: len(palette)], palette)
 
 
-def _limits(values: NDArray[np.floating], spread: bool) -> tuple[float, float]:
-    """Find the ends of the colours; of lengths without what few points would stretch them to."""
+def _palette(count: int) -> NDArray[np.uint8]:
+    """Colours of the labels below a number, (n, 3), or of the first `MOST_COLOURS`."""
+    return np.round(255 * object_colours(min(max(count, 1), MOST_COLOURS))).astype(np.uint8)
+
+
+def _of(palette: NDArray[np.uint8], values: NDArray[Any]) -> NDArray[np.uint8]:
+    return np.asarray(palette[values.clip(0).astype(np.int64) % len(palette)])
+
+
+def _limits(values: NDArray[Any], spread: bool) -> tuple[float, float]:
+    """Find the ends of the colours; of numbers without what few points would stretch them to."""
     known = values[np.isfinite(values)]
     if not len(known):
         return 0.0, 1.0

@@ -29,6 +29,10 @@ _UP = np.cross(_AWAY, _RIGHT)
 # Of a window, by half its height: what the scene may fill left of the panel, and how far the
 # middle of that is from the middle of the window.
 _WIDE, _HIGH, _ASIDE = 1.15, 0.88, 0.42
+# Light of about pi in all: under more, colours are paler than they are. viser's own lights make a
+# floor of any colour nearly white.
+_AROUND, _SUN = 1.3, 2.0
+_FROM = (0.15, -0.75, 1.2)  # left of the camera's first place, so that no two sides look alike
 _GRID = (128, 134, 142)  # lines that are seen on a light page and on a dark one
 
 
@@ -91,6 +95,13 @@ class LivePage(viser.ViserServer):
             shadow_opacity=0.0,
             position=(float(centre[0]), float(centre[1]), float(low[2]) - 0.002 * size),
         )
+
+    def light_evenly(self) -> None:
+        """Replace the lights, so that the colours of a surface are those of its bar."""
+        self.scene.configure_environment_map(None)
+        self.scene.configure_default_lights(enabled=False, cast_shadow=False)
+        self.scene.add_light_ambient("/light/around", intensity=_AROUND)
+        self.scene.add_light_directional("/light/sun", intensity=_SUN, position=_FROM)
 
     def add_page_controls(self, step_m: float) -> None:
         """Add what every page has at the end of its panel."""

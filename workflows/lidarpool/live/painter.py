@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Hashable, Iterable
+from dataclasses import dataclass
 
 BUSY_SHARE = 0.1  # of the time may go into drawing while a run needs the machine
 
@@ -76,3 +77,58 @@ class Painter:
             self.run()
         except Exception as error:
             self.error = error
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A part of a page, and how it is drawn.
+
+    Parameters
+    ----------
+    name
+        Its name, each one once.
+    state
+        What it looks like: it is drawn when this has changed.
+    every_s
+        Seconds from one drawing to the next, at least.
+    draw
+        Draws it.
+    """
+
+    name: str
+    state: Hashable
+    every_s: float
+    draw: Callable[[], None]
+
+
+class Throttle:
+    """Draws the parts of a page that have changed, each not oftener than it may be."""
+
+    def __init__(self) -> None:
+        self._drawn: dict[str, Hashable] = {}  # {name: its state when it was drawn}
+        self._due_at: dict[str, float] = {}
+
+    def hurry(self) -> None:
+        """Let everything be due, since somebody waits for it."""
+        self._due_at = {}
+
+    def draw(self, drawings: Iterable[Drawing], final: bool = False) -> bool:
+        """Draw what has changed and is due, or all that has changed if this is final.
+
+        Returns
+        -------
+        left
+            Whether something has changed that was not due.
+        """
+        left = False
+        for drawing in drawings:
+            if drawing.name in self._drawn and self._drawn[drawing.name] == drawing.state:
+                continue
+            now = time.monotonic()
+            if now < self._due_at.get(drawing.name, now) and not final:
+                left = True
+                continue
+            drawing.draw()
+            self._drawn[drawing.name] = drawing.state
+            self._due_at[drawing.name] = time.monotonic() + drawing.every_s
+        return left

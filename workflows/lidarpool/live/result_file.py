@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import json
+import re
 from bisect import bisect_left, bisect_right
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..choice import one_of_each_part
-from ..errors import LidarpoolError
-from ..picture_file import PICTURE_FILE, Pictured
-from ..ply_format import layout
-from .display import DISPLAY
+from ..base.choice import one_of_each_part
+from ..base.errors import LidarpoolError
+from ..columns.table import TABLE, Column
+from ..export.ply_format import AXES, layout
+from ..run.picture_file import PICTURE_FILE, Pictured
+from .display import display_rows, quantities
 
 CLOUD, REPORT = "cloud.ply", "report.json"
 OUTSIDE = 0.01  # of the points of a cloud may lie outside of its scene
@@ -28,6 +31,8 @@ class ResultFile:
 
     Attributes
     ----------
+    quantities
+        What the points can be coloured by: the properties of the file, and what follows from them.
     pictured
         The scene, how it was hit, sensors and planning; None where there is nothing of that.
     note
@@ -53,7 +58,8 @@ class ResultFile:
             self._check_pictured(report)
             self.names = tuple(map(str, report.get("points_by_object", ())))
             self.route = _route(report)  # (n, 2), metres, world coordinates
-            self._sensors, self._steps = _sensors(report, self.pictured)
+            self._sensors, self._steps, self._at_stations = _sensors(report, self.pictured)
+            self._columns = _columns(self._rows.dtype, report)
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise LidarpoolError(
                 f"{self.path.with_name(REPORT)} is not the report of a run ({error!r}): remove "
@@ -63,15 +69,19 @@ class ResultFile:
             self.names = self.pictured.scene.names
             if self.pictured.plan is not None:
                 self.route = self.pictured.plan.path + self.pictured.scene.origin[:2]
-        whole = self.choose(0, 2**31 - 1, 100_000)[0]
-        scans = whole["scan"]
-        self.in_order = bool((np.diff(scans) >= 0).all())
-        # Exact where the scans are in order.
-        ends = self._rows["scan"][[0, -1]] if self.in_order and len(self) else scans
-        self.scans = (int(ends.min(initial=2**31 - 1)), int(ends.max(initial=0)))
-        if not len(self):
-            self.scans = (0, 0)
-        self.has_ranges = bool(np.isfinite(whole["range"]).any())
+        self.quantities = quantities(self._columns, self._knows_ranges)
+        self._see_scans()
+
+    def _see_scans(self) -> None:
+        """Find out which scans there are, and whether they are in order, to choose from."""
+        self.in_order, self.scans = False, (0, 0)
+        if not self._has_scans or not len(self):
+            return
+        column = self._rows["scan"]
+        some = column[one_of_each_part(len(self), 100_000)]
+        self.in_order = bool((np.diff(some) >= 0).all())
+        ends = column[[0, -1]] if self.in_order else some  # exact where the scans are in order
+        self.scans = (int(ends.min()), int(ends.max()))
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -92,40 +102,59 @@ class ResultFile:
         Returns
         -------
         rows
-            The points (DISPLAY), in order. Those without finite coordinates are left out.
+            The points with their `quantities`, see `display_rows`, in order. Those without
+            finite coordinates are left out.
         count
             How many there are.
         """
-        scans = self._rows["scan"]
-        low = bisect_left(scans, first) if first > 0 else 0
-        high = bisect_right(scans, last) if last < 2**31 - 1 else len(scans)
+        low, high = 0, len(self)
+        if self.in_order:
+            scans = self._rows["scan"]
+            low = bisect_left(scans, first) if first > self.scans[0] else low
+            high = bisect_right(scans, last) if last < self.scans[1] else high
         count = max(0, high - low)
         rows = self._rows[low + one_of_each_part(count, most)]
-        positions = np.stack([rows[axis] for axis in "xyz"], axis=1, dtype=np.float64)
-        out = np.empty(len(rows), DISPLAY)
-        out["position"] = positions - self.origin
-        out["range"] = self._ranges(positions, rows["scan"])
-        for name in ("scan", "ring", "object"):
-            out[name] = rows[name]
+        positions = np.stack([rows[axis] for axis in AXES], axis=1, dtype=np.float64)
+        values = {column.name: rows[column.in_files] for column in self._columns}
+        sensors = self._sensors_of(values["scan"]) if self._knows_ranges else np.full(3, np.nan)
+        out = display_rows(self.quantities, positions, self.origin, values, sensors)
         return out[np.isfinite(positions).all(axis=1)], count
+
+    @property
+    def _has_scans(self) -> bool:
+        row = self._rows.dtype
+        return "scan" in (row.names or ()) and row["scan"].kind in "iu"
+
+    @property
+    def _knows_ranges(self) -> bool:
+        return self._at_stations and len(self._sensors) > 0 and self._has_scans
 
     def sensor_at(self, scan: int) -> NDArray[np.float64] | None:
         """Where the sensor stood in a scan, (3,), displayed position; None if it is not known."""
         if not len(self._sensors):
             return None
-        row = min(max(scan // self._steps, 0), len(self._sensors) - 1)
-        return np.asarray(self._sensors[row] - self.origin)
+        return np.asarray(self._sensors_of(np.array([scan]))[0] - self.origin)
+
+    def _sensors_of(self, scans: NDArray[Any]) -> NDArray[np.float64]:
+        """Where the sensor was in scans (n,), (n, 3), world coordinates."""
+        last = len(self._sensors) - 1
+        if self._at_stations:
+            rows = scans // self._steps
+        else:  # places on its way, evenly spread over all scans
+            rows = scans * last // max(1, self._steps - 1)
+        return self._sensors[np.clip(rows, 0, last).astype(np.int64)]
 
     def _check_pictured(self, report: Mapping[str, Any]) -> None:
         """Do without the scene if it is not that of this cloud."""
         if self.pictured is None:
             return
         told, scene = report.get("parameters", {}), self.pictured.scene
-        found = {"poses": len(self.pictured.poses), "triangles": len(scene.faces)}
-        fits = all(told.get(name, count) == count for name, count in found.items())
+        fits = told.get("triangles", len(scene.faces)) == len(scene.faces)
+        # There are more places than stations where the sensor moves.
+        fits &= told.get("poses", 1) <= len(self.pictured.poses)
         if fits and len(self):
             some = self._rows[one_of_each_part(len(self), 10_000)]
-            points = np.stack([some[axis] for axis in "xyz"], axis=1, dtype=np.float64)
+            points = np.stack([some[axis] for axis in AXES], axis=1, dtype=np.float64)
             low, high = scene.bounds + scene.origin
             room = 0.01 * np.linalg.norm(high - low) + 1.0
             known = np.isfinite(points).all(axis=1)
@@ -134,14 +163,6 @@ class ResultFile:
         if not fits:
             self.pictured = None
             self.note = f"{PICTURE_FILE} is of another run: the cloud is shown without the scene."
-
-    def _ranges(
-        self, positions: NDArray[np.float64], scans: NDArray[np.int32]
-    ) -> NDArray[np.float64]:
-        if not len(self._sensors):
-            return np.full(len(positions), np.nan)
-        sensor = self._sensors[(scans // self._steps).clip(0, len(self._sensors) - 1)]
-        return np.asarray(np.linalg.norm(positions - sensor, axis=1))
 
 
 def _cloud_in(path: Path) -> Path:
@@ -195,18 +216,53 @@ def _pictured_beside(cloud: Path) -> tuple[Pictured | None, str]:
         return None, f"The cloud is shown without the scene. {error}"
 
 
+def _columns(row: np.dtype[np.void], report: Mapping[str, Any]) -> tuple[Column, ...]:
+    """Columns of a file with such rows: those of the table, in its order, and what else it holds.
+
+    What columns of one's own mean, the report may tell.
+    """
+    known = {column.in_files: column for column in TABLE.values()}
+    told = {entry["file_name"]: entry for entry in report.get("columns", ())}
+    found: dict[str, Column] = {}
+    fields = row.names or ()
+    for name in (*(name for name in known if name in fields), *fields):
+        if name in AXES:
+            continue
+        dtype = row[name].str
+        if name in known:
+            column = replace(known[name], dtype=dtype, file_name=name)
+        else:
+            entry = told.get(name, {})
+            column = Column(
+                re.sub(r"\W|^(?=\d)", "_", str(entry.get("name", name))),
+                dtype,
+                str(entry.get("unit", "")),
+                str(entry.get("meaning", "")),
+                kind="label" if entry.get("kind") == "label" else "number",
+                file_name=name,
+            )
+        found.setdefault(column.name, column)
+    return tuple(found.values())
+
+
 def _sensors(
     report: Mapping[str, Any], pictured: Pictured | None
-) -> tuple[NDArray[np.float64], int]:
-    """World position of each pose, (p, 3), and scans from each; none where not all are told."""
+) -> tuple[NDArray[np.float64], int, bool]:
+    """Where the sensor was, (p, 3), world coordinates; empty where not all places are told.
+
+    Beside it either the scans from each place, and True; or, where it moved and these are places
+    on its way, the number of all scans, and False.
+    """
     told = report.get("parameters", {})
     if pictured is not None and "steps" in told:
-        return pictured.poses, int(told["steps"])
+        steps, stations = int(told["steps"]), int(told.get("poses", len(pictured.poses)))
+        moved = stations < len(pictured.poses)
+        return pictured.poses, steps * stations if moved else steps, not moved
     poses = told.get("first_poses", ())
     if not poses or len(poses) != told.get("poses"):
-        return np.empty((0, 3)), 1
+        return np.empty((0, 3)), 1, True
     local = np.array([pose["position"] for pose in poses], np.float64)
-    return local + np.asarray(told["origin"], np.float64), int(told["steps"])
+    return local + np.asarray(told["origin"], np.float64), int(told["steps"]), True
 
 
 def _route(report: Mapping[str, Any]) -> NDArray[np.float64]:

@@ -1,25 +1,16 @@
-"""How far a run is, written for the panel of a page."""
+"""The panel of a run: how far it is, and what somebody at the page wants of it."""
 
 from __future__ import annotations
 
+import threading
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from html import escape
 
-from ..progress import Progress
-from ..terminal import in_words, is_sure, time_in_words
+from ..run.progress import STAGES, Progress, in_words, is_sure, time_in_words
 
 WINDOW_S = 10.0  # that rates are taken over
-
-# Label, the count so far, the total, and the unit of each line.
-_STAGES = (
-    ("1 generate", "generated", "scans"),
-    ("2 intersect", "cast", "scans"),
-    ("3 sort frames", "framed", "scans"),
-    ("4 collect", "collected", "scans"),
-    ("plan path", "trials_done", "trials"),
-)
 
 _BOX = '<div style="padding:0 0.8em;font-size:0.85em;font-variant-numeric:tabular-nums">'
 
@@ -46,6 +37,8 @@ class RunState:
         Points that are displayed.
     frames, skipped
         Frames that were displayed, and those that were not because others came at once.
+    error
+        What cannot be displayed and why, a sentence; empty if nothing is wrong.
     """
 
     words: str
@@ -53,6 +46,7 @@ class RunState:
     displayed: int = 0
     frames: int = 0
     skipped: int = 0
+    error: str = ""
 
 
 class RunPanel:
@@ -67,12 +61,13 @@ class RunPanel:
             return f"{_BOX}<b>{escape(state.words)}</b></div>"
         self._note(progress)
         lines = [f"<b>{escape(state.words)}</b>, {progress.seconds:,.0f} s"]
-        lines += [self._stage(progress, *stage) for stage in _STAGES]
+        lines += [self._stage(progress, *stage) for stage in STAGES]
         shown = (
             "" if state.displayed >= progress.points else f", {state.displayed:,} of them displayed"
         )
         lines.append(f"<b>{progress.points:,} points</b>{shown}")
         lines.append(f"{state.frames:,} frames displayed, {state.skipped:,} skipped")
+        lines.append(escape(state.error))
         if state.partitions:
             busy = ", ".join(
                 f"{escape(name)} {held.busy} of {held.slots}"
@@ -108,3 +103,48 @@ class RunPanel:
             f'<div style="height:100%;border-radius:2px;width:{share:.1f}%;background:#2f7fd6">'
             "</div></div>"
         )
+
+
+class RunControl:
+    """What somebody at the page wants of the run; the run asks for it in its own thread."""
+
+    def __init__(self) -> None:
+        self._pause, self._stop = threading.Event(), threading.Event()
+
+    @property
+    def paused(self) -> bool:
+        """Whether the run is to stand still."""
+        return self._pause.is_set() and not self._stop.is_set()
+
+    @property
+    def stopped(self) -> bool:
+        """Whether the run is to end."""
+        return self._stop.is_set()
+
+    def pause(self) -> None:
+        """Have the run stand still; nothing is lost."""
+        self._pause.set()
+
+    def go_on(self) -> None:
+        """Have it go on."""
+        self._pause.clear()
+
+    def stop(self) -> None:
+        """Have it end as by Ctrl-C, also when it stands still."""
+        self._stop.set()
+
+    def check(self) -> None:
+        """Do nothing, unless the run is to stop.
+
+        Raises
+        ------
+        KeyboardInterrupt
+            If it is.
+        """
+        if self._stop.is_set():
+            raise KeyboardInterrupt
+
+    def wait_for_stop(self) -> None:
+        """Wait until somebody presses stop, or Ctrl-C."""
+        while not self._stop.wait(0.2):
+            pass

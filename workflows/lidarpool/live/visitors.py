@@ -62,7 +62,7 @@ def refuse_strangers(server: viser.ViserServer) -> None:
         origin = ", ".join(origins)
         if origin not in refused and len(refused) < _NAMED_MOST:
             refused.add(origin)
-            _LOGGER.warning("a page of %r wanted to connect to the live view: refused", origin)
+            _LOGGER.warning("a page of %r wanted to connect to the live page: refused", origin)
         await connection.close(_POLICY_VIOLATION, "only pages of this machine may connect")
         # What it sent meanwhile would still be taken, so that closing is not enough. The next
         # that the handler of this connection does is to wait for what sends and takes messages:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from ..errors import LidarpoolError
+from ..base.errors import LidarpoolError
 from .geometry import Floats, clearance, path_length
 from .planning import Planning
 from .tangents import shortest_path_length

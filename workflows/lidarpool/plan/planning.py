@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import LidarpoolError
+from ..base.errors import LidarpoolError
 from .geometry import Floats, segment_distances
 
 

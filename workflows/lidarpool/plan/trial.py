@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import LidarpoolError
+from ..base.errors import LidarpoolError
 from .axes import PathAxes
 from .cost import PathCost
 from .geometry import Floats, clearance, path_length, segment_distances

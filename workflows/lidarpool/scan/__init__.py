@@ -1,11 +1,10 @@
-"""The survey pipeline: four stages on the partitions of a cluster."""
+"""The survey pipeline: four stages on the partitions of a cluster, and their driver."""
 
-from .builder import CloudBuilder
-from .merged import StoredCloud
-from .messages import Frame
-from .pump import SurveyPump
-from .setup import SurveySetup
-from .stage_names import COLLECT, GENERATE, GPU, INTERSECT, LIDAR, OTHER, SORT
+from .driver import SurveyDriver, SurveyOptions
+from .messages import Frame, Receipt
+from .names import COLLECT, GENERATE, GPU, INTERSECT, LIDAR, OTHER, SORT
+from .rig import RigPlan
+from .watch import PATIENCE_S, WAIT_S, Watch
 
 __all__ = [
     "COLLECT",
@@ -14,10 +13,13 @@ __all__ = [
     "INTERSECT",
     "LIDAR",
     "OTHER",
+    "PATIENCE_S",
     "SORT",
-    "CloudBuilder",
+    "WAIT_S",
     "Frame",
-    "StoredCloud",
-    "SurveyPump",
-    "SurveySetup",
+    "Receipt",
+    "RigPlan",
+    "SurveyDriver",
+    "SurveyOptions",
+    "Watch",
 ]

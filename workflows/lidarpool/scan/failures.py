@@ -10,7 +10,13 @@ from distributed.scheduler import NoValidWorkerError
 
 from poolpart import WorkerLeft
 
-from ..errors import LidarpoolError
+from ..base.errors import LidarpoolError
+from .rig import RigMissing
+
+
+class OtherVersion(RuntimeError):  # noqa: N818 - reads as what happened
+    """A worker has another version of lidarpool than the driver; it does nothing for this run."""
+
 
 ASK_S = 10.0  # for an error's text, which the scheduler has
 
@@ -28,7 +34,7 @@ def naming_scans(first: int, last: int | None = None) -> Iterator[None]:
     """
     try:
         yield
-    except WorkerLeft:
+    except (WorkerLeft, OtherVersion):
         raise
     except Exception as error:
         span = f"scan {first}" if last in (None, first) else f"scans {first} to {last}"
@@ -38,6 +44,11 @@ def naming_scans(first: int, last: int | None = None) -> Iterator[None]:
 def was_killed(future: Future) -> bool:
     """Whether it was not a failed task that failed: its workers kept dying, or its worker left."""
     return isinstance(future.exception(timeout=ASK_S), (KilledWorker, WorkerLeft))
+
+
+def rig_is_missing(future: Future) -> bool:
+    """Whether a task of stage 2 has failed since its worker had no rig."""
+    return isinstance(future.exception(timeout=ASK_S), RigMissing)
 
 
 def raise_if_failed(future: Future, what: str) -> None:

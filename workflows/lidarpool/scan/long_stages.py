@@ -1,64 +1,276 @@
-"""What the long-running stages of a run are to do each time that they are started."""
+"""The long-running tasks of stages 1, 3 and 4: started where there is room, and kept alive."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any
 
-from poolpart import Pipe
+from distributed import Client, Future, Lock
 
-from ..survey import Survey
-from .messages import Attempt
-from .stage_names import COLLECT, GENERATE, SORT
-from .stage_tasks import Command, Work
-from .stages import collect, generate, sort_frames
-from .survey_run import SurveyRun
+from poolpart import Partition, Slots, look_at_slots
+
+from ..base.errors import LidarpoolError
+from .failures import OtherVersion, raise_if_failed, was_killed, words_on_memory
+
+LOOK_EVERY_S = 0.5
+SETTLE_S = 2.0  # for a task that was just submitted to start
+DEATHS_MOST = 12  # of one stage with nothing committed in between
+ASK_LOCK_S = 0.05
+
+# Makes what a stage is to do, from the attempt's number: a function and its arguments.
+Work = tuple[Callable[..., Any], tuple[Any, ...]]
+Command = Callable[[int], Work]
 
 
-def long_stages(
-    run: SurveyRun,
-    survey: Survey,
-    *,
-    collectors: int,
-    first: Callable[[], int],
-    pace: float | None,
-    scans: Pipe,
-    inlet: Callable[[str, int], Pipe],
-    deliveries: Pipe,
-) -> dict[str, Command]:
-    """Commands for `StageTasks`, by the name of the task.
+@dataclass(eq=False)
+class _Task:
+    """One stage as it runs now."""
+
+    future: Future
+    worker: str  # address of the one worker that it may run on
+    since: float
+    dead_since: float | None = None  # it has died, and was not started again yet
+    died: list[str] = field(default_factory=list)  # earlier workers, in a row
+    progress: int = -1  # what had been committed when it last died
+
+
+class LongStages:
+    """Runs each stage on a worker of its own choosing, and starts it again when that dies.
+
+    Dask would do both, in ways that do not fit tasks as long as the run: it may give two of them
+    to one slot, where the second waits until the first has ended, which it never does; and it
+    blames a task for the deaths of the workers it ran on, so that the fourth ends it. The stages
+    are started all together, under a lock of the cluster, when there are slots for all of them:
+    two runs that each had some of the slots would wait for each other for ever.
 
     Parameters
     ----------
-    run, survey
-        The run and what it scans.
-    collectors
-        Number of tasks of stage 4.
-    first
-        Says which scan stage 1 is to begin with.
-    pace
-        Scans a second, None for as many as are taken.
-    scans, deliveries
-        Pipes from stage 1, and to the driver.
-    inlet
-        Makes the pipe that an attempt of stage 3 or 4 is to read, of stage and number.
+    client, partition
+        Where the stages run.
+    run
+        Id of the run, part of the tasks' keys.
+    commands
+        What each stage is to do, by name; asked again each time the stage is started.
+    on_death
+        Called with the name of a stage whose worker has died.
+    patience_s
+        How long to wait for slots, seconds.
     """
 
-    def generator(number: int) -> Work:
-        attempt = Attempt(run.id, GENERATE, number)
-        return generate, (attempt, survey, scans, first(), pace)
+    def __init__(
+        self,
+        client: Client,
+        partition: Partition,
+        run: str,
+        commands: Mapping[str, Command],
+        on_death: Callable[[str], None],
+        patience_s: float,
+    ) -> None:
+        self.client, self.partition, self.run = client, partition, run
+        self._commands, self._on_death, self._patience_s = commands, on_death, patience_s
+        self._tasks: dict[str, _Task] = {}
+        self._submitted = 0
+        self._looked_at = 0.0
+        self._refused: set[str] = set()  # addresses of workers of another version
+        self._enough_at = time.monotonic()  # slots, free or not
+        self._waited_from: float | None = None  # for slots that others held
+        self.waiting = False  # for slots that others hold, to start with
+        self.notes: list[str] = []  # what a user should know
 
-    def sorter(number: int) -> Work:
-        return sort_frames, (Attempt(run.id, SORT, number), inlet(SORT, number), deliveries)
+    @property
+    def futures(self) -> dict[str, Future]:
+        """The stages by name."""
+        return {name: task.future for name, task in self._tasks.items()}
 
-    def collector(name: str, number: int) -> Work:
-        cloud = (survey.sensor, survey.keep_every, survey.precision_m)
-        attempt = Attempt(run.id, name, number)
-        return collect, (attempt, *cloud, inlet(COLLECT, number), deliveries)
+    @property
+    def done(self) -> bool:
+        """Whether all have ended."""
+        return all(task.future.done() for task in self._tasks.values())
 
-    names = [f"{COLLECT}-{which}" for which in range(collectors)]
-    return {
-        GENERATE: generator,
-        SORT: sorter,
-        **{name: partial(collector, name) for name in names},
-    }
+    def worker_of(self, name: str) -> str:
+        """Address of the worker of a stage that runs; "" where it does not."""
+        task = self._tasks.get(name)
+        return task.worker if task and task.dead_since is None else ""
+
+    def start(self) -> None:
+        """Start every stage, each on a free slot; if there are too few, `look` does it later.
+
+        Raises
+        ------
+        LidarpoolError
+            If the partition has too few slots, and goes on having too few.
+        """
+        lock = Lock(self._lock_name, scheduler_rpc=self.client.scheduler, loop=self.client.loop)
+        acquired = False
+        with suppress(RuntimeError):  # another run has just let go of it, see `forget_lock`
+            acquired = lock.acquire(timeout=ASK_LOCK_S)
+        if not acquired:
+            self.waiting = True
+            return
+        try:
+            self._start_all()
+        finally:
+            lock.release()
+
+    @property
+    def _lock_name(self) -> str:
+        return f"lidarpool-start-{self.partition.name}"
+
+    def forget_lock(self) -> None:
+        """Remove the lock from the scheduler unless another run holds it: Dask would keep it."""
+        self.client.run_on_scheduler(_forget_lock, name=self._lock_name)
+
+    def _start_all(self) -> None:
+        slots = self._slots()
+        free = {address: count for address, count in slots.free.items() if count > 0}
+        now, needed = time.monotonic(), len(self._commands)
+        if sum(free.values()) >= needed:
+            self.waiting = False
+            if self._waited_from is not None:
+                self.notes.append(
+                    f"the survey waited {now - self._waited_from:.1f} s for partition "
+                    f"{self.partition.name}, until other runs had left it {needed} slots"
+                )
+            for name in self._commands:
+                self._submit(name, free)
+            # Another run may look as soon as the lock is free: the tasks must be known by then.
+            deadline = now + SETTLE_S
+            keys = {task.future.key for task in self._tasks.values()}
+            while self._slots().known < keys and time.monotonic() < deadline:
+                time.sleep(0.005)
+            return
+        self.waiting = slots.total >= needed
+        if self.waiting:
+            self._waited_from = self._waited_from or now
+            self._enough_at = now
+        elif now - self._enough_at > self._patience_s:
+            raise LidarpoolError(
+                f"Partition {self.partition.name!r} has had {slots.total} of the {needed} slots "
+                f"needed for {self._patience_s:.0f} s: start another worker with "
+                f'--resources "{self.partition.name}=1" and run it again.'
+            )
+
+    def _slots(self) -> Slots:
+        keys = [task.future.key for task in self._tasks.values()]
+        slots = look_at_slots(self.client, self.partition.name, keys)
+        return slots.without(self._refused)
+
+    def look(self, progress: int) -> None:
+        """See, once in a while, to stages that died or wait behind another.
+
+        Parameters
+        ----------
+        progress
+            Any number that grows when something is committed.
+
+        Raises
+        ------
+        LidarpoolError
+            If a stage has failed, or keeps dying with nothing committed in between.
+        """
+        now = time.monotonic()
+        if now - self._looked_at < LOOK_EVERY_S:
+            return
+        self._looked_at = now
+        if not self._tasks:
+            self.start()
+            return
+        self._check()
+        slots = self._slots()
+        free = dict(slots.free)
+        for name, task in list(self._tasks.items()):
+            if task.future.status == "finished":
+                continue
+            room = max(free.values(), default=0) > 0
+            # A worker that is silent may wake up: its stages are left to it while there is no
+            # other place for them.
+            if task.dead_since is None and (
+                self._has_died(task, slots) or (task.worker in slots.silent and room)
+            ):
+                task.dead_since = now
+                self._on_death(name)
+            if task.dead_since is not None:
+                if room:
+                    self._restart(name, task, free, progress)
+                else:
+                    self._wait_for_slot(name, now - task.dead_since)
+            elif room and self._is_behind_another(task, slots, now):
+                free[task.worker] += 1
+                self._on_death(name)
+                self._submit(name, free)
+
+    def _check(self) -> None:
+        for name, task in self._tasks.items():
+            if task.future.status != "error" or was_killed(task.future):
+                if task.future.status == "cancelled":
+                    raise_if_failed(task.future, f"stage {name}")
+                continue
+            error = task.future.exception(timeout=10)
+            if isinstance(error, OtherVersion):
+                self._refused.add(task.worker)
+                self.notes.append(f"{error}: it was given nothing to do")
+            else:
+                raise_if_failed(task.future, f"stage {name}")
+
+    def _has_died(self, task: _Task, slots: Slots) -> bool:
+        if task.future.status == "error":
+            return True
+        return task.worker not in slots.present
+
+    def _is_behind_another(self, task: _Task, slots: Slots, now: float) -> bool:
+        """Whether a task is behind another on a worker that has more than its slots hold."""
+        settled = now - task.since > SETTLE_S
+        return (
+            settled and task.future.key not in slots.running and slots.free.get(task.worker, 0) < 0
+        )
+
+    def _wait_for_slot(self, name: str, seconds: float) -> None:
+        """LidarpoolError when a stage has had no slot for long.
+
+        One of several collectors is not missed: the others do its work.
+        """
+        kind = name.partition("-")[0]
+        spare = any(
+            other != name and other.startswith(kind) and task.dead_since is None
+            for other, task in self._tasks.items()
+        )
+        if seconds > self._patience_s and not spare:
+            raise LidarpoolError(
+                f"Stage {name} has had no free slot in partition {self.partition.name!r} for "
+                f"{self._patience_s:.0f} s since its worker died: start another worker with "
+                f'--resources "{self.partition.name}=1" and run it again.'
+            )
+
+    def _restart(self, name: str, task: _Task, free: dict[str, int], progress: int) -> None:
+        died = [*(task.died if progress == task.progress else []), task.worker]
+        if len(died) > DEATHS_MOST:
+            raise LidarpoolError(
+                f"stage {name} was started {len(died)} times, and each time its worker died before "
+                f"anything was committed{words_on_memory(self.client, died)}: look into the logs "
+                "of the LIDAR workers."
+            )
+        self._submit(name, free)
+        self._tasks[name].died, self._tasks[name].progress = died, progress
+
+    def _submit(self, name: str, free: dict[str, int]) -> None:
+        """Start a stage, under a key of its own, where most slots are free."""
+        worker = max(free, key=lambda address: (free[address], address))
+        free[worker] -= 1
+        number, self._submitted = self._submitted, self._submitted + 1
+        function, arguments = self._commands[name](number)
+        earlier = self._tasks.get(name)
+        key = f"{name}-{self.run}-{number}"
+        future = self.partition.submit(function, *arguments, key=key, worker=worker)
+        self._tasks[name] = _Task(future, worker, time.monotonic())
+        if earlier is not None:
+            # Where it still runs after all, it ends with its pipe; what comes of it is dropped.
+            earlier.future.cancel()
+
+
+def _forget_lock(name: str, dask_scheduler: Any = None) -> None:
+    semaphores = dask_scheduler.extensions["semaphores"]
+    if not semaphores.leases.get(name) and not semaphores.metrics["pending"].get(name):
+        semaphores.close(name=name)

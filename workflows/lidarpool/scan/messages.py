@@ -1,9 +1,13 @@
-"""What travels between the four stages and the driver."""
+"""What travels between the four stages and the driver: descriptions, summaries and receipts.
+
+Their size does not depend on the number of points. All of it is what msgpack carries, so that
+nothing that comes through a pipe is ever unpickled.
+"""
 
 from __future__ import annotations
 
-import pickle
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -11,34 +15,101 @@ from numpy.typing import NDArray
 
 from poolpart import TaskRecord
 
-from ..survey import Pose, ScanSpec
+from ..columns.cloud import Cloud
+from ..sensor import Pose
 
-# A hit as it leaves stage 2, 16 bytes: the position follows from these and the scan's
-# description, so it is worked out where it is wanted, and only for the points that are kept.
-HIT = np.dtype([("distance", "<f8"), ("ray", "<u4"), ("object", "<i4")])
+SAMPLES_MOST = 4  # sample rays of a scan
+SAMPLES_WANTED = 400  # of a survey
 
-# A point of the cloud as it leaves stage 4. `cell` is the position in multiples of the
-# cloud's precision from the scene's local origin: whole numbers, so that rounding once is
-# rounding for good.
-POINT = np.dtype(
-    [("cell", "<i4", (3,)), ("scan", "<u4"), ("ray", "<u4"), ("object", "<i4"), ("ring", "<u2")]
-)
+
+def samples_of_scan(scan_count: int) -> int:
+    """Sample rays of each scan: fewer where there are many scans, since each one travels."""
+    return max(1, min(SAMPLES_MOST, -(-SAMPLES_WANTED // scan_count)))
+
+
+def summary_type(samples: int) -> np.dtype[np.void]:
+    """Summary of a scan: hits, points kept, and ends of sample rays, metres, local coordinates.
+
+    A sample that there is none of is NaN.
+    """
+    return np.dtype([("hits", "<u4"), ("points", "<u4"), ("samples", "<f4", (samples, 3))])
+
+
+@dataclass(frozen=True)
+class Receipt:
+    """A part is whole in storage.
+
+    Parameters
+    ----------
+    offer
+        Number of the offer that it answers; see `scan.batches`.
+    first, stop
+        Its scans.
+    name
+        Of the part.
+    rows, size
+        Its points and its bytes.
+    hits
+        Of its scans, before they were thinned out.
+    cells
+        Lowest and highest cell as six numbers; empty where there are no points.
+    summaries
+        Of its scans, as bytes of `summary_type`.
+    records
+        The tasks of stage 2 and 4 that made it.
+    held_at
+        Address of the worker that holds the part in its memory because it does not see the
+        storage; "" where the part is in storage already.
+    """
+
+    offer: int
+    first: int
+    stop: int
+    name: str
+    rows: int
+    size: int
+    hits: int
+    cells: tuple[int, ...]
+    summaries: bytes
+    records: tuple[TaskRecord, ...] = ()
+    held_at: str = ""
+
+    def wire(self) -> dict[str, Any]:
+        """Plain data, for a pipe."""
+        data = dict(self.__dict__)
+        data["records"] = [pack_record(record) for record in self.records]
+        return data
+
+    @classmethod
+    def from_wire(cls, data: Mapping[str, Any]) -> Receipt:
+        """Inverse of `wire`."""
+        records = tuple(unpack_record(record) for record in data["records"])
+        return cls(**{**data, "records": records, "cells": tuple(data["cells"])})
+
+
+def pack_record(record: TaskRecord) -> list[Any]:
+    """Plain data of the record of a task."""
+    return list(record.__dict__.values())
+
+
+def unpack_record(data: Sequence[Any]) -> TaskRecord:
+    """Inverse of `pack_record`."""
+    stage, partition, worker, resources, *rest = data
+    return TaskRecord(stage, partition, worker, tuple(resources), *rest)
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One scan as stage 3 hands it out, in scan order.
+    """One scan as stage 3 hands it out, in scan order, when its points are in storage.
 
     Parameters
     ----------
     scan
         Its number.
     pose
-        Where the sensor stood, in the scene's local coordinates.
-    rays, hits
-        Rays fired, and those that hit something.
-    triangles, counts
-        int32 (k,): the triangles that were hit, and how many rays hit each.
+        Where the sensor was when it began, in the scene's local coordinates.
+    rays, hits, count
+        Rays fired, those that hit something, and points of the cloud.
     samples
         float32 (m, 3): where a few of the rays ended, metres, local coordinates.
     """
@@ -47,93 +118,16 @@ class Frame:
     pose: Pose
     rays: int
     hits: int
-    triangles: NDArray[np.int32]
-    counts: NDArray[np.int32]
+    count: int
     samples: NDArray[np.float32]
+    _read: Callable[[int], Cloud] = field(repr=False, compare=False)
 
+    def points(self) -> Cloud:
+        """Points of this scan, read from its part.
 
-@dataclass(frozen=True)
-class Batch:
-    """What stage 2 made of one item: some scans, their hits and their frames.
-
-    `hits` holds the hits of all `scans`, one scan after the other, `hit_counts` of each.
-    """
-
-    scans: tuple[ScanSpec, ...]
-    hits: NDArray[Any]  # HIT
-    hit_counts: tuple[int, ...]
-    frames: tuple[Frame, ...]
-    record: TaskRecord
-
-
-@dataclass(frozen=True)
-class Part:
-    """Points that a collector gathered: whole scans, not necessarily neighbours.
-
-    `points` holds those of all `scans`, one scan after the other, `counts` of each.
-    """
-
-    scans: tuple[int, ...]
-    counts: tuple[int, ...]
-    points: NDArray[Any]  # POINT
-
-
-@dataclass(frozen=True)
-class Attempt:
-    """One start of a long-running stage.
-
-    Parameters
-    ----------
-    run
-        Id of the survey.
-    name
-        Name of the stage's task; of several that share a stage, "stage-number".
-    number
-        Tasks of long stages that the run had started before.
-    """
-
-    run: str
-    name: str
-    number: int
-
-    @property
-    def stage(self) -> str:
-        """Name of the stage."""
-        return self.name.partition("-")[0]
-
-    @property
-    def fields(self) -> dict[str, Any]:
-        """What a trace tells of it."""
-        return {"run": self.run, "stage": self.stage, "attempt": self.number}
-
-
-@dataclass(frozen=True)
-class Hello:
-    """A consumer stage has started, perhaps again on another worker with nothing in memory."""
-
-
-@dataclass(frozen=True)
-class FrameRun:
-    """Frames in order, and the records of the tasks that made them."""
-
-    frames: tuple[Frame, ...]
-    records: tuple[TaskRecord, ...]
-
-
-@dataclass(frozen=True)
-class Delivery:
-    """What stages 3 and 4 send to the driver."""
-
-    attempt: Attempt
-    content: Hello | FrameRun | Part
-
-    def wire(self) -> bytes:
-        """Bytes to put into a pipe."""
-        return pickle.dumps(self, protocol=5)
-
-    @staticmethod
-    def from_wire(data: bytes) -> Delivery:
-        """Inverse of `wire`; for data from this run's own workers only."""
-        delivery = pickle.loads(data)
-        assert isinstance(delivery, Delivery)
-        return delivery
+        Raises
+        ------
+        LidarpoolError
+            If the part cannot be read, as after the run where it was not kept.
+        """
+        return self._read(self.scan)

@@ -14,48 +14,53 @@ generate.sent      after that
 intersect.start    the task runs, nothing was cast
 intersect.cast     the rays were cast, the result has not left the task
 intersect.end      the result is about to be returned
-sort.hello         before the task says hello
-sort.get           results were fetched
-sort.put           before frames, in order, are put
+sort.start         the task runs, nothing is in its memory
+sort.get           summaries were taken
+sort.put           before summaries, in order, are put
 sort.sent          after that
-collect.hello      before the task says hello
-collect.get        results were fetched
-collect.part       points were made and are in memory only
-collect.sent       they were put
+collect.start      the task runs
+collect.get        a batch was fetched
+collect.part       its part was made and is in memory only
+collect.stored     the part is in storage, and nobody knows of it
+collect.sent       its receipt was put
 driver.take        descriptions were taken from stage 1; `scans` are those that are new
-driver.submit      a batch was submitted to stage 2
-driver.handon      results were put into the pipe of `stage`
+driver.submit      a batch was offered to a GPU worker
+driver.handon      a collector was told of a batch, or the sorter of summaries
+driver.points      the part of a batch was committed
 driver.frame       a frame was handed out
-driver.points      points were entered into the cloud
+driver.release     a scan was committed and handed out; nothing holds it any more
 driver.duplicate   something came that is here already, from `stage`, and was dropped
 driver.stale       something came from an attempt that was replaced, and was dropped
-driver.release     scans have arrived both ways and nothing holds them any more
-driver.replay      scans that `stage` was given before are about to be put once more
-driver.recast      a batch is about to be submitted to stage 2 once more; `reason` says why
+driver.replay      a batch is about to be offered or handed on once more; `reason` says why
 ================== ======================================================================
 """
 
 from __future__ import annotations
 
-from .stage_names import COLLECT, GENERATE, INTERSECT, SORT
+from .names import COLLECT, GENERATE, INTERSECT, SORT
 
 # {stage: its points, in the order in which it passes them}
 STAGE_POINTS = {
     GENERATE: ("generate.start", "generate.put", "generate.sent"),
     INTERSECT: ("intersect.start", "intersect.cast", "intersect.end"),
-    SORT: ("sort.hello", "sort.get", "sort.put", "sort.sent"),
-    COLLECT: ("collect.hello", "collect.get", "collect.part", "collect.sent"),
+    SORT: ("sort.start", "sort.get", "sort.put", "sort.sent"),
+    COLLECT: (
+        "collect.start",
+        "collect.get",
+        "collect.part",
+        "collect.stored",
+        "collect.sent",
+    ),
 }
 
 DRIVER_POINTS = (
     "driver.take",
     "driver.submit",
     "driver.handon",
-    "driver.frame",
     "driver.points",
+    "driver.frame",
+    "driver.release",
     "driver.duplicate",
     "driver.stale",
-    "driver.release",
     "driver.replay",
-    "driver.recast",
 )

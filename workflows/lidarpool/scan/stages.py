@@ -8,62 +8,87 @@ failed it knows why.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
 from itertools import chain
 from typing import Any
 
-import numpy as np
-from distributed import Client, secede
+from distributed import get_worker, secede
 
 from poolpart import (
-    Backoff,
     Pipe,
     PipeClosed,
     PipeFailed,
     Recorder,
     TaskRecord,
-    fetch_available,
+    fetch_from,
+    hold_for_driver,
     own_client,
     telling_departure,
     trace,
 )
 
-from ..sensor import Sensor
-from ..survey import ScanSpec, Survey
-from .failures import naming_scans
-from .messages import POINT, Attempt, Batch, Delivery, Frame, FrameRun, Hello, Part
-from .pacer import Pacer
-from .setup import ray_directions
-from .stage_names import COLLECT, GENERATE, LIDAR, SORT
+from .._version import __version__
+from ..columns.parts import pack
+from ..columns.storage import Storage
+from ..sensor import Survey
+from .cast import CastBatch
+from .failures import OtherVersion, naming_scans
+from .messages import Receipt
+from .names import COLLECT, GENERATE, LIDAR, SORT
 
-DELIVERY_BYTES = 4 << 20  # of points or frames in one message through the scheduler
-GIVE_UP_S = 120.0  # asking for a result; the driver sends what does not arrive again
+LOOK_EVERY_S = 0.05  # at the clock, so that a pipe that fails is noticed
+FETCH_PATIENCE_S = 2.0  # for a sign of life of the worker that has a batch
+
+
+def check_version(wanted: str) -> None:
+    """Refuse to work for a driver of another version; runs on a worker.
+
+    Raises
+    ------
+    OtherVersion
+        Naming the worker and both versions.
+    """
+    if __version__ != wanted:
+        worker = get_worker()
+        raise OtherVersion(
+            f"the worker {worker.name} at {worker.address} has lidarpool {__version__}, the run "
+            f"{wanted}"
+        )
 
 
 @telling_departure()
 def generate(
-    attempt: Attempt, survey: Survey, outlet: Pipe, first: int = 0, pace: float | None = None
+    fields: dict[str, Any],
+    version: str,
+    survey: Survey,
+    outlet: Pipe,
+    first: int = 0,
+    pace: float | None = None,
 ) -> TaskRecord:
     """Stage 1: describe every scan from `first` on, as many in one item as is advised.
 
-    With a pace, so many a second, each when its time has come.
+    An item is a range of scans, all of which the survey says the same of everywhere. With a pace,
+    so many a second, each when its time has come.
     """
     secede()
+    check_version(version)
     recorder = Recorder(GENERATE, LIDAR)
-    sent = first
-    clock = None if pace is None else Pacer(pace, first)
-    trace("generate.start", **attempt.fields, first=first, scans=[])
+    sent, begun = first, time.monotonic()
+    trace("generate.start", **fields, scans=[])
     try:
         while sent < survey.scan_count:
             stop = min(sent + outlet.advice, survey.scan_count)
-            if clock is not None and (stop := min(stop, clock.due)) <= sent:
-                clock.wait(sent)
-                continue
+            if pace is not None:
+                due = first + 1 + int((time.monotonic() - begun) * pace)
+                if due <= sent:
+                    outlet.advice  # noqa: B018 - raises where the pipe has failed
+                    time.sleep(min(LOOK_EVERY_S, 1 / pace))
+                    continue
+                stop = min(stop, due)
             with naming_scans(sent, stop - 1):
-                item = [survey.scan(index).wire() for index in range(sent, stop)]
-            trace("generate.put", **attempt.fields, scans=list(range(sent, stop)))
-            outlet.put(item)
-            trace("generate.sent", **attempt.fields, scans=list(range(sent, stop)))
+                survey.scan(stop - 1)  # what cannot be described is told of here
+            trace("generate.put", **fields, scans=list(range(sent, stop)))
+            outlet.put((sent, stop))
+            trace("generate.sent", **fields, scans=list(range(sent, stop)))
             sent = stop
         outlet.close()
     except PipeFailed:
@@ -74,161 +99,138 @@ def generate(
 
 
 @telling_departure()
-def sort_frames(attempt: Attempt, inlet: Pipe, outlet: Pipe) -> TaskRecord:
-    """Stage 3: put frames back into scan order.
+def sort_frames(
+    fields: dict[str, Any], version: str, size: int, following: int, inlet: Pipe, outlet: Pipe
+) -> TaskRecord:
+    """Stage 3: put the summaries of scans into scan order.
 
-    The driver has only so many scans under way, which bounds the frames waiting here.
+    Parameters
+    ----------
+    fields
+        What tells this start of the task from others, for traces and the driver.
+    version
+        Of the driver.
+    size
+        Bytes of a summary.
+    following
+        The scan whose turn it is; all before have been handed out.
+    inlet, outlet
+        From the driver lists of {first: a scan, data: summaries from there on}, and to it one such.
     """
     secede()
+    check_version(version)
     recorder = Recorder(SORT, LIDAR)
-    waiting: dict[int, Frame] = {}  # {scan: frame that came before its turn}
-    following = 0  # the scan whose turn it is
+    waiting: dict[int, bytes] = {}  # {first scan: summaries of consecutive scans}
+    begin = following
     try:
-        trace("sort.hello", **attempt.fields, scans=[])
-        outlet.put(Delivery(attempt, Hello()).wire())
-        for base, results in _arrivals(inlet):
-            trace("sort.get", **attempt.fields, scans=_scans_of_frames(results))
-            # Everything before `base` has reached the driver: a sorter that was started again
-            # with an empty memory must not wait for it.
-            following = max(following, base)
-            records = []
-            for frames, record in results:
-                records.append(record)
-                waiting.update({frame.scan: frame for frame in frames if frame.scan >= following})
-            ready = []
-            for stale in [scan for scan in waiting if scan < following]:
-                del waiting[stale]
-            while following in waiting:
-                ready.append(waiting.pop(following))
-                following += 1
-            with naming_scans(following - len(ready), following - 1):
-                runs = list(_frame_runs(ready, records))
-            for run in runs:
-                scans = [frame.scan for frame in run.frames]
-                trace("sort.put", **attempt.fields, scans=scans)
-                outlet.put(Delivery(attempt, run).wire())
-                trace("sort.sent", **attempt.fields, scans=scans)
+        trace("sort.start", **fields, scans=[])
+        while True:
+            for item in chain.from_iterable(inlet.get_all(alone=True)):
+                first, data = item["first"], item["data"]
+                trace("sort.get", **fields, scans=_scans(first, data, size))
+                if first + len(data) // size > following:
+                    skip = max(0, following - first)
+                    waiting[first + skip] = data[skip * size :]
+            ready, at = [], following
+            while (data := waiting.pop(following, None)) is not None:
+                ready.append(data)
+                following += len(data) // size
+            if ready:
+                whole = b"".join(ready)
+                trace("sort.put", **fields, scans=_scans(at, whole, size))
+                outlet.put(
+                    {"attempt": fields["attempt"], "first": at, "data": whole}, unbounded=True
+                )
+                trace("sort.sent", **fields, scans=_scans(at, whole, size))
     except (PipeClosed, PipeFailed):
         pass
-    return recorder.done(following)
+    return recorder.done(following - begin)
 
 
 @telling_departure()
 def collect(
-    attempt: Attempt,
-    sensor: Sensor,
-    keep_every: int,
-    precision_m: float,
+    fields: dict[str, Any],
+    version: str,
+    storage: Storage,
+    probe: tuple[str, bytes],
     inlet: Pipe,
     outlet: Pipe,
 ) -> TaskRecord:
-    """Stage 4: thin out the hits of each scan, turn them into points, gather and deliver."""
+    """Stage 4: fetch batches from the workers that cast them, and write each as a part.
+
+    Parameters
+    ----------
+    fields, version
+        As of `sort_frames`.
+    storage, probe
+        Where parts go, and a file there with its content. A worker that does not see it holds its
+        parts in memory, and the driver fetches them.
+    inlet
+        From the driver: lists of {offer, key, at, first, stop, name}.
+    outlet
+        To the driver: {receipt: …}, or {lost: offer} for one that could not be fetched,
+        {failed: reason} where the storage takes nothing, {hidden: worker} where it is not seen.
+    """
     secede()
+    check_version(version)
     recorder = Recorder(COLLECT, LIDAR)
     scans = 0
     try:
-        trace("collect.hello", **attempt.fields, scans=[])
-        outlet.put(Delivery(attempt, Hello()).wire())
-        for _, results in _arrivals(inlet):
-            batches: list[Batch] = results
-            trace("collect.get", **attempt.fields, scans=_scans_of_batches(batches))
-            tables = []
-            for spec, hits in chain.from_iterable(map(_hits_by_scan, batches)):
-                with naming_scans(spec.scan):
-                    points = points_of(sensor, spec, hits[::keep_every], precision_m)
-                tables.append((spec.scan, points))
-            scans += len(tables)
-            for part in _parts(tables):
-                trace("collect.part", **attempt.fields, scans=list(part.scans))
-                outlet.put(Delivery(attempt, part).wire())
-                trace("collect.sent", **attempt.fields, scans=list(part.scans))
+        trace("collect.start", **fields, scans=[])
+        seen = storage.sees(*probe)
+        if not seen:
+            outlet.put({"hidden": str(get_worker().name)})
+        while True:
+            for item in chain.from_iterable(inlet.get_all(alone=True)):
+                answer = _collected(fields, storage if seen else None, item)
+                if "receipt" in answer:
+                    scans += item["stop"] - item["first"]
+                outlet.put(answer, unbounded=True)  # the driver bounds what it asks for
+                trace("collect.sent", **fields, scans=list(range(item["first"], item["stop"])))
     except (PipeClosed, PipeFailed):
         pass
     return recorder.done(scans)
 
 
-def points_of(sensor: Sensor, spec: ScanSpec, hits: np.ndarray, precision_m: float) -> np.ndarray:
-    """Points (POINT) of some hits (HIT) of one scan, rounded to the precision."""
-    directions = ray_directions(sensor, spec, hits["ray"])
-    position = np.asarray(spec.pose.position) + directions * hits["distance"][:, None]
-    points = np.zeros(len(hits), POINT)
-    points["cell"] = np.rint(position / precision_m)
-    points["scan"], points["ray"] = spec.scan, hits["ray"]
-    points["object"], points["ring"] = hits["object"], hits["ray"] % sensor.layers
-    return points
-
-
-def _arrivals(inlet: Pipe) -> Iterator[tuple[int, list[Any]]]:
-    """Fetch what a pipe of the driver names: (base, results), until the pipe is closed.
-
-    The items carry keys, not futures: the driver holds the futures until the scans have
-    arrived. `base` is the first scan that had not reached the driver when the item was put.
-    Results whose worker has died are asked for until Dask has made them again.
-    """
-    client: Client = own_client()
-    pause = Backoff(most_s=0.1)
-    missing: dict[str, float] = {}  # {key: when to stop asking}
-    while True:
+def _collected(
+    fields: dict[str, Any], storage: Storage | None, item: dict[str, Any]
+) -> dict[str, Any]:
+    """Make a part of one batch; returns what to tell the driver."""
+    first, stop, offer = item["first"], item["stop"], item["offer"]
+    scans = list(range(first, stop))
+    found = fetch_from(own_client(), item["at"], [item["key"]], FETCH_PATIENCE_S)
+    batch: CastBatch | None = found.get(item["key"])
+    if batch is None:
+        return {"lost": offer}
+    trace("collect.get", **fields, scans=scans)
+    with naming_scans(first, stop - 1):
+        data = pack(batch.part)
+        cells = batch.part.cells
+    trace("collect.part", **fields, scans=scans)
+    held_at = ""
+    if storage is None:
+        held_at = hold_for_driver(item["name"], data)
+    else:
         try:
-            items = inlet.get_all(timeout_s=pause.next() if missing else None)
-        except TimeoutError:
-            items = []
-        now = time.monotonic()
-        missing.update({key: now + GIVE_UP_S for item in items for key in item["keys"]})
-        results = fetch_available(client, missing)
-        # One that nobody makes any more was sent twice, and has arrived through another.
-        missing = {k: until for k, until in missing.items() if k not in results and until > now}
-        if results or not missing:
-            pause.reset()
-        yield max((item["base"] for item in items), default=0), list(results.values())
-
-
-def _scans_of_frames(results: Sequence[tuple[Sequence[Frame], TaskRecord]]) -> list[int]:
-    return [frame.scan for frames, _ in results for frame in frames]
-
-
-def _scans_of_batches(batches: Sequence[Batch]) -> list[int]:
-    return [spec.scan for batch in batches for spec in batch.scans]
-
-
-def _hits_by_scan(batch: Batch) -> Iterator[tuple[ScanSpec, np.ndarray]]:
-    stops = np.cumsum(batch.hit_counts)
-    for spec, stop, count in zip(batch.scans, stops, batch.hit_counts, strict=True):
-        yield spec, batch.hits[stop - count : stop]
-
-
-def _frame_runs(frames: Sequence[Frame], records: Sequence[TaskRecord]) -> Iterator[FrameRun]:
-    """Divide frames into messages of bounded size; the records go with the first."""
-    run: list[Frame] = []
-    size = 0
-    carried = tuple(records)
-    for frame in frames:
-        run.append(frame)
-        size += frame.triangles.nbytes + frame.counts.nbytes + frame.samples.nbytes
-        if size >= DELIVERY_BYTES:
-            yield FrameRun(tuple(run), carried)
-            run, size, carried = [], 0, ()
-    if run or carried:
-        yield FrameRun(tuple(run), carried)
-
-
-def _parts(tables: Sequence[tuple[int, np.ndarray]]) -> Iterator[Part]:
-    """Divide the points of some scans into messages of bounded size."""
-    held: list[tuple[int, np.ndarray]] = []
-    size = 0
-    for scan, points in tables:
-        held.append((scan, points))
-        size += points.nbytes
-        if size >= DELIVERY_BYTES:
-            yield _part(held)
-            held, size = [], 0
-    if held:
-        yield _part(held)
-
-
-def _part(tables: Sequence[tuple[int, np.ndarray]]) -> Part:
-    return Part(
-        scans=tuple(scan for scan, _ in tables),
-        counts=tuple(len(points) for _, points in tables),
-        points=np.concatenate([points for _, points in tables]),
+            storage.write(item["name"], data)
+        except OSError as error:
+            return {"failed": f"{error.strerror or error}"}
+        trace("collect.stored", **fields, scans=scans)
+    receipt = Receipt(
+        offer=offer,
+        first=first,
+        stop=stop,
+        name=item["name"],
+        rows=len(batch.part),
+        size=len(data),
+        hits=int(batch.summaries["hits"].sum()),
+        cells=() if cells is None else tuple(cells.ravel().tolist()),
+        summaries=batch.summaries.tobytes(),
+        records=(batch.record,),
+        held_at=held_at,
     )
+    return {"receipt": receipt.wire()}
+
+
+def _scans(first: int, data: bytes, size: int) -> list[int]:
+    return list(range(first, first + len(data) // size))

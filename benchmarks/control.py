@@ -1,0 +1,202 @@
+"""The control road: what passes scheduler and driver, and how much one driver sustains.
+
+Bytes: a survey on a cluster of this machine, whose scheduler is in the driver's process, so that
+all that either sends or receives passes here and is counted by kind of message. It is run with
+every fifth point kept and with all of them: what grows with points would show.
+
+Receipts: a cluster of workers in this process whose casting and storage answer at once, so that
+what is left is what driver, scheduler, pipes and database take for each part.
+
+Run: ``python -m benchmarks.control [--scans 20000] [--parts 2000]``
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import distributed.comm.tcp as tcp
+import numpy as np
+from distributed import Client, Scheduler, SpecCluster, Worker
+
+import lidarpool.scan.cast
+import lidarpool.scan.driver
+from lidarpool import Scene, Sensor, Survey, simulate
+from lidarpool.columns.parts import PartColumns
+from lidarpool.columns.storage import Storage
+from lidarpool.scan.cast import CastBatch
+from lidarpool.scan.messages import samples_of_scan, summary_type
+from poolpart import Recorder
+
+# Messages that come with time and with workers, not with work.
+UPKEEP = {"heartbeat", "setup", "transfers"}
+
+
+class Counted:
+    """Bytes of messages by kind, by the address at this end of their connection."""
+
+    def __init__(self) -> None:
+        self._bytes: dict[str, Counter[str]] = {}  # {address here: {kind: bytes}}
+
+    def add(self, message: Any, frames: list[Any]) -> None:
+        """Count a message."""
+        here = self._bytes.setdefault(_here.get(), Counter())
+        here[_kind(message)] += sum(memoryview(frame).nbytes for frame in frames)
+
+    @property
+    def scheduler(self) -> Counter[str]:
+        """What the scheduler sent and received: all of its connections end at one address."""
+        return max(self._bytes.values(), key=lambda counts: sum(counts.values()))
+
+
+def _kind(message: Any) -> str:
+    first = message[0] if isinstance(message, (list, tuple)) and message else message
+    op = str(first.get("op", "answer")) if isinstance(first, dict) else "answer"
+    if "heartbeat" in op:
+        return "heartbeat"
+    if op in ("register-worker", "register-client", "identity", "register_worker_plugin"):
+        return "setup"
+    return op
+
+
+_here: ContextVar[str] = ContextVar("_here", default="")  # address at this end of a connection
+
+
+@contextmanager
+def counting() -> Iterator[Counted]:
+    """Count what this process sends and receives while the body runs."""
+    counted, to_frames, from_frames = Counted(), tcp.to_frames, tcp.from_frames
+    read, write = tcp.TCP.read, tcp.TCP.write
+
+    async def sent(message: Any, *args: Any, **kwargs: Any) -> Any:
+        frames = await to_frames(message, *args, **kwargs)
+        counted.add(message, frames)
+        return frames
+
+    async def received(frames: Any, *args: Any, **kwargs: Any) -> Any:
+        message = await from_frames(frames, *args, **kwargs)
+        counted.add(message, frames)
+        return message
+
+    async def reads(self: Any, *args: Any, **kwargs: Any) -> Any:
+        _here.set(self.local_address)
+        return await read(self, *args, **kwargs)
+
+    async def writes(self: Any, *args: Any, **kwargs: Any) -> Any:
+        _here.set(self.local_address)
+        return await write(self, *args, **kwargs)
+
+    with (
+        patch.object(tcp, "to_frames", sent),
+        patch.object(tcp, "from_frames", received),
+        patch.object(tcp.TCP, "read", reads),
+        patch.object(tcp.TCP, "write", writes),
+    ):
+        yield counted
+
+
+def small_survey(scans: int, keep_every: int) -> Survey:
+    """Describe scans of 128 rays."""
+    sensor = Sensor.grid(rays_per_revolution=360, layers=32, step_deg=4)
+    poses = [(0.01 * place, 0.0, 1.0) for place in range(-(-scans // 90))]
+    return Survey(sensor, poses, steps=90, keep_every=keep_every)
+
+
+def count_bytes(scans: int) -> None:
+    """Print bytes a scan: what more scans and more points add to what passes the scheduler."""
+    sides = {
+        "every 5th point": (scans, 5),
+        "all points": (scans, 1),
+        "twice the scans": (2 * scans, 5),
+    }
+    work: dict[str, Counter[str]] = {}
+    for side, (count, keep_every) in sides.items():
+        what = small_survey(count, keep_every)
+        with counting() as counted:
+            result = simulate(Scene.seed(), what)
+        upkeep = sum(counted.scheduler[kind] for kind in UPKEEP)
+        work[side] = Counter({k: n for k, n in counted.scheduler.items() if k not in UPKEEP})
+        print(
+            f"{side:16} {what.scan_count:,} scans, {len(result.points):,} points: "
+            f"{sum(work[side].values()) / 1e6:.2f} MB in and out of the scheduler, the scene's "
+            f"among them, and {upkeep / 1e6:.2f} MB of heartbeats and set-up"
+        )
+    one, more, points = work["every 5th point"], work["twice the scans"], work["all points"]
+    for kind, count in (more - one).most_common(5):
+        print(f"    {kind:24} {count / scans:6.1f} bytes a further scan")
+    added = (sum(more.values()) - sum(one.values())) / scans
+    print(
+        f"a further scan adds {added:.0f} bytes; five times the points add "
+        f"{(sum(points.values()) - sum(one.values())) / scans:.0f} bytes a scan"
+    )
+
+
+def sustain(parts: int) -> None:
+    """Print what one driver sustains where everything else answers at once."""
+    sensor = Sensor.grid(rays_per_revolution=360, layers=1, step_deg=360)
+    what = Survey(sensor, [(0.0, 0.0, 1.0)] * parts, steps=1)
+    kind = summary_type(samples_of_scan(parts))
+    empty = {c.name: np.zeros(0, c.dtype) for c in what.stored_columns}
+
+    def cast_at_once(handle: str, first: int, stop: int, run: str = "") -> CastBatch:
+        part = PartColumns(
+            first,
+            np.zeros(stop - first, np.int64),
+            empty,
+            np.zeros(0, np.int32),
+            np.zeros(0, np.int64),
+        )
+        return CastBatch(part, np.zeros(stop - first, kind), Recorder("intersect", "GPU").done())
+
+    quiet = {"host": "127.0.0.1", "dashboard": False}
+    slots = {"GPU-0": 4, "GPU-1": 4, "LIDAR": 8}
+    workers = {
+        name: {
+            "cls": Worker,
+            "options": {"resources": {name.split("-")[0]: n}, "nthreads": n, **quiet},
+        }
+        for name, n in slots.items()
+    }
+    scheduler = {"cls": Scheduler, "options": {"port": 0, **quiet}}
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        SpecCluster(workers=workers, scheduler=scheduler, silence_logs=50) as cluster,
+        Client(cluster) as client,
+        patch.object(lidarpool.scan.driver, "intersect", cast_at_once),
+        patch.object(lidarpool.scan.driver, "BATCH_RAYS", 1),
+        patch.object(Storage, "write", lambda self, name, data: None),
+        patch.object(Storage, "sees", lambda self, name, data: True),
+    ):
+        began = time.perf_counter()
+        result = simulate(
+            Scene.seed(), what, client=client, backend="numpy", folder=Path(folder) / "run"
+        )
+        seconds = time.perf_counter() - began
+    rate = parts / result.survey_seconds
+    print(
+        f"{parts:,} parts in {result.survey_seconds:.1f} s (all {seconds:.1f} s), with workers and "
+        f"scheduler in the driver's process: {rate:.0f} receipts/s, {1000 / rate:.2f} ms each; "
+        f"with 10^6 returns in a part {rate * 1e6 / 1e6:,.0f} million points/s"
+    )
+
+
+def main() -> None:
+    """Run both."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--scans", type=int, default=20_000)
+    parser.add_argument("--parts", type=int, default=2_000)
+    given = parser.parse_args()
+    count_bytes(given.scans)
+    sustain(given.parts)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,175 @@
+"""A whole survey beside the script that an expert would write: time, bytes, and the same points.
+
+The script runs in one process: Open3D casts on all cores, NumPy thins and rounds, Open3D writes
+the PLY. Ours is the command with ``--only cloud`` on a cluster that it starts itself, with all the
+guarantees of a run. Both are processes of their own, measured from start to end, in turns.
+
+Run: ``python -m benchmarks.survey [--rays 1e8] [--rounds 3] [--pictures]``
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+RAYS_PER_TURN, LAYERS, FOV_DEG = 1800, 64, 50.0
+KEEP_EVERY, PRECISION_M = 5, 0.01
+TRIANGLES = 100_000
+MESH = "city.glb"
+
+
+def poses(count: int) -> list[tuple[float, float, float]]:
+    """Places along streets, at the height of a car's roof."""
+    from lidarpool.scene.city import city
+
+    low, high = city(TRIANGLES).bounds
+    rng = np.random.default_rng(0)
+    places = low[:2] + (high[:2] - low[:2]) * rng.uniform(0.25, 0.75, (count, 2))
+    return [(round(float(x), 3), round(float(y), 3), 2.0) for x, y in places]
+
+
+def script(rays: int, out: Path) -> None:
+    """Survey in one process, as plainly as it goes."""
+    import open3d as o3d
+
+    from lidarpool import Scene
+
+    scene = Scene.load(out.parent / MESH)
+    caster = o3d.t.geometry.RaycastingScene()
+    caster.add_triangles(
+        o3d.core.Tensor(scene.vertices.astype(np.float32)),
+        o3d.core.Tensor(scene.faces.astype(np.uint32)),
+    )
+    azimuth = 2 * np.pi * np.arange(RAYS_PER_TURN) / RAYS_PER_TURN
+    elevation = np.linspace(-np.radians(FOV_DEG) / 2, np.radians(FOV_DEG) / 2, LAYERS)
+    a, e = np.meshgrid(azimuth, elevation, indexing="ij")
+    directions = np.stack([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)], axis=-1)
+    directions = directions.reshape(-1, 3)
+    table = np.empty((len(directions), 6), np.float32)
+    table[:, 3:] = directions
+    columns: dict[str, list[np.ndarray]] = {n: [] for n in ("positions", "scan", "ring", "object")}
+    for scan, pose in enumerate(poses(scan_count(rays))):
+        table[:, :3] = pose
+        answer = caster.cast_rays(o3d.core.Tensor(table))
+        t, face = answer["t_hit"].numpy(), answer["primitive_ids"].numpy()
+        hit = np.flatnonzero(np.isfinite(t))[::KEEP_EVERY]
+        points = np.asarray(pose) + directions[hit] * t[hit, None]
+        columns["positions"].append(np.round(points, 2))
+        columns["scan"].append(np.full(len(hit), scan, np.int32))
+        columns["ring"].append((hit % LAYERS).astype(np.uint16))
+        columns["object"].append(scene.face_object[face[hit]])
+    cloud = o3d.t.geometry.PointCloud()
+    whole = {name: np.concatenate(parts) for name, parts in columns.items()}
+    cloud.point.positions = o3d.core.Tensor(whole["positions"].astype(np.float32))
+    for name in ("scan", "ring", "object"):
+        cloud.point[name] = o3d.core.Tensor(np.ascontiguousarray(whole[name])[:, None])
+    o3d.t.io.write_point_cloud(str(out / "cloud.ply"), cloud, write_ascii=False)
+
+
+def scan_count(rays: int) -> int:
+    """Count the scans of whole turns."""
+    return max(1, round(rays / (RAYS_PER_TURN * LAYERS)))
+
+
+def scenario(rays: int, folder: Path) -> Path:
+    """Write mesh and scenario of the same survey."""
+    from lidarpool.scene.city import city
+    from lidarpool.scene.scene_file import write_scene
+
+    write_scene(folder / MESH, city(TRIANGLES))
+    data = {
+        "scene": {"files": [MESH]},
+        "sensor": {
+            "rays_per_revolution": RAYS_PER_TURN,
+            "layers": LAYERS,
+            "vertical_fov_deg": FOV_DEG,
+            "step_deg": 360,
+        },
+        "poses": [list(pose) for pose in poses(scan_count(rays))],
+        "steps": 1,
+        "cloud": {"keep_every": KEEP_EVERY, "precision_m": PRECISION_M},
+    }
+    path = folder / "survey.yaml"
+    path.write_text(json.dumps(data))  # which is YAML, too
+    return path
+
+
+def timed(side: str, rays: int, folder: Path) -> tuple[float, float]:
+    """Wall and processor seconds of the process that does one side, and of its children."""
+    out = folder / side
+    out.mkdir(exist_ok=True)
+    here = [sys.executable, "-m"]
+    command = {
+        "script": [*here, "benchmarks.survey", "--script", str(out), "--rays", str(rays)],
+        "ours": [*here, "lidarpool", "run", str(folder / "survey.yaml"), "-q", "--only", "cloud"],
+        "pictures": [*here, "lidarpool", "run", str(folder / "survey.yaml"), "-q"],
+    }[side]
+    if side != "script":
+        command += ["--no-plan", "--out", str(out)]
+    before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    wall, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return wall, cpu
+
+
+def main() -> None:
+    """Run the benchmark, or one side of it."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rays", type=lambda text: int(float(text)), default=100_000_000)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--pictures", action="store_true", help="also with pictures and report")
+    parser.add_argument("--script", type=Path, metavar="FOLDER", help="only do the script's side")
+    given = parser.parse_args()
+    if given.script:
+        script(given.rays, given.script)
+        return
+    sides = ["script", "ours", *(["pictures"] if given.pictures else [])]
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        scenario(given.rays, folder)
+        times: dict[str, list[tuple[float, float]]] = {side: [] for side in sides}
+        for _ in range(given.rounds):
+            for side, found in times.items():
+                found.append(timed(side, given.rays, folder))
+                wall, cpu = found[-1]
+                print(f"{side:8} {wall:7.2f} s wall {cpu:7.2f} s processor", flush=True)
+        compare(folder)
+    for which, what in enumerate(("wall time", "processor time")):
+        pairs = zip(times["ours"], times["script"], strict=True)
+        ratio = statistics.median(a[which] / b[which] for a, b in pairs)
+        print(f"{what}: ours {ratio:.2f} x the script's, median of {given.rounds}")
+    if given.pictures:
+        pairs = zip(times["pictures"], times["ours"], strict=True)
+        more = statistics.median(a[0] - b[0] for a, b in pairs)
+        print(f"pictures and report: {more:.1f} s more")
+
+
+def compare(folder: Path) -> None:
+    """Compare both clouds: which points are there, and how far apart they are."""
+    from lidarpool import read_cloud
+
+    one, other = (read_cloud(folder / side / "cloud.ply") for side in ("script", "ours"))
+    same = len(one) == len(other) and np.logical_and.reduce(
+        [one[name] == other[name] for name in ("scan", "channel", "object")]
+    )
+    share = float(np.mean(same))
+    apart = np.abs(one.positions - other.positions).max(axis=1)[same] if share else np.zeros(1)
+    print(
+        f"{len(one):,} and {len(other):,} points, {share:.4%} of them in the same place of the "
+        f"order with the same labels; half of these within {np.median(apart):.3f} m, "
+        f"99.9 % within {np.quantile(apart, 0.999):.3f} m"
+    )
+
+
+if __name__ == "__main__":
+    main()

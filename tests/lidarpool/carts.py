@@ -1,0 +1,28 @@
+"""A trajectory that moves, for tests."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidarpool import Pose
+
+
+@dataclass(frozen=True)
+class Cart:
+    """Drives along x while it turns about z, in lanes that lie side by side."""
+
+    speed: float = 5.0  # metres a second
+    yaw_rate_deg: float = 90.0  # a second
+    stations: int = 2
+    moves: bool = True
+
+    def pose(self, station, time_ns=0.0):
+        seconds = time_ns / 1e9
+        return Pose((self.speed * seconds, 10.0 * station, 1.0), self.yaw_rate_deg * seconds)
+
+    def poses(self, station, times_ns):
+        poses = [self.pose(station, time) for time in times_ns]
+        rotations = [np.eye(3) if p.rotation is None else p.rotation for p in poses]
+        return np.array([p.position for p in poses]), np.array(rotations)

@@ -1,0 +1,205 @@
+"""The table of columns, columns of one's own, and clouds that hold them."""
+
+from __future__ import annotations
+
+import pickle
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lidarpool import Cloud, Column, LidarpoolError, save_cloud
+from lidarpool.columns.cloud import counts_by_object
+from lidarpool.columns.table import ALWAYS, OPTIONAL, TABLE, chosen, stored
+from lidarpool.scan.returns import BatchReturns
+
+# -- the table ------------------------------------------------------------------------------------
+
+
+def test_the_table_describes_every_column():
+    assert next(iter(TABLE)) == "scan" and set(TABLE) >= {"time", "intensity", "class"}
+    for name, column in TABLE.items():
+        assert column.name == name and column.meaning and not column.meaning.endswith(".")
+        assert name == "scan" or hasattr(BatchReturns, column.source), name
+    assert len({column.in_files for column in TABLE.values()}) == len(TABLE)
+
+
+def test_columns_are_chosen_by_name_once_and_in_order():
+    own = Column("mine", "u1", "", "", lambda returns: 0)
+    assert chosen([]) == ()
+    found = chosen(["range", own, "time", "range", own, TABLE["time"], "ring", "channel", "scan"])
+    assert [column.name for column in found] == ["range", "mine", "time"]
+    assert stored(found) == (*ALWAYS, *found)
+    assert chosen(OPTIONAL) == OPTIONAL
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        (["intensty"], r"no column 'intensty'.*'intensity'"),
+        (["reflectance of the surface"], r"There are .*intensity.*"),
+        ([Column("time", "u4", "s", "another")], "Two columns are called 'time': rename one"),
+        ([Column("a", "u1", "", ""), Column("a", "u2", "", "")], "Two columns are called 'a'"),
+        ([Column("ring", "u1", "", "")], "Two columns are called 'ring'"),
+        ([Column("a", "u1", "", "", file_name="x")], "Two columns are called 'x'"),
+    ],
+)
+def test_columns_that_cannot_be_chosen(columns, message):
+    with pytest.raises(LidarpoolError, match=message):
+        chosen(columns)
+
+
+@pytest.mark.parametrize("name", ["", "a b", "1st", "a-b", "../x"])
+def test_a_column_is_called_by_an_identifier(name):
+    with pytest.raises(LidarpoolError, match=f"cannot be called '{name}': use an identifier"):
+        Column(name, "u1", "", "")
+
+
+@pytest.mark.parametrize("name", ["a b", "a\nb", "höhe", "positions", "normals", "colors", "x"])
+def test_a_column_that_files_cannot_hold_is_neither_chosen_nor_written(name, tmp_path):
+    column = Column("a", "u1", "", "", file_name=name)
+    with pytest.raises(LidarpoolError, match=r"called .* in files.*: (use|rename)"):
+        chosen([column])
+    with pytest.raises(LidarpoolError, match=r"called .* in files.*: (use|rename)"):
+        save_cloud(tmp_path / "c.ply", Cloud(np.zeros((1, 3)), {"a": [1]}, (column,)))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("dtype", ["float23", "U5", "O", "bool", "M8[s]", "complex64", "3f4"])
+def test_a_column_holds_numbers(dtype):
+    with pytest.raises(LidarpoolError, match="give one of whole or real numbers"):
+        Column("a", dtype, "", "")
+
+
+class Returns(SimpleNamespace):
+    def __len__(self):
+        return 3
+
+
+@pytest.mark.parametrize(
+    ("dtype", "values"),
+    [("u1", [0, 7, 255]), ("i2", [-5.0, 0.0, 1.0]), ("f4", [np.nan, 0, np.inf]), ("u8", [0, 1, 2])],
+)
+def test_a_column_is_made_of_an_attribute_or_by_a_function(dtype, values):
+    returns = Returns(thing=values)
+    for source in ("thing", lambda returns: returns.thing):
+        made = Column("a", dtype, "", "", source).make(returns)
+        assert made.dtype == np.dtype(dtype)
+        np.testing.assert_array_equal(made, values)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "values", "message"),
+    [
+        ("u1", [0, 1], r"shape \(2,\); it needs one value for each of the 3 points"),
+        ("u1", 5, r"shape \(\)"),
+        ("f4", np.zeros((3, 1)), r"shape \(3, 1\)"),
+        ("u1", [0, 1, 256], "holds 0 to 256, and uint8 holds 0 to 255: give it a wider type"),
+        ("u4", [-1, 0, 1], "holds -1 to 1"),
+        ("i4", [0, 1, np.nan], "holds NaN or infinity as int32"),
+        ("i8", [0, 1, np.inf], "holds NaN or infinity"),
+    ],
+)
+def test_values_that_do_not_fit_their_column(dtype, values, message):
+    with pytest.raises(LidarpoolError, match=message):
+        Column("a", dtype, "", "", lambda returns: values).make(Returns())
+
+
+def test_no_returns_make_no_values():
+    class Nothing:
+        def __len__(self):
+            return 0
+
+    made = Column("a", "u1", "", "", lambda returns: np.zeros(0)).make(Nothing())
+    assert made.shape == (0,) and made.dtype == np.uint8
+
+
+# -- clouds ---------------------------------------------------------------------------------------
+
+
+def cloud_of(count=5):
+    columns = {"scan": np.arange(count) // 2, "object": np.arange(count) % 3, "mine": [0.5] * count}
+    return Cloud(np.arange(3.0 * count).reshape(count, 3), columns)
+
+
+def test_a_cloud_gives_its_columns_in_their_types():
+    cloud = cloud_of()
+    assert len(cloud) == 5
+    assert cloud.scan.dtype == np.int32 == cloud["object"].dtype
+    assert cloud.mine.tolist() == cloud["mine"].tolist() == [0.5] * 5
+    assert [c.name for c in cloud.table] == ["scan", "object", "mine"]
+    assert cloud.table[0] is TABLE["scan"] and cloud.table[2].dtype == "<f8"
+    assert cloud.bounds.tolist() == [[0, 1, 2], [12, 13, 14]]
+    assert counts_by_object(cloud, 4).tolist() == [2, 2, 1, 0]
+    again = pickle.loads(pickle.dumps(cloud))
+    assert np.array_equal(again.positions, cloud.positions) and again.scan.tolist() == [
+        0,
+        0,
+        1,
+        1,
+        2,
+    ]
+
+
+def test_a_cloud_without_points_has_bounds():
+    cloud = Cloud(np.empty((0, 3)), {"scan": []})
+    assert cloud.bounds.tolist() == [[0, 0, 0], [0, 0, 0]]
+    assert list(cloud.chunks()) == [] and cloud.scan.dtype == np.int32
+
+
+def test_positions_stay_as_precise_as_they_came():
+    assert Cloud(np.zeros((1, 3), np.float32), {}).positions.dtype == np.float32
+    assert Cloud([[1, 2, 3]], {}).positions.dtype == np.float64
+
+
+def test_a_column_that_is_not_there():
+    with pytest.raises(KeyError, match=r"no column 'time'; it has \['scan', 'object', 'mine'\]"):
+        cloud_of()["time"]
+    with pytest.raises(AttributeError, match="no attribute or column 'time'"):
+        _ = cloud_of().time
+    assert not hasattr(cloud_of(), "__array__")
+
+
+def test_a_column_of_ones_own_is_held_to_its_description():
+    own = (Column("mine", "uint8", "dB", "how loud"),)
+    cloud = Cloud(np.zeros((2, 3)), {"mine": [1, 2]}, own)
+    assert cloud.mine.dtype == np.uint8 and cloud.table == own
+    assert cloud.part(slice(1, 2)).table == own
+    with pytest.raises(LidarpoolError, match="mine holds 1 to 256"):
+        Cloud(np.zeros((2, 3)), {"mine": [1, 256]}, own)
+
+
+@pytest.mark.filterwarnings("ignore:invalid value encountered in cast")
+@pytest.mark.parametrize(
+    ("positions", "columns", "message"),
+    [
+        (np.zeros((5, 2)), {}, r"positions of \(n, 3\), not \(5, 2\)"),
+        (np.zeros(3), {}, r"not \(3,\)"),
+        ([[np.nan, 0, 0]], {}, "NaN or infinite"),
+        (np.full((1, 3), np.inf, np.float32), {}, "NaN or infinite"),
+        (np.zeros((2, 3)), {"scan": [1]}, r"'scan' has the shape \(1,\) and there are 2 points"),
+        (np.zeros((2, 3)), {"scan": [[1, 2]]}, r"shape \(1, 2\)"),
+        (np.zeros((1, 3)), {"channel": [65_536]}, "channel holds 65536 to 65536.* 0 to 65535"),
+        (np.zeros((1, 3)), {"scan": [2**31]}, "scan holds 2147483648"),
+        (np.zeros((1, 3)), {"object": [0.5]}, "object holds 0.5 to 0.5; it must be whole"),
+        (np.zeros((1, 3)), {"time": [np.nan]}, "time holds nan"),
+    ],
+)
+def test_arrays_that_are_no_cloud(positions, columns, message):
+    with pytest.raises(LidarpoolError, match=message):
+        Cloud(positions, columns)
+
+
+@given(st.integers(0, 20), st.integers(1, 25))
+def test_chunks_are_the_cloud(count, points):
+    cloud = cloud_of(count)
+    chunks = list(cloud.chunks(points))
+    assert all(len(chunk) == points for chunk in chunks[:-1])
+    assert len(chunks) == -(-count // points)
+    if chunks:
+        joined = Cloud.joined(chunks)
+        assert np.array_equal(joined.positions, cloud.positions)
+        for name, values in cloud.columns.items():
+            assert np.array_equal(joined[name], values) and joined[name].dtype == values.dtype

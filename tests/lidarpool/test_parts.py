@@ -1,0 +1,273 @@
+"""Parts: files of columns, whole or refused, and clouds that are read from them in order."""
+
+from __future__ import annotations
+
+import io
+import pickle
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidarpool import Cloud, LidarpoolError
+from lidarpool.base.choice import one_of_each_part
+from lidarpool.columns.parts import (
+    SUFFIX,
+    PartColumns,
+    StoredCloud,
+    pack,
+    positions,
+    read_part,
+    read_tally,
+    unpack,
+)
+from lidarpool.columns.storage import Storage
+from lidarpool.columns.table import OPTIONAL, stored
+
+COLUMNS = stored(OPTIONAL)
+ORIGIN = np.array([500_000.0, 5_400_000.0, 300.0])
+PRECISION_M = 0.01
+
+
+def part_of(first, counts, seed=0, columns=COLUMNS):
+    """A part with any values in its columns."""
+    rng = np.random.default_rng((seed, first))
+    counts = np.array(counts, np.int64)
+    made = {c.name: rng.integers(0, 200, counts.sum()).astype(c.dtype) for c in columns}
+    triangles = np.unique(rng.integers(0, 50, 5)).astype(np.int32)
+    return PartColumns(first, counts, made, triangles, np.arange(1, len(triangles) + 1))
+
+
+def equal(one, other):
+    return (
+        (one.first, one.stop, len(one)) == (other.first, other.stop, len(other))
+        and list(one.columns) == list(other.columns)
+        and all(
+            a.dtype == b.dtype and np.array_equal(a, b)
+            for a, b in (
+                (one.counts, other.counts),
+                (one.triangles, other.triangles),
+                (one.hits, other.hits),
+                *((one.columns[name], other.columns[name]) for name in one.columns),
+            )
+        )
+    )
+
+
+# -- files ----------------------------------------------------------------------------------------
+
+
+@settings(max_examples=50)
+@given(st.integers(0, 10**6), st.lists(st.integers(0, 7), min_size=1, max_size=6))
+def test_what_is_packed_comes_back(first, counts):
+    part = part_of(first, counts)
+    data = bytes(pack(part))
+    assert equal(unpack(data), part)
+    assert bytes(pack(unpack(data))) == data
+    assert part.stop == first + len(counts)
+    scans = part.scan_column()
+    assert scans.dtype == np.int32
+    assert scans.tolist() == [s for s, n in enumerate(counts, first) for _ in range(n)]
+    if len(part):
+        axes = np.stack([part.columns[axis] for axis in "xyz"], axis=1)
+        assert part.cells.tolist() == [axes.min(axis=0).tolist(), axes.max(axis=0).tolist()]
+    else:
+        assert part.cells is None
+
+
+def test_numpy_opens_a_part():
+    part = part_of(7, [2, 0, 3])
+    with np.load(io.BytesIO(pack(part)), allow_pickle=False) as archive:
+        names = [".scans", ".counts", ".triangles", ".hits", *(c.name for c in COLUMNS)]
+        assert archive.files == names
+        assert archive[".scans"].tolist() == [7, 10]
+        assert archive[".counts"].tolist() == [2, 0, 3]
+        assert archive["time"].dtype == np.int64
+
+
+def test_columns_that_are_not_contiguous_are_packed_as_they_read():
+    part = part_of(0, [4])
+    wide = {name: np.repeat(values, 2)[::2] for name, values in part.columns.items()}
+    again = PartColumns(0, part.counts, wide, part.triangles, part.hits)
+    assert bytes(pack(again)) == bytes(pack(part))
+
+
+SMALL = part_of(3, [1, 2], columns=COLUMNS[:4])
+
+
+def test_damage_at_any_place_is_noticed_or_changes_nothing():
+    data = bytes(pack(SMALL))
+    noticed = 0
+    for place in range(len(data)):
+        # Each bit somewhere, and digits of the headers of arrays become others.
+        for flip in {1 << place % 8, 6, 0xFF}:
+            damaged = bytearray(data)
+            damaged[place] ^= flip
+            try:
+                assert equal(unpack(bytes(damaged)), SMALL), (place, flip)
+            except LidarpoolError as error:
+                noticed += 1
+                assert str(error).startswith("it is damaged (")
+    assert noticed > len(data)
+
+
+def test_a_cut_part_is_noticed_wherever_it_was_cut():
+    data = bytes(pack(SMALL))
+    for length in range(len(data)):
+        with pytest.raises(LidarpoolError, match="it is damaged"):
+            unpack(data[:length])
+
+
+@pytest.mark.parametrize(
+    "arrays",
+    [
+        {"x": np.zeros(2)},
+        {".scans": np.array([3, 9])},
+        {".scans": np.array(3)},
+        {".scans": np.array([3, 4, 5])},
+        {".counts": np.array([1, 2, 1])},
+        {".counts": np.array([4, -1])},
+        {".counts": np.array([[1, 2]])},
+        {".hits": np.zeros(1)},
+        {"x": np.array([{}, {}, {}])},
+        {".hits": None},
+    ],
+    ids=str,
+)
+def test_arrays_that_do_not_fit_together(arrays):
+    with np.load(io.BytesIO(pack(SMALL))) as archive:
+        content = {name: archive[name] for name in archive.files} | arrays
+    memory = io.BytesIO()
+    np.savez(memory, **{name: array for name, array in content.items() if array is not None})
+    with pytest.raises(LidarpoolError, match="it is damaged"):
+        unpack(memory.getvalue())
+
+
+@pytest.fixture(params=["folder", "memory"])
+def storage(request, tmp_path):
+    if request.param == "folder":
+        place = Storage.at(tmp_path / "parts")
+    else:
+        place = Storage.at(f"memory://{request.node.name}-{tmp_path.name}/parts")
+    place.prepare()
+    yield place
+    place.remove(list(place.sizes()))
+
+
+def test_a_part_in_storage(storage):
+    storage.write("a.npz", pack(SMALL))
+    assert equal(read_part(storage, "a.npz"), SMALL)
+    triangles, hits = read_tally(storage, "a.npz")
+    assert np.array_equal(triangles, SMALL.triangles) and np.array_equal(hits, SMALL.hits)
+
+
+@pytest.mark.parametrize("read", [read_part, read_tally])
+def test_a_part_that_cannot_be_read_is_named(storage, read):
+    with pytest.raises(LidarpoolError, match=r"The part .*none\.npz cannot be"):
+        read(storage, "none.npz")
+    storage.write("cut.npz", bytes(pack(SMALL))[:-30])
+    with pytest.raises(LidarpoolError, match=r"The part .*cut\.npz cannot be used.*start it anew"):
+        read(storage, "cut.npz")
+
+
+# -- clouds ---------------------------------------------------------------------------------------
+
+
+def stored_cloud(storage, counts):
+    """Write a part for each list of counts; the cloud, and its parts."""
+    parts, first = [], 0
+    for number, of_scans in enumerate(counts):
+        parts.append(part_of(first, of_scans))
+        storage.write(f"{number}{SUFFIX}", pack(parts[-1]))
+        first = parts[-1].stop
+    found = [part.cells for part in parts if part.cells is not None]
+    cells = None
+    if found:
+        table = np.array(found)
+        cells = np.stack([table[:, 0].min(axis=0), table[:, 1].max(axis=0)])
+    names = [f"{number}{SUFFIX}" for number in range(len(parts))]
+    rows = [len(part) for part in parts]
+    cloud = StoredCloud(storage, names, rows, COLUMNS, cells, PRECISION_M, ORIGIN)
+    return cloud, parts
+
+
+def same(one, other):
+    return (
+        np.array_equal(one.positions, other.positions)
+        and list(one.columns) == list(other.columns)
+        and all(
+            one[name].dtype == other[name].dtype and np.array_equal(one[name], other[name])
+            for name in one.columns
+        )
+    )
+
+
+counts_of_parts = st.lists(
+    st.lists(st.integers(0, 5), min_size=1, max_size=3), min_size=0, max_size=5
+)
+
+
+@settings(max_examples=40)
+@given(counts_of_parts, st.integers(1, 30))
+def test_a_cloud_is_the_same_however_it_is_divided(tmp_path_factory, counts, points):
+    storage = Storage.at(tmp_path_factory.mktemp("parts"))
+    cloud, parts = stored_cloud(storage, counts)
+    whole = cloud.load()
+    assert len(whole) == len(cloud) == sum(map(len, parts))
+    assert whole.scan.tolist() == [s for part in parts for s in part.scan_column().tolist()]
+    assert [c.name for c in whole.table] == [c.name for c in cloud.table]
+    assert cloud.table[0].name == "scan" and "x" not in whole.columns
+    for name in ("channel", "time", "triangle"):
+        values = [v for part in parts for v in part.columns[name].tolist()]
+        assert whole[name].tolist() == values
+    assert np.array_equal(whole.bounds, cloud.bounds)
+    chunks = list(cloud.chunks(points))
+    assert all(len(chunk) == points for chunk in chunks[:-1])
+    assert len(chunks) == -(-len(cloud) // points)
+    assert not chunks or same(Cloud.joined(chunks), whole)
+
+
+def test_a_cloud_in_parts_is_small_to_send(storage):
+    cloud, _ = stored_cloud(storage, [[3, 4], [2]])
+    data = pickle.dumps(cloud)
+    assert len(data) < 5000
+    assert same(pickle.loads(data).load(), cloud.load())
+
+
+def test_a_sample_is_of_the_cloud_and_in_its_order(storage):
+    cloud, _ = stored_cloud(storage, [[40], [0, 0], [7, 90], [1], [0], [62]])
+    whole = cloud.load()
+    rows = {tuple(p): i for i, p in enumerate(np.c_[whole.positions, whole.time])}
+
+    def picked(most, parts=256):
+        some, count = cloud.sample(one_of_each_part, most, parts)
+        assert count == 200
+        found = [rows[tuple(p)] for p in np.c_[some.positions, some.time]]
+        assert found == sorted(found)
+        return some, found
+
+    assert same(picked(1000)[0], whole)
+    _, found = picked(50)
+    assert len(found) == 50 and max(np.diff(found)) < 9, "from all of it"
+    _, found = picked(50, parts=2)
+    opened = np.searchsorted([40, 137, 138, 200], found, "right")
+    assert 0 < len(found) <= 50 and len(set(opened)) <= 2
+    none, count = stored_cloud(storage, [[0], [0, 0]])[0].sample(one_of_each_part, 10)
+    assert (len(none), count) == (0, 0) and none.table[0].name == "scan"
+
+
+def test_a_cloud_whose_part_is_lost_says_so(storage):
+    cloud, _ = stored_cloud(storage, [[3], [4]])
+    storage.remove(["1.npz"])
+    with pytest.raises(LidarpoolError, match=r"1\.npz cannot be read"):
+        cloud.load()
+
+
+@pytest.mark.parametrize("precision", [1e-6, 1e-3, 0.01, 0.05, 0.07, 0.25, 1.0, 1000.0])
+def test_positions_are_the_short_decimals_that_are_meant(precision):
+    cells = np.arange(-1000, 1000)[:, None] * np.ones(3, int)
+    found = positions(cells, precision, np.zeros(3))[:, 0]
+    assert [repr(abs(float(x))) for x in found] == [
+        repr(abs(float(f"{c * precision:.9g}"))) for c in range(-1000, 1000)
+    ]

@@ -1,0 +1,173 @@
+"""Scans as a worker casts them, against rays that are made one by one and cast by themselves."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.lidarpool.carts import Cart
+
+from lidarpool import Beams, Column, Pose, Scene, Sensor, Spin, Survey
+from lidarpool.scan.failures import naming_scans
+from lidarpool.scan.rig import Rig, RigPlan
+from lidarpool.scenario.sampling import sample_survey
+from lidarpool.scene.shapes import seed_objects
+from poolpart import WorkerLeft
+from raybeam import RayCaster
+
+ELEVATIONS = np.radians([-20, -5, 0, 12])
+BEAMS = Beams(
+    ELEVATIONS,
+    azimuth=np.radians([0, 1.5, 0, -1.5]),
+    time_ns=[0, 50_000, 100_000, 150_000],
+    origin=[[0.1, 0, 0], [0.1, 0.02, 0], [0.1, -0.02, 0], [0.1, 0, 0.05]],
+)
+TURNED = (Pose((0, 0, 1), 10, 5, -3), Pose((3, -2, 2)))
+
+
+def grazing(returns):
+    """A column of one's own: how flat a ray meets its triangle, degrees."""
+    return 90 - np.degrees(np.arccos(returns.intensity))
+
+
+OWN = Column("grazing", "float32", "deg", "angle between ray and triangle", grazing)
+COLUMNS = ("ray", "time", "azimuth", "elevation", "range", "intensity", "triangle", OWN)
+
+
+def survey(beams=BEAMS, per_turn=90, **options):
+    sensor = Sensor(beams, Spin(per_turn, step_deg=30, rate_hz=10), 0.5, 40)
+    return Survey(sensor, steps=14, keep_every=3, columns=COLUMNS, **options)
+
+
+SURVEYS = {
+    "beams without offsets": survey(Beams(ELEVATIONS), poses=TURNED),
+    "beams with offsets": survey(poses=TURNED),
+    "turns of no whole number": survey(per_turn=90.449, poses=TURNED),
+    "on the move": survey(trajectory=Cart()),
+    "on the move, no whole number": survey(per_turn=90.449, trajectory=Cart(yaw_rate_deg=-700)),
+}
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return Scene.from_meshes(seed_objects(rings=8, segments=12))
+
+
+def about_z(angle):
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+
+
+def rays_of_scan(survey, scan):
+    """Origins, directions in the scene and in the sensor, and times of a scan's rays."""
+    head, beams, spec = survey.sensor.head, survey.sensor.beams, survey.scan(scan)
+    rows = []
+    for firing in range(*spec.firings):
+        azimuth = 2 * np.pi * firing / head.firings_per_turn
+        begun = firing * 1e9 / (head.rate_hz * head.firings_per_turn)
+        pose = survey.path.pose(spec.station, begun)
+        rotation = np.eye(3) if pose.rotation is None else pose.rotation
+        for k, elevation in enumerate(beams.elevation):
+            about = about_z(azimuth + beams.azimuth[k])
+            looks = about @ [np.cos(elevation), 0, np.sin(elevation)]
+            origin = pose.position + rotation @ about_z(azimuth) @ beams.origin[k]
+            time = spec.start_ns + begun + beams.time_ns[k]
+            rows.append((origin, rotation @ looks, looks, time, k))
+    return [np.array(column) for column in zip(*rows, strict=True)]
+
+
+@pytest.mark.parametrize("name", SURVEYS)
+def test_what_is_cast_is_what_each_ray_by_itself_meets(name, scene):
+    survey = SURVEYS[name]
+    caster = RayCaster(scene.vertices, scene.faces, backend="numpy")
+    batches = list(Rig(RigPlan(scene, survey, "numpy")).cast(0, survey.scan_count))
+    assert [len(batch.specs) for batch in batches] == [14, 14], "a batch for each station"
+    scans = 0
+    for batch in batches:
+        made = {c.name: c.make(batch) for c in survey.stored_columns}
+        tally = np.zeros(len(scene.faces), int)
+        for spec, stop in zip(batch.specs, np.cumsum(batch.counts), strict=True):
+            origins, directions, looks, times, channels = rays_of_scan(survey, spec.scan)
+            found = caster.cast(origins, directions, 0.5, 40)
+            tally += np.bincount(found.triangle[found.hit], minlength=len(tally))
+            kept = np.flatnonzero(found.hit)[::3]
+            mine = slice(stop - len(kept), stop)
+            assert np.array_equal(made["ray"][mine], kept)
+            assert np.array_equal(made["channel"][mine], channels[kept])
+            assert np.array_equal(made["triangle"][mine], found.triangle[kept])
+            assert np.array_equal(made["object"][mine], scene.face_object[found.triangle[kept]])
+            assert np.abs(made["time"][mine] - times[kept]).max(initial=0) <= 1
+            assert np.allclose(made["range"][mine], found.distance[kept], atol=1e-5)
+            ends = origins[kept] + directions[kept] * found.distance[kept, None]
+            cells = np.stack([made[axis][mine] for axis in "xyz"], axis=1)
+            assert np.abs(cells * 0.01 - ends).max(initial=0) <= 0.005 + 1e-6
+            assert np.allclose(batch.positions[mine], ends, atol=1e-6)
+            x, y, z = looks[kept].T
+            turned = (made["azimuth"][mine] - np.degrees(np.arctan2(y, x)) + 180) % 360 - 180
+            assert np.allclose(turned, 0, atol=1e-3)
+            assert np.allclose(made["elevation"][mine], np.degrees(np.arcsin(z)), atol=1e-4)
+            corners = scene.vertices[scene.faces[found.triangle[kept]]]
+            normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+            cosines = np.abs((normals * directions[kept]).sum(axis=1))
+            assert np.allclose(made["intensity"][mine], cosines, atol=1e-5)
+            angles = 90 - np.degrees(np.arccos(cosines))
+            assert np.allclose(made["grazing"][mine], angles, atol=0.05)
+            scans += 1
+        assert np.array_equal(batch.found.tally, tally), "all hits, and not only those kept"
+        assert np.array_equal(batch.scan, np.repeat([s.scan for s in batch.specs], batch.counts))
+        assert len(batch) == batch.counts.sum() > 0
+    assert scans == survey.scan_count
+
+
+@pytest.mark.parametrize("name", SURVEYS)
+def test_however_scans_are_batched_their_columns_have_the_same_bits(name, scene):
+    survey = SURVEYS[name]
+    rig = Rig(RigPlan(scene, survey, "numpy"))
+
+    def columns(cuts):
+        spans = itertools.pairwise(cuts)
+        batches = [batch for span in spans for batch in rig.cast(*span)]
+        return [
+            np.concatenate([column.make(batch) for batch in batches]).tobytes()
+            for column in survey.stored_columns
+        ]
+
+    whole = columns([0, survey.scan_count])
+    assert columns([0, 1, 5, 14, 17, 28]) == whole
+    assert columns(list(range(29))) == whole
+
+
+@pytest.mark.parametrize("name", ["beams with offsets", "on the move"])
+def test_a_sample_of_all_rays_counts_what_a_survey_gives(name, scene):
+    survey = SURVEYS[name]
+    batches = list(Rig(RigPlan(scene, survey, "numpy")).cast(0, survey.scan_count))
+    sample = sample_survey(scene, survey, "numpy")
+    assert sample.rays == survey.ray_count and sample.behind == ()
+    assert sample.hits == sum(batch.found.hits.sum() for batch in batches)
+    assert sample.points == sum(map(len, batches))
+
+
+def test_of_a_moving_survey_that_is_long_some_rays_tell(scene):
+    """Stations differ in what they see, and so do the scans of a station."""
+    long = replace(SURVEYS["on the move"], steps=1800, keep_every=1)
+    sample = sample_survey(scene, long, "numpy")
+    assert sample.rays < long.ray_count / 5
+    batches = Rig(RigPlan(scene, long, "numpy")).cast(0, long.scan_count)
+    assert sample.hits == pytest.approx(sum(b.found.hits.sum() for b in batches), rel=0.1)
+
+
+class TestNamingScans:
+    def test_what_fails_is_told_with_its_scans(self):
+        with (
+            pytest.raises(RuntimeError, match=r"scans 3 to 5: ValueError: bad"),
+            naming_scans(3, 5),
+        ):
+            raise ValueError("bad")
+
+    def test_a_worker_that_leaves_is_not_a_failure_of_its_scans(self):
+        """The driver casts those elsewhere, and would end the run at any other error."""
+        with pytest.raises(WorkerLeft), naming_scans(3, 5):
+            raise WorkerLeft("the worker has left")

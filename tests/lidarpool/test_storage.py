@@ -1,0 +1,123 @@
+"""Where parts are: a folder, or what fsspec opens; a file is there whole or not at all."""
+
+from __future__ import annotations
+
+import pickle
+import sys
+import threading
+
+import pytest
+
+from lidarpool import LidarpoolError
+from lidarpool.columns.storage import Storage
+
+
+@pytest.fixture(params=["folder", "memory"])
+def storage(request, tmp_path):
+    if request.param == "folder":
+        place = Storage.at(tmp_path / "a" / "b")
+    else:
+        place = Storage.at(f"memory://{request.node.name}-{tmp_path.name}/b/")
+    yield place
+    place.remove(list(place.sizes()))
+
+
+def test_files_come_and_go(storage):
+    assert storage.sizes() == {}
+    storage.prepare()
+    storage.prepare()
+    assert storage.sizes() == {}
+    storage.write("one", b"12345")
+    storage.write("two", [b"ab", memoryview(b"c"), bytearray(b"d"), b""])
+    storage.write("none", b"")
+    assert storage.sizes() == {"one": 5, "two": 4, "none": 0}
+    assert storage.read("two") == b"abcd"
+    storage.write("one", b"another")
+    assert storage.read("one") == b"another"
+    storage.remove(["one", "none", "never there"])
+    assert storage.sizes() == {"two": 4}
+    assert storage.path("two").endswith("/b/two")
+
+
+def test_another_process_may_see_the_same_place(storage):
+    storage.prepare()
+    storage.write("here", b"token")
+    there = pickle.loads(pickle.dumps(storage))
+    assert there == storage and len(pickle.dumps(storage)) < 500
+    assert there.sees("here", b"token")
+    assert not there.sees("here", b"another")
+    assert not there.sees("gone", b"token")
+    assert not Storage("nonsense://a/b").sees("here", b"token")
+
+
+def test_a_file_that_is_not_there(storage):
+    storage.prepare()
+    with pytest.raises(FileNotFoundError):
+        storage.read("none")
+
+
+def test_a_file_is_whole_or_not_there(storage):
+    """As long as it is written, nothing of it is seen under its name."""
+    storage.prepare()
+    seen, done = set(), threading.Event()
+
+    def look():
+        while not done.is_set():
+            seen.update((n, s) for n, s in storage.sizes().items() if n.endswith(".npz"))
+
+    watcher = threading.Thread(target=look)
+    watcher.start()
+    try:
+        for number in range(30):
+            storage.write(f"{number}.npz", [b"x" * 10_000] * 10)
+    finally:
+        done.set()
+        watcher.join()
+    assert {size for _, size in seen} <= {100_000}
+    assert storage.sizes() == {f"{number}.npz": 100_000 for number in range(30)}
+
+
+def test_a_write_that_fails_leaves_nothing(tmp_path):
+    storage = Storage.at(tmp_path)
+    storage.write("a", b"before")
+    with pytest.raises(TypeError):
+        storage.write("a", [b"half", "no bytes"])
+    assert storage.read("a") == b"before"
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+def test_a_folder_that_is_not_there(tmp_path):
+    storage = Storage.at(tmp_path / "none")
+    with pytest.raises(FileNotFoundError):
+        storage.write("a", b"")
+    storage.remove(["a"])
+    storage.remove_folder()
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError):
+        Storage.at(tmp_path / "file" / "below").prepare()
+
+
+def test_only_an_empty_folder_is_removed(tmp_path):
+    storage = Storage.at(tmp_path / "parts")
+    storage.prepare()
+    storage.write("a", b"")
+    storage.remove_folder()
+    assert storage.sizes() == {"a": 0}
+    storage.remove(["a"])
+    storage.remove_folder()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_path_is_made_absolute_and_a_url_is_left(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    here, there = Storage.at("parts"), Storage.at("s3://bucket/a/")
+    assert here.url == str(tmp_path / "parts") and here.is_local
+    assert there.url == "s3://bucket/a" and not there.is_local
+
+
+@pytest.mark.parametrize("url", ["nonsense://a/b", "gs://bucket/folder"])
+def test_a_storage_whose_library_is_missing_says_so(url, monkeypatch):
+    monkeypatch.setitem(sys.modules, "gcsfs", None)
+    for use in (Storage.prepare, Storage.sizes, lambda s: s.read("a"), lambda s: s.write("a", b"")):
+        with pytest.raises(LidarpoolError, match=f"{url} cannot be opened: .*[^.][.]$"):
+            use(Storage.at(url))

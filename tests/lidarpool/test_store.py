@@ -1,0 +1,336 @@
+"""What a run keeps in its folder, and under which terms a later run goes on from it."""
+
+from __future__ import annotations
+
+import gc
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lidarpool import LidarpoolError, Planning, Scene, Sensor, Survey, remove_run
+from lidarpool.columns.parts import PartColumns, pack
+from lidarpool.plan import run_trial
+from lidarpool.run.identity import Identity
+from lidarpool.run.job import Job
+from lidarpool.run.store import COMMAND_TERMS, RunStore
+from lidarpool.scan.messages import Receipt, samples_of_scan, summary_type
+from lidarpool.scene.shapes import seed_objects
+
+SCENE = Scene.from_meshes(seed_objects(rings=4, segments=6))
+SURVEY = Survey(Sensor.grid(layers=2), poses=[(0, 0, 1)], steps=6, columns=["time"])
+PLANNING = Planning((0, 0), (9, 1), [(5, 0)], 1.0, trials=2, particles=10, iterations=5)
+JOB = Job(SCENE, SURVEY)
+
+
+def add(store, first, stop, name="", rows=3, number=0):
+    """Write a part of scans, with `rows` points of each, and commit it."""
+    rng = np.random.default_rng(first)
+    counts = np.full(stop - first, rows)
+    columns = {
+        c.name: rng.integers(0, 2, counts.sum()).astype(c.dtype)
+        for c in store.job.survey.stored_columns
+    }
+    triangles = np.array([first, stop], np.int32)
+    part = PartColumns(first, counts, columns, triangles, np.array([1, 2]))
+    data, name = bytes(pack(part)), name or f"{first}-{number}.npz"
+    store.storage.prepare()
+    store.storage.write(name, data)
+    kind = summary_type(samples_of_scan(store.job.survey.scan_count))
+    summaries = np.zeros(stop - first, kind)
+    summaries["samples"] = [first, 0, 0]
+    cells = part.cells
+    receipt = Receipt(
+        0, first, stop, name, len(part), len(data), 3,
+        () if cells is None else tuple(cells.ravel().tolist()), summaries.tobytes(),
+    )  # fmt: skip
+    return store.db.commit([receipt])
+
+
+def names(folder):
+    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return tmp_path / "run"
+
+
+@pytest.fixture
+def unfinished(folder):
+    """A folder in which a run has left four of six scans."""
+    store = RunStore(JOB, folder)
+    store.backend = "numpy"
+    add(store, 0, 2)
+    add(store, 3, 5)
+    store.db.close()
+    return folder
+
+
+# -- one run --------------------------------------------------------------------------------------
+
+
+def test_a_run_from_its_beginning_to_its_end(folder):
+    store = RunStore(JOB, folder)
+    assert (store.kept, store.complete, store.resumed) == ("", False, 0)
+    add(store, 2, 6)
+    assert store.kept == "4 of 6 scans" and store.progress().points == 12
+    add(store, 0, 2)
+    store.db.frames = 6
+    assert store.complete
+    cloud = store.points().load()
+    assert cloud.scan.tolist() == np.repeat(np.arange(6), 3).tolist()
+    assert len(store.points()) == 18 == store.db.point_count
+    for scan in range(6):
+        points = store.points_of_scan(scan)
+        assert set(points.scan) == {scan} and "time" in points.columns
+        assert np.array_equal(points.positions, cloud.positions[3 * scan : 3 * scan + 3])
+    hits = store.hit_counts()
+    assert hits.shape == (len(SCENE.faces),)
+    assert hits[[0, 2, 6]].tolist() == [1, 3, 2] and hits.sum() == 6
+    rays = store.sample_rays()
+    assert rays.shape[1:] == (2, 3) and set(rays[:, 1, 0]) == {0, 2}
+    assert set(map(tuple, rays[:, 0].tolist())) == {(0, 0, 1)}
+    store.remove()
+    assert not folder.exists()
+
+
+def test_parts_that_no_receipt_names_are_removed_in_the_end(folder):
+    store = RunStore(JOB, folder)
+    add(store, 0, 2)
+    store.storage.write("stray.npz", b"of a collector that died")
+    store.storage.write("notes.txt", b"somebody else's")
+    store.tidy()
+    assert store.storage.sizes().keys() == {"0-0.npz", "notes.txt"}
+
+
+def test_without_a_folder_all_goes_with_the_last_user_of_the_points():
+    store = RunStore(JOB)
+    add(store, 0, 6)
+    points, folder = store.points(), store.folder
+    del store
+    gc.collect()
+    assert len(points.load()) == 18
+    del points
+    gc.collect()
+    assert not folder.exists()
+
+
+def test_a_folder_whose_parent_is_not_there(tmp_path):
+    with pytest.raises(LidarpoolError, match="make the one that it lies in first"):
+        RunStore(JOB, tmp_path / "none" / "run")
+
+
+# -- a later run ----------------------------------------------------------------------------------
+
+
+def test_an_unfinished_run_is_not_run_over(unfinished):
+    before = names(unfinished)
+    with pytest.raises(LidarpoolError) as refused:
+        RunStore(JOB, unfinished)
+    assert str(refused.value) == (
+        f"{unfinished} holds an unfinished run, 4 of 6 scans: continue it with resume=True, or "
+        "drop it with remove_run()."
+    )
+    with pytest.raises(LidarpoolError, match="continue it with --resume, or drop it with --fresh"):
+        RunStore(JOB, unfinished, terms=COMMAND_TERMS)
+    assert names(unfinished) == before
+
+
+def test_it_is_gone_on_with(unfinished):
+    store = RunStore(replace(JOB, backend="auto"), unfinished, resume=True)
+    assert (store.resumed, store.backend, store.notes) == (4, "numpy", [])
+    assert store.db.missing(0, 6) == [(2, 3), (5, 6)]
+    assert "were cast with it" in store.advice
+    store.db.close()
+    RunStore(replace(JOB, backend="numpy"), unfinished, resume=True).db.close()
+
+
+def test_another_backend_cannot_go_on(unfinished):
+    with pytest.raises(LidarpoolError, match=r"'embree' is asked for, .* cast with 'numpy'"):
+        RunStore(replace(JOB, backend="embree"), unfinished, resume=True)
+
+
+OTHERS = {
+    "survey": replace(JOB, survey=replace(SURVEY, keep_every=1)),
+    "sensor": replace(JOB, survey=replace(SURVEY, sensor=Sensor.grid(layers=3))),
+    "columns": replace(JOB, survey=replace(SURVEY, columns=["range"])),
+    "poses": replace(JOB, survey=replace(SURVEY, poses=[(0, 0, 2)], trajectory=None)),
+    "scene": replace(JOB, scene=Scene.from_meshes(seed_objects(rings=4, segments=7))),
+    "planning": replace(JOB, planning=PLANNING),
+}
+
+
+@pytest.mark.parametrize("other", OTHERS)
+def test_another_run_cannot_go_on(other, unfinished):
+    what = other if other in ("scene", "planning") else "survey"
+    for resume in (True, False):
+        with pytest.raises(LidarpoolError, match=f"cannot be continued, it is of another {what}"):
+            RunStore(OTHERS[other], unfinished, resume=resume)
+    remove_run(unfinished)
+    RunStore(OTHERS[other], unfinished).db.close()
+
+
+def test_another_version_cannot_go_on(unfinished, monkeypatch):
+    here = Identity.of(JOB)
+    later = replace(here, versions={**here.versions, "numpy": "99.0"})
+    monkeypatch.setattr(Identity, "of", lambda job: later)
+    with pytest.raises(LidarpoolError, match=r"it was written with numpy 2\S+, here it is 99\.0"):
+        RunStore(JOB, unfinished, resume=True)
+
+
+def test_a_run_that_has_kept_nothing_is_in_nobodys_way(folder):
+    RunStore(JOB, folder).db.close()
+    store = RunStore(OTHERS["scene"], folder)
+    assert store.resumed == 0
+    store.db.close()
+    RunStore(OTHERS["scene"], folder).db.close()
+
+
+def test_how_jobs_are_run_is_no_part_of_what_they_are(unfinished):
+    other = replace(JOB, collectors=5, queue_capacity=3, scans_per_second=2.0, patience_s=1.0)
+    RunStore(other, unfinished, resume=True).db.close()
+
+
+def test_trials_are_gone_on_with_too(folder):
+    job = replace(JOB, planning=PLANNING)
+    store = RunStore(job, folder)
+    store.db.add_trial(run_trial(PLANNING, 1))
+    assert store.kept == "1 of 2 planning trials"
+    store.db.close()
+    again = RunStore(job, folder, resume=True)
+    assert [trial.trial for trial in again.db.trials] == [1] and not again.complete
+
+
+@pytest.mark.parametrize("damage", ["missing", "cut", "longer", "all"])
+def test_parts_that_are_not_whole_are_made_again(damage, unfinished):
+    part = unfinished / "parts" / "3-0.npz"
+    if damage == "cut":
+        part.write_bytes(part.read_bytes()[:-1])
+    elif damage == "longer":
+        part.write_bytes(part.read_bytes() + b"\0")
+    else:
+        part.unlink()
+    if damage == "all":
+        (unfinished / "parts" / "0-0.npz").unlink()
+        (unfinished / "parts").rmdir()
+    store = RunStore(JOB, unfinished, resume=True)
+    lost = 4 if damage == "all" else 2
+    assert store.resumed == 4 - lost
+    (note,) = store.notes
+    assert note.startswith(f"{lost} scans were made again: their parts were missing or cut short")
+    if lost == 2:
+        assert store.db.missing(0, 6) == [(2, 6)]
+    assert add(store, 3, 5, number=1)
+    store.tidy()
+    assert set(store.points().names) == store.storage.sizes().keys()
+
+
+# -- parts in another place -----------------------------------------------------------------------
+
+
+@pytest.fixture(params=["folder", "memory"])
+def place(request, tmp_path):
+    if request.param == "folder":
+        return str(tmp_path / "elsewhere")
+    return f"memory://{request.node.name}-{tmp_path.name}"
+
+
+def test_parts_elsewhere_stay_when_the_run_is_done(folder, place):
+    store = RunStore(JOB, folder, place)
+    add(store, 0, 6)
+    assert names(folder) <= {"run.db", "run.db-journal"}
+    points = store.points()
+    store.remove()
+    assert not folder.exists()
+    assert len(points.load()) == 18
+
+
+def test_a_place_that_holds_others_parts_is_refused(folder, place):
+    store = RunStore(JOB, folder, place)
+    add(store, 0, 6)
+    store.remove()
+    with pytest.raises(LidarpoolError, match=r"holds the parts of another run \(0-0\.npz, …\)"):
+        RunStore(JOB, folder, place)
+    assert store.storage.sizes().keys() == {"0-0.npz"}
+    assert not folder.exists()
+
+
+def test_a_run_that_was_killed_early_does_not_make_others_parts_its_own(folder, place, tmp_path):
+    theirs = RunStore(JOB, tmp_path / "theirs", place)
+    add(theirs, 0, 6)
+    for job in (JOB, OTHERS["scene"]):
+        if folder.exists():
+            remove_run(folder)
+        RunStore(JOB, folder).db.close()  # killed before its first part
+        with pytest.raises(LidarpoolError, match="holds the parts of another run"):
+            RunStore(job, folder, place)
+    assert len(theirs.points().load()) == 18
+
+
+def test_a_run_that_was_killed_early_may_begin_again_in_its_place(folder, place):
+    store = RunStore(JOB, folder, place)
+    store.storage.prepare()
+    store.storage.write("uncommitted.npz", b"")
+    store.db.close()
+    again = RunStore(JOB, folder, place)
+    add(again, 0, 6)
+    again.tidy()
+    assert again.storage.sizes().keys() == {"0-0.npz"}
+
+
+def test_a_run_is_gone_on_with_in_the_place_of_its_parts_only(folder, place):
+    store = RunStore(JOB, folder, place)
+    add(store, 0, 4)
+    store.db.close()
+    with pytest.raises(LidarpoolError, match=r"has its parts in .*: give that place, or drop"):
+        RunStore(JOB, folder, resume=True)
+    assert RunStore(JOB, folder, place, resume=True).resumed == 4
+
+
+def test_leftovers_in_the_runs_own_folder_are_cleared_away(folder):
+    (folder / "parts").mkdir(parents=True)
+    (folder / "parts" / "old.npz").write_bytes(b"")
+    store = RunStore(JOB, folder)
+    assert store.storage.sizes() == {}
+
+
+# -- errors ---------------------------------------------------------------------------------------
+
+
+def test_an_error_tells_how_to_go_on(folder):
+    store = RunStore(JOB, folder, terms=COMMAND_TERMS)
+    add(store, 0, 2)
+    store.db.frames = 1
+    with pytest.raises(KeyboardInterrupt) as caught, store.kept_on_error():
+        raise KeyboardInterrupt
+    assert caught.value.__notes__ == [f"2 of 6 scans are kept in {folder}: continue with --resume."]
+    again = RunStore(JOB, folder, resume=True)
+    assert (again.resumed, again.db.frames) == (2, 1)
+
+
+def test_an_error_before_anything_was_kept_leaves_nothing(folder):
+    store = RunStore(JOB, folder)
+    store.storage.prepare()
+    store.storage.write("stray.npz", b"")
+    with pytest.raises(ValueError, match="bad") as caught, store.kept_on_error():
+        raise ValueError("bad")
+    assert not hasattr(caught.value, "__notes__") and not folder.exists()
+
+
+def test_an_error_after_all_was_removed_is_left_alone(folder):
+    store = RunStore(JOB, folder)
+    add(store, 0, 2)
+    with pytest.raises(ValueError, match="late") as caught, store.kept_on_error():
+        store.remove()
+        raise ValueError("late")
+    assert not hasattr(caught.value, "__notes__")
+
+
+def test_removing_a_run_leaves_what_is_not_its_own(unfinished):
+    (unfinished / "report.json").write_text("{}")
+    (unfinished / "parts" / "notes.txt").write_text("mine")
+    (unfinished / "parts" / ".tmp-5.npz-1a2b").write_text("half")
+    remove_run(unfinished)
+    remove_run(unfinished)
+    assert names(unfinished) == {"report.json", "parts/notes.txt"}

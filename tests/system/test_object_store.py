@@ -1,0 +1,139 @@
+"""Parts in an object store that speaks S3."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lidarpool.columns.parts import unpack
+from lidarpool.columns.storage import Storage
+
+pytest.importorskip("s3fs", reason="parts in an object store need s3fs")
+server = pytest.importorskip("moto.server", reason="the object store of these tests is moto's")
+
+BUCKET = "s3://surveys"
+# Of the default survey, with Embree as well as with NumPy.
+CLOUD_SHA256 = "9012bcbf7aa44d9d07c95fae78e707887c40225f1bde1fcb304c674c220c0228"
+SCENARIO = "planning: {enabled: false}\n"
+
+
+@pytest.fixture(scope="module")
+def environment() -> Iterator[dict[str, str]]:
+    """A server with a bucket; what whoever uses it needs to know."""
+    store = server.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    store.start()
+    host, port = store.get_host_and_port()
+    environment = {
+        "AWS_ENDPOINT_URL": f"http://{host}:{port}",
+        "AWS_ACCESS_KEY_ID": "anybody",
+        "AWS_SECRET_ACCESS_KEY": "anything",
+        "AWS_DEFAULT_REGION": "us-east-1",
+    }
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in environment.items():
+            patch.setenv(name, value)
+        Storage.at(BUCKET).prepare()
+        yield environment
+    store.stop()
+
+
+@pytest.fixture(scope="module")
+def cluster_there(environment, outside) -> Any:
+    """A cluster whose workers know of the server."""
+    cluster = outside()
+    cluster.add("GPU", **environment)
+    cluster.add("LIDAR", slots=4, **environment)
+    cluster.wait()
+    return cluster
+
+
+@pytest.fixture
+def run(cluster_there, lidarpool, tmp_path) -> Callable[..., Any]:
+    """Run the default survey without planning, with its parts in a folder of the bucket."""
+    (tmp_path / "s.yaml").write_text(SCENARIO)
+
+    def run(folder: str, *options: str) -> Any:
+        return lidarpool(
+            "run", tmp_path / "s.yaml", "--out", tmp_path / "out", "--only", "cloud", "-q",
+            "--scheduler", cluster_there.address, "--parts", f"{BUCKET}/{folder}", *options,
+        )  # fmt: skip
+
+    return run
+
+
+def check(out: Path, folder: str) -> dict[str, Any]:
+    assert sha256((out / "cloud.ply").read_bytes()).hexdigest() == CLOUD_SHA256
+    report = json.loads((out / "report.json").read_text())
+    storage = Storage.at(f"{BUCKET}/{folder}")
+    parts = [unpack(storage.read(name)) for name in sorted(storage.sizes())]
+    assert [part.first for part in parts[1:]] == [part.stop for part in parts[:-1]]
+    assert (parts[0].first, parts[-1].stop) == (0, 108)
+    assert sum(len(part) for part in parts) == report["points"] == 995
+    assert not (out / "run").exists()
+    return report
+
+
+def test_parts_go_to_the_bucket_and_stay(run, tmp_path):
+    done = run("whole")
+    assert (done.code, done.err) == (0, "")
+    check(tmp_path / "out", "whole")
+    # They are not taken for those of another run, nor touched by it.
+    again = run("whole")
+    assert again.code == 2
+    assert "s3://surveys/whole holds the parts of another run" in again.err
+    check(tmp_path / "out", "whole")
+
+
+# Ends its worker a moment after the third upload has begun.
+DIES = """
+import os, signal, threading
+from lidarpool.columns.storage import Storage
+write, count = Storage.write, []
+def write_and_die(storage, name, data):
+    count.append(name)
+    if len(count) == 3:
+        threading.Timer(0.001, os.kill, (os.getpid(), signal.SIGKILL)).start()
+    return write(storage, name, data)
+Storage.write = write_and_die
+"""
+
+
+def test_a_collector_dies_while_it_uploads(run, cluster_there, environment, tmp_path):
+    """The stages begin on the worker with more slots, which dies, and go on on the other."""
+    cluster_there.add("LIDAR", slots=8, preload=DIES, **environment)
+    cluster_there.wait()
+    doomed = list(cluster_there.processes)[-1]
+    done = run("died")
+    assert (done.code, done.err) == (0, "")
+    assert cluster_there.processes.pop(doomed).wait(60) == -9
+    report = check(tmp_path / "out", "died")
+    assert report["replayed"] > 0
+
+
+@pytest.mark.parametrize("place", ["s3://no/x", "s9://surveys/x"])
+def test_a_place_that_there_cannot_be(place, run, tmp_path):
+    refused = run("", "--parts", place)
+    assert refused.code == 2
+    assert len(refused.err.splitlines()) == 1
+    assert place in refused.err
+    assert not (tmp_path / "out" / "run").exists()
+
+
+def test_a_bucket_that_the_workers_cannot_reach(
+    lidarpool, cluster, environment, tmp_path, monkeypatch
+):
+    """Parts come to it through the driver."""
+    monkeypatch.setattr(Storage, "sees", lambda *_: False)
+    (tmp_path / "s.yaml").write_text(SCENARIO)
+    done = lidarpool(
+        "run", tmp_path / "s.yaml", "--out", tmp_path / "out", "--only", "cloud", "-q",
+        "--scheduler", cluster, "--parts", f"{BUCKET}/far",
+    )  # fmt: skip
+    assert (done.code, done.err) == (0, "")
+    (note,) = (n for n in check(tmp_path / "out", "far")["notes"] if "cannot see" in n)
+    assert note.startswith(f"LIDAR of partition LIDAR cannot see {BUCKET}/far: parts came to it")

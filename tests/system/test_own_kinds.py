@@ -1,0 +1,125 @@
+"""Columns and sensors of a user's own: from their module to the files of the result."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from lidarpool import Beams, Column, Scene, Sensor, Spin, Survey, read_cloud, save_cloud, simulate
+from lidarpool.columns.table import TABLE
+from lidarpool.report.output import write_result
+
+
+@dataclass(frozen=True)
+class Nod:
+    """A head that looks up and down a wedge: a firing at each azimuth, to and fro."""
+
+    azimuths_in_wedge: int = 40
+    wedge_deg: float = 90.0
+
+    @property
+    def period(self) -> int:
+        return 2 * self.azimuths_in_wedge
+
+    def firings(self, step: int) -> tuple[int, int]:
+        return step * self.azimuths_in_wedge, (step + 1) * self.azimuths_in_wedge
+
+    def times_ns(self, firings):
+        return np.asarray(firings, np.float64) * 50_000.0
+
+    def azimuths(self, firings):
+        at = firings % self.period
+        at = np.where(at < self.azimuths_in_wedge, at, self.period - 1 - at)
+        return np.radians(self.wedge_deg * at / self.azimuths_in_wedge)
+
+
+@dataclass(frozen=True, eq=False)
+class Tilted(Sensor):
+    """A sensor that lies on its side: its beams fan out about the x axis."""
+
+    tilt_deg: float = 30.0
+    head: Nod = field(default_factory=Nod)
+
+    def directions(self, firings):
+        x, y, z = np.moveaxis(super().directions(firings), -1, 0)
+        c, s = np.cos(np.radians(self.tilt_deg)), np.sin(np.radians(self.tilt_deg))
+        return np.stack([x, c * y - s * z, s * y + c * z], axis=-1)
+
+
+def brightness(returns):
+    """Light that comes back, falling with the square of the distance."""
+    return returns.intensity / np.maximum(returns.range, 1.0) ** 2
+
+
+BRIGHTNESS = Column("brightness", "float32", "W", "light that comes back", brightness)
+
+
+def survey(**columns) -> Survey:
+    sensor = Tilted(Beams.even(12, 50.0))
+    return Survey(sensor, [(0, 0, 1.5), (4, 2, 1)], steps=30, keep_every=1, **columns)
+
+
+@pytest.fixture(scope="module")
+def result(local_client):
+    wanted = survey(columns=[BRIGHTNESS, "time", "range", "intensity"])
+    return simulate(Scene.seed(), wanted, client=local_client)
+
+
+def test_points_lie_where_the_sensors_own_geometry_says(result):
+    """Its rays are made again here, and end at the ranges that were found."""
+    cloud, wanted = result.cloud, survey()
+    assert result.rays == wanted.ray_count == 2 * 30 * 40 * 12
+    assert len(cloud) == result.hits > 1000
+    firings = cloud["time"] % (30 * 40 * 50_000) // 50_000
+    stations = cloud.scan // 30
+    places = np.array([(0, 0, 1.5), (4, 2, 1)])[stations]
+    directions = wanted.sensor.directions(firings)[np.arange(len(cloud)), cloud.channel]
+    expected = places + directions * cloud["range"][:, None]
+    assert np.abs(cloud.positions - expected).max() <= 0.006
+
+
+def test_a_column_of_ones_own_is_what_its_function_makes(result):
+    cloud = result.cloud
+    assert cloud["brightness"].dtype == np.float32
+    expected = cloud["intensity"] / np.maximum(cloud["range"], 1.0) ** 2
+    assert np.allclose(cloud["brightness"], expected, rtol=1e-5)
+
+
+def test_both_are_in_the_files_of_the_result(result, tmp_path):
+    wanted = survey(columns=[BRIGHTNESS, "time", "range", "intensity"])
+    write_result(tmp_path, result, Scene.seed(), wanted, None)
+    report = json.loads((tmp_path / "report.json").read_text())
+    names = [column["name"] for column in report["columns"]]
+    assert names == ["scan", "channel", "object", "brightness", "time", "range", "intensity"]
+    (own,) = (column for column in report["columns"] if column["name"] == "brightness")
+    assert (own["unit"], own["meaning"]) == ("W", "light that comes back")
+    values = result.cloud["brightness"]
+    limits = [own["lowest"], own["highest"]]
+    assert limits == pytest.approx([values.min(), values.max()])
+    sensor = report["parameters"]["sensor"]
+    assert (sensor["kind"], sensor["head"]["kind"], sensor["channels"]) == ("Tilted", "Nod", 12)
+    page = (tmp_path / "report.html").read_text()
+    assert "brightness" in page and "light that comes back" in page
+    assert "<dd>Tilted</dd>" in page and "<dd>Nod</dd>" in page
+
+    cloud = read_cloud(tmp_path / "cloud.ply")
+    assert np.array_equal(cloud["brightness"], values)
+    header = (tmp_path / "cloud.ply").read_bytes().partition(b"end_header")[0]
+    assert b"property float brightness" in header
+
+    save_cloud(tmp_path / "again.ply", result.cloud)
+    assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "cloud.ply").read_bytes()
+
+
+def test_all_columns_of_the_table_come_through(client, cluster_client, same_cloud):
+    """And the same, whatever makes them: three processes, or one thread."""
+    optional = [name for name in TABLE if name not in ("scan", "x", "y", "z", "channel", "object")]
+    wanted = Survey(
+        Sensor(Beams.even(8, 40.0), Spin(360, 10)), [(0, 0, 1)], steps=36, columns=optional
+    )
+    cloud = simulate(Scene.seed(), wanted, client=client).cloud
+    assert set(optional) < cloud.columns.keys()
+    assert same_cloud(cloud, simulate(Scene.seed(), wanted, client=cluster_client).cloud)

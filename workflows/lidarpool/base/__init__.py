@@ -1,0 +1,1 @@
+"""Errors, interrupts and words: what every room uses."""

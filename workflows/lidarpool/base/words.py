@@ -1,0 +1,19 @@
+"""Words of messages."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """Return " Did you mean 'x'?", or nothing where no known word is near.
+
+    Examples
+    --------
+    >>> did_you_mean("layer", ["layers", "step_deg"])
+    " Did you mean 'layers'?"
+    """
+    lower = {name.lower(): name for name in known}
+    near = difflib.get_close_matches(word.lower(), lower, n=1, cutoff=0.6)
+    return f" Did you mean {lower[near[0]]!r}?" if near else ""

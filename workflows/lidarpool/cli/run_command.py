@@ -1,0 +1,261 @@
+"""The commands `run` and `demo` without their options: survey, planning, files."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+from distributed import Client
+
+from poolpart.wording import counted
+
+from ..live import shown_on_page
+from ..report.summary import summary
+from ..run.checks import check_backend_here, check_backend_name
+from ..run.connection import connected, local_client
+from ..run.job import Job, make_job
+from ..run.result import Result
+from ..run.run import Run, make_result
+from ..run.store import COMMAND_TERMS, RunStore, remove_run
+from ..run.tls import NO_FILES, TlsFiles
+from ..scan import PATIENCE_S, WAIT_S
+from ..scenario.advice import advice
+from ..scenario.scenario import Scenario
+from .log_file import LOG, logged_to
+from .quiet import QuietWorkers
+from .terminal import shown_progress, shown_status
+
+if TYPE_CHECKING:
+    from ..live import LiveRun
+
+RUN_FOLDER = "run"  # of what is kept of a run until its result is whole, in the output folder
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """How a scenario is to be run; see the options of `lidarpool run`.
+
+    `resumable` says whether the run is kept in the output folder; without that, `resume` and
+    `fresh` mean nothing. `stay` says whether the page of `live` stays when all is done. `only` is
+    "cloud" for a cloud without pictures and page. `parts` is where the parts go, and stay.
+    """
+
+    out: Path
+    scheduler: str | None = None
+    files: TlsFiles = NO_FILES
+    tls: bool = False
+    backend: str | None = None
+    no_plan: bool = False
+    resumable: bool = True
+    resume: bool = False
+    fresh: bool = False
+    quiet: bool = False
+    verbose: bool = False
+    as_json: bool = False
+    live: bool = False
+    stay: bool = True
+    page: bool = False
+    only: str | None = None
+    parts: str | None = None
+    wait_s: float = WAIT_S
+    patience_s: float = PATIENCE_S
+
+
+def run_scenario(scenario: Scenario, options: RunOptions) -> None:
+    """Run a scenario, write the result and tell of it.
+
+    Raises
+    ------
+    LidarpoolError
+        If something is wrong or fails; notes of the error say what was kept.
+    """
+    # Matplotlib is a third of the time that --help would take.
+    from ..report.output import result_folder, write_result
+    from ..report.page import make_recipe
+
+    recipe = make_recipe(scenario, click.get_current_context(silent=True))
+    _check_backend(options.backend or scenario.pool.backend, options)
+    job = make_job(
+        scenario,
+        options.backend,
+        options.no_plan,
+        wait_s=options.wait_s,
+        patience_s=options.patience_s,
+    )
+    if not options.quiet:
+        for note in advice(job.scene, job.survey, scenario.unitless_files):
+            click.echo(f"note: {note}", err=True)
+    with _told_when_whole(options.out) as whole, _shown_live(job, options) as live:
+
+        def in_place() -> None:
+            whole.append(options.out)
+            store.remove()
+
+        with result_folder(options.out), logged_to(_log(options), options.verbose) as log:
+            store = _store(job, options)
+            with store.kept_on_error():
+                result = _conduct(scenario, store, options, live)
+                with shown_status(f"writing {_what(options)}", options.quiet):
+                    report = write_result(
+                        options.out,
+                        result,
+                        job.scene,
+                        job.survey,
+                        job.planning,
+                        recipe,
+                        in_place,
+                        only_cloud=options.only == "cloud",
+                    )
+        if options.as_json:
+            figures = summary(options.out, report, log.path if log.written else None)
+            click.echo(json.dumps(figures, indent=1, allow_nan=False))
+        else:
+            _tell(options.out, result, job, report["files"])
+            if log.written and not options.quiet:
+                name = click.format_filename(options.out / LOG)
+                click.echo(f"messages of Dask and other libraries are in {name}", err=True)
+        if live is not None and options.stay:
+            live.stay()
+
+
+@contextmanager
+def _told_when_whole(out: Path) -> Iterator[list[Path]]:
+    """Let an error say that the result is whole once that is in the list: so is an interrupt."""
+    whole: list[Path] = []
+    try:
+        yield whole
+    except BaseException as error:
+        if whole:
+            error.add_note(f"The result in {out} is complete.")
+        raise
+
+
+@contextmanager
+def _shown_live(job: Job, options: RunOptions) -> Iterator[LiveRun | None]:
+    """Page that shows the run, if one is wanted."""
+    if not options.live:
+        yield None
+        return
+    from ..live import live_run
+
+    with live_run(job) as live:
+        yield live
+
+
+def _what(options: RunOptions) -> str:
+    return "the cloud" if options.only == "cloud" else "the cloud, the pictures and the report"
+
+
+def _log(options: RunOptions) -> Path:
+    """File for messages of libraries; its name is good in workers, too."""
+    return options.out.absolute() / LOG
+
+
+def _check_backend(backend: str, options: RunOptions, *advice: str) -> None:
+    """Refuse a backend that is not to be had, as far as that can be seen from here."""
+    if options.scheduler is None:
+        check_backend_here(backend, *advice)
+    else:
+        check_backend_name(backend)
+
+
+def _store(job: Job, options: RunOptions) -> RunStore:
+    """Where the run is kept, with what an earlier one has left if that is to be resumed."""
+    if not options.resumable:
+        return RunStore(job, None, options.parts)
+    path = options.out / RUN_FOLDER
+    if options.fresh:
+        remove_run(path)
+    store = RunStore(job, path, options.parts, resume=options.resume, terms=COMMAND_TERMS)
+    if options.resume and not store.kept:
+        store.notes.append(f"there was nothing to resume in {options.out}")
+    return store
+
+
+def _conduct(
+    scenario: Scenario, store: RunStore, options: RunOptions, live: LiveRun | None
+) -> Result:
+    """Do what is not done yet."""
+    if live is not None:
+        live.follow(store)
+    result = make_result(store) if store.complete else _drive(scenario, store, options, live)
+    if live is not None:
+        live.finish()
+    return result
+
+
+def _drive(
+    scenario: Scenario, store: RunStore, options: RunOptions, live: LiveRun | None
+) -> Result:
+    if store.backend:
+        _check_backend(store.backend, options, store.advice)
+    if options.scheduler is None:
+        cluster = _local_client(scenario, options, store.job.planning is not None)
+    else:
+        cluster = connected(options.scheduler, options.files)
+    with (
+        cluster as client,
+        shown_progress(options.quiet) as show,
+        shown_on_page(client, options.page, show) as show_both,
+    ):
+        tell = _silent if options.quiet else _note
+        if live is None:
+            return Run(client, store, tell=tell).drive(None, show_both)
+        run = Run(client, store, live.wants_pause, tell)
+        return run.drive(live.on_frame, live.with_progress(show_both, run.partitions))
+
+
+def _note(words: str) -> None:
+    click.echo(f"note: {words}", err=True)
+
+
+def _silent(words: str) -> None:
+    """Say nothing."""
+
+
+@contextmanager
+def _local_client(scenario: Scenario, options: RunOptions, planning: bool) -> Iterator[Client]:
+    """Client of a cluster on this machine whose workers say nothing at the terminal."""
+    with ExitStack() as stack:
+        with shown_status("starting the workers", options.quiet):
+            client = stack.enter_context(
+                local_client(
+                    gpu_workers=scenario.pool.gpu,
+                    collectors=scenario.pool.collectors,
+                    other_workers=scenario.pool.other,
+                    planning=planning,
+                    tls=options.tls,
+                )
+            )
+            client.register_plugin(QuietWorkers(_log(options) if options.verbose else None))
+        yield client
+
+
+def _tell(out: Path, result: Result, job: Job, files: list[str]) -> None:
+    for note in result.notes:
+        click.echo(f"note: {note}")
+    click.echo(
+        f"{job.survey.scan_count:,} scans, {result.rays:,} rays, {result.hits:,} hits on "
+        f"{counted(len(job.scene.names), 'object')}, {len(result.points):,} points in the cloud "
+        f"({result.backend}, {result.survey_seconds:.1f} s)"
+    )
+    if result.plan is not None:
+        plan = result.plan
+        found = (
+            f"path of {plan.length:.2f} m, free of collisions"
+            if plan.collision_free
+            else "no path free of collisions was found"
+        )
+        possible = (
+            f"the shortest possible is {plan.shortest_possible:.2f} m"
+            if math.isfinite(plan.shortest_possible)
+            else "none is possible, the obstacles leave no way"
+        )
+        click.echo(f"{found}; {possible} ({plan.trials} trials, {result.planning_seconds:.1f} s)")
+    click.echo(f"results in {click.format_filename(out)}: {', '.join(files)}")

@@ -1,0 +1,1 @@
+"""The points of a cloud and their columns."""

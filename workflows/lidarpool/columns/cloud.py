@@ -1,0 +1,157 @@
+"""The cloud: what a survey is for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..base.errors import LidarpoolError
+from .table import TABLE, Column
+
+CHUNK_POINTS = 1_000_000  # in memory at a time where a cloud is read in order
+
+
+class CloudLike(Protocol):
+    """A cloud in memory or in parts, to be read in order, a piece at a time."""
+
+    def __len__(self) -> int: ...
+
+    @property
+    def bounds(self) -> NDArray[np.floating]:
+        """Lowest and highest coordinates, (2, 3), metres, in the positions' type."""
+
+    @property
+    def table(self) -> tuple[Column, ...]:
+        """The columns beside the positions, in the order of files."""
+
+    def chunks(self, points: int = CHUNK_POINTS) -> Iterator[Cloud]:
+        """Give the points in order, at most so many at a time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """Points of a survey, ordered by scan and ray.
+
+    A column is read as ``cloud["channel"]``, and ``cloud.scan`` will do where a name is free.
+
+    Parameters
+    ----------
+    positions
+        float32 or float64 (n, 3), metres, world coordinates.
+    columns
+        {name: (n,)}: the other columns, of `lidarpool.columns.table` or one's own.
+    own
+        Descriptions of the columns that are not in the table.
+
+    Raises
+    ------
+    LidarpoolError
+        If the lengths differ, a position is not finite, or a value does not fit its column.
+    """
+
+    positions: NDArray[np.floating]
+    columns: Mapping[str, NDArray[Any]]
+    own: tuple[Column, ...] = ()
+
+    def __post_init__(self) -> None:
+        positions = np.asarray(self.positions)
+        if positions.dtype not in (np.float32, np.float64):
+            positions = positions.astype(np.float64)
+        if positions.ndim != 2 or positions.shape[1:] != (3,):
+            raise LidarpoolError(f"A cloud needs positions of (n, 3), not {positions.shape}.")
+        if not np.isfinite(positions).all():
+            raise LidarpoolError("A point of the cloud is NaN or infinite; it cannot be kept.")
+        known = TABLE | {column.name: column for column in self.own}
+        columns = {}
+        for name, values in self.columns.items():
+            array = np.asarray(values)
+            if array.shape != (len(positions),):
+                raise LidarpoolError(
+                    f"Column {name!r} has the shape {array.shape} and there are {len(positions)} "
+                    "points: give one value a point."
+                )
+            columns[name] = _fitting(known[name], array) if name in known else array
+        object.__setattr__(self, "positions", positions)
+        object.__setattr__(self, "columns", columns)
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        try:
+            return self.columns[name]
+        except KeyError:
+            raise KeyError(
+                f"the cloud has no column {name!r}; it has {list(self.columns)}"
+            ) from None
+
+    def __getattr__(self, name: str) -> NDArray[Any]:
+        columns: Mapping[str, NDArray[Any]] = self.__dict__.get("columns", {})
+        if name in columns:
+            return columns[name]
+        raise AttributeError(f"a cloud has no attribute or column {name!r}")
+
+    def __getstate__(self) -> dict[str, Any]:
+        return dict(self.__dict__)
+
+    @property
+    def table(self) -> tuple[Column, ...]:
+        """The columns beside the positions, in the order of files."""
+        known = TABLE | {column.name: column for column in self.own}
+        return tuple(
+            known.get(name) or Column(name, array.dtype.str, "", "")
+            for name, array in self.columns.items()
+        )
+
+    @property
+    def bounds(self) -> NDArray[np.floating]:
+        """Lowest and highest coordinates, (2, 3), metres; zeros where there are no points."""
+        if not len(self):
+            return np.zeros((2, 3), self.positions.dtype)
+        return np.stack([self.positions.min(axis=0), self.positions.max(axis=0)])
+
+    def part(self, rows: slice) -> Cloud:
+        """Return some consecutive points, as views."""
+        columns = {name: array[rows] for name, array in self.columns.items()}
+        return Cloud(self.positions[rows], columns, self.own)
+
+    def chunks(self, points: int = CHUNK_POINTS) -> Iterator[Cloud]:
+        """Give the points in order, at most so many at a time, as views."""
+        for first in range(0, len(self), points):
+            yield self.part(slice(first, first + points))
+
+    @classmethod
+    def joined(cls, parts: list[Cloud]) -> Cloud:
+        """Put clouds of the same columns one behind the other; at least one must be given."""
+        first = parts[0]
+        if len(parts) == 1:
+            return first
+        columns = {
+            name: np.concatenate([part.columns[name] for part in parts]) for name in first.columns
+        }
+        return cls(np.concatenate([part.positions for part in parts]), columns, first.own)
+
+
+def counts_by_object(cloud: CloudLike, objects: int) -> NDArray[np.int64]:
+    """Count the points of each object: (objects,)."""
+    counts = np.zeros(objects, np.int64)
+    for chunk in cloud.chunks():
+        counts += np.bincount(chunk["object"], minlength=objects)
+    return counts
+
+
+def _fitting(column: Column, values: ArrayLike) -> NDArray[Any]:
+    """`values` in the column's type; LidarpoolError where a plain cast would wrap around."""
+    given, wanted = np.asarray(values), np.dtype(column.dtype)
+    cast = given.astype(wanted, copy=False)
+    if wanted.kind in "iu" and not np.array_equal(cast, given):
+        limits = np.iinfo(wanted)
+        raise LidarpoolError(
+            f"{column.name} holds {given.min()} to {given.max()}; it must be whole numbers of "
+            f"{limits.min} to {limits.max}."
+        )
+    return cast

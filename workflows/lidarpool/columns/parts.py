@@ -1,0 +1,332 @@
+"""Parts: the columns of some consecutive scans as one file.
+
+A part is a NumPy archive without compression (``numpy.load`` opens it): an array for each column,
+rows in (scan, ray) order, and three more: `.scans`, first scan and one past the last; `.counts`,
+rows of each scan; and the tally of hits by triangle, `.triangles` and `.hits`, of all hits and not
+only those that were kept. `x`, `y` and `z` are whole multiples of the precision from the scene's
+local origin, so that rounding once is rounding for good.
+"""
+
+from __future__ import annotations
+
+import io
+import lzma
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from tokenize import TokenError
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.errors import LidarpoolError
+from .cloud import CHUNK_POINTS, Cloud
+from .storage import Storage
+from .table import AXES, SCAN, Column
+
+SUFFIX = ".npz"
+_UNREADABLE = (
+    ArithmeticError, EOFError, LookupError, MemoryError, RuntimeError, TypeError, ValueError,
+    lzma.LZMAError, struct.error, TokenError, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
+_DATE = (1980, 1, 1, 0, 0, 0)  # the same columns give the same bytes
+
+
+@dataclass(frozen=True)
+class PartColumns:
+    """Content of a part.
+
+    Parameters
+    ----------
+    first
+        Its first scan.
+    counts
+        int64 (scans,): rows of each scan.
+    columns
+        {name: (rows,)}: the columns, positions as cells.
+    triangles, hits
+        int32 (k,), int64 (k,): triangles that were hit, and how often, by all hits.
+    """
+
+    first: int
+    counts: NDArray[np.int64]
+    columns: Mapping[str, NDArray[Any]]
+    triangles: NDArray[np.int32]
+    hits: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return int(self.counts.sum())
+
+    @property
+    def stop(self) -> int:
+        """One past its last scan."""
+        return self.first + len(self.counts)
+
+    @property
+    def cells(self) -> NDArray[np.int64] | None:
+        """Lowest and highest cell, (2, 3); None where there are no rows."""
+        if not len(self):
+            return None
+        axes = [self.columns[axis.name] for axis in AXES]
+        return np.array([[a.min() for a in axes], [a.max() for a in axes]], np.int64)
+
+    def scan_column(self) -> NDArray[np.int32]:
+        """Scan of each row."""
+        scans = np.arange(self.first, self.stop, dtype=np.int32)
+        return np.repeat(scans, self.counts)
+
+
+def pack(part: PartColumns) -> bytearray:
+    """Write a part down: the same content gives the same bytes."""
+    arrays = {
+        ".scans": np.array([part.first, part.stop], np.int64),
+        ".counts": part.counts,
+        ".triangles": part.triangles,
+        ".hits": part.hits,
+        **part.columns,
+    }
+    memory = io.BytesIO()
+    # NumPy's own savez sets the time of each file, and copies the content once more.
+    with zipfile.ZipFile(memory, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
+        for name, array in arrays.items():
+            head = io.BytesIO()
+            array = np.ascontiguousarray(array)
+            np.lib.format.write_array_header_1_0(
+                head, np.lib.format.header_data_from_array_1_0(array)
+            )
+            with archive.open(zipfile.ZipInfo(f"{name}.npy", _DATE), "w", force_zip64=True) as file:
+                file.write(head.getbuffer())
+                file.write(array.data.cast("B") if array.size else b"")
+    return memory.getbuffer()  # type: ignore[return-value]
+
+
+def unpack(data: bytes) -> PartColumns:
+    """Inverse of `pack`; every array's checksum is compared.
+
+    Raises
+    ------
+    LidarpoolError
+        If it is no part or damaged; the message is a clause.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            names = archive.namelist()
+            # A damaged entry of the list of files may hide those behind it.
+            if len(names) != int.from_bytes(data[-12:-10], "little"):
+                raise ValueError(f"{len(names)} arrays")
+            arrays = {name.removesuffix(".npy"): _read_array(archive, name) for name in names}
+        first, stop = arrays.pop(".scans").tolist()
+        part = PartColumns(
+            first,
+            arrays.pop(".counts"),
+            arrays,
+            arrays.pop(".triangles"),
+            arrays.pop(".hits"),
+        )
+        if (
+            part.stop != stop
+            or (part.counts < 0).any()
+            or part.triangles.shape != part.hits.shape
+            or any(array.shape != (len(part),) for array in part.columns.values())
+        ):
+            raise ValueError("its arrays do not fit together")
+    except (*_UNREADABLE, OSError) as error:
+        raise LidarpoolError(f"it is damaged ({error})") from error
+    return part
+
+
+def _read_array(archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
+    """Read an array to its end: only there are checksums compared."""
+    with archive.open(name) as file:
+        array: NDArray[Any] = np.lib.format.read_array(file, allow_pickle=False)
+        if file.read(1):
+            raise ValueError(f"{name} is longer than its array")
+    return array
+
+
+def read_part(storage: Storage, name: str) -> PartColumns:
+    """Read a part.
+
+    Raises
+    ------
+    LidarpoolError
+        If it is not there, cannot be read or is damaged.
+    """
+    try:
+        return unpack(storage.read(name))
+    except LidarpoolError as error:
+        raise LidarpoolError(
+            f"The part {storage.path(name)} cannot be used: {error}. Drop the run, and start it "
+            "anew."
+        ) from error
+    except OSError as error:
+        raise LidarpoolError(
+            f"The part {storage.path(name)} cannot be read: {error.strerror or error}."
+        ) from error
+
+
+def read_tally(storage: Storage, name: str) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """Read which triangles the hits of a part fell on, and how often; the rest stays on disk.
+
+    Raises
+    ------
+    LidarpoolError
+        As `read_part`.
+    """
+    if not storage.is_local:
+        part = read_part(storage, name)
+        return part.triangles, part.hits
+    try:
+        with zipfile.ZipFile(storage.path(name)) as archive:
+            return _read_array(archive, ".triangles.npy"), _read_array(archive, ".hits.npy")
+    except (*_UNREADABLE, OSError) as error:
+        raise LidarpoolError(
+            f"The part {storage.path(name)} cannot be used ({error}). Drop the run, and start it "
+            "anew."
+        ) from error
+
+
+class StoredCloud:
+    """The points of parts in (scan, ray) order, read as many at a time as wanted; a `CloudLike`.
+
+    Parameters
+    ----------
+    storage
+        Where the parts are.
+    names, rows
+        Names of the parts in scan order, and how many points each has.
+    columns
+        What a part holds.
+    cells
+        Lowest and highest cell of all points, (2, 3); None where there are no points.
+    precision_m
+        Size of the cells that positions were rounded to.
+    origin
+        World position of the scene's local origin, (3,), metres.
+    keeper
+        Whatever has to live as long as the parts are to be read.
+    """
+
+    def __init__(
+        self,
+        storage: Storage,
+        names: Sequence[str],
+        rows: Sequence[int],
+        columns: Sequence[Column],
+        cells: NDArray[np.int64] | None,
+        precision_m: float,
+        origin: NDArray[np.float64],
+        keeper: Any = None,
+    ) -> None:
+        self.storage, self.names, self.rows = storage, tuple(names), tuple(rows)
+        self._columns = tuple(columns)
+        self._cells, self._precision_m, self._origin = cells, precision_m, origin
+        self._keeper = keeper
+
+    def __len__(self) -> int:
+        return sum(self.rows)
+
+    @property
+    def bounds(self) -> NDArray[np.float64]:
+        """Lowest and highest coordinates, (2, 3), metres; zeros where there are no points."""
+        if self._cells is None:
+            return np.zeros((2, 3))
+        return positions(self._cells, self._precision_m, self._origin)
+
+    @property
+    def table(self) -> tuple[Column, ...]:
+        """The columns beside the positions, in the order of files."""
+        rest = [column for column in self._columns if column not in AXES]
+        return (SCAN, *rest)
+
+    def part(self, name: str) -> PartColumns:
+        """Read one part."""
+        return read_part(self.storage, name)
+
+    def cloud_of(self, part: PartColumns, rows: NDArray[np.integer] | slice = slice(None)) -> Cloud:
+        """Points of a part, or some of them."""
+        cells = np.stack([part.columns[axis.name][rows] for axis in AXES], axis=1)
+        columns = {"scan": part.scan_column()[rows]}
+        columns |= {c.name: part.columns[c.name][rows] for c in self.table if c is not SCAN}
+        return Cloud(
+            positions(cells, self._precision_m, self._origin),
+            columns,
+            tuple(c for c in self.table),
+        )
+
+    def chunks(self, points: int = CHUNK_POINTS) -> Iterator[Cloud]:
+        """Read the cloud in order, so many points at a time.
+
+        Raises
+        ------
+        LidarpoolError
+            If a part cannot be read.
+        """
+        held: list[Cloud] = []
+        count = 0
+        for name, rows in zip(self.names, self.rows, strict=True):
+            if not rows:
+                continue
+            cloud = self.cloud_of(self.part(name))
+            while count + len(cloud) >= points:
+                cut = points - count
+                yield Cloud.joined([*held, cloud.part(slice(0, cut))])
+                cloud, held, count = cloud.part(slice(cut, None)), [], 0
+            if len(cloud):
+                held.append(cloud)
+                count += len(cloud)
+        if held:
+            yield Cloud.joined(held)
+
+    def sample(
+        self, choose: Callable[[int, int], NDArray[np.integer]], most: int, parts: int = 256
+    ) -> tuple[Cloud, int]:
+        """Read at most so many points, evenly chosen, of at most so many parts.
+
+        Parameters
+        ----------
+        choose
+            ``choose(count, most)`` gives at most `most` row numbers of `count`, in order.
+        most
+            Points.
+        parts
+            Parts that are opened: what it takes does not grow with the survey.
+
+        Returns
+        -------
+        cloud, count
+            The points, and how many the whole cloud has.
+        """
+        filled = [i for i, rows in enumerate(self.rows) if rows]
+        opened = [filled[i] for i in choose(len(filled), parts)] if filled else []
+        total = sum(self.rows[i] for i in opened)
+        picked = choose(total, most) if total else np.zeros(0, np.int64)
+        clouds, before = [], 0
+        for i in opened:
+            inside = picked[(picked >= before) & (picked < before + self.rows[i])] - before
+            before += self.rows[i]
+            clouds.append(self.cloud_of(self.part(self.names[i]), inside))
+        if not clouds:
+            return self.load(), 0
+        return Cloud.joined(clouds), len(self)
+
+    def load(self) -> Cloud:
+        """Read the whole cloud into memory."""
+        parts = list(self.chunks())
+        if parts:
+            return Cloud.joined(parts)
+        columns = {c.name: np.zeros(0, c.dtype) for c in self.table}
+        return Cloud(np.zeros((0, 3)), columns, self.table)
+
+
+def positions(
+    cells: NDArray[np.integer], precision_m: float, origin: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """World coordinates, (n, 3), of points in these cells, (n, 3)."""
+    found = cells * precision_m + origin
+    # Multiplying leaves 0.07 at 0.07000000000000001; the nearest short decimal is meant.
+    digits = max(0, int(np.ceil(-np.log10(precision_m))) + 3)
+    return np.round(found, digits, out=found)

@@ -1,0 +1,210 @@
+"""Where the parts of a run are: a folder, or whatever else fsspec opens.
+
+A file is there whole or not at all: in a folder it is written under a temporary name and renamed,
+and an object store shows an object when it has been put.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from ..base.errors import LidarpoolError
+
+_TEMPORARY = ".tmp-"
+
+
+@dataclass(frozen=True)
+class Storage:
+    """A folder of files, by path or URL; small when pickled.
+
+    Parameters
+    ----------
+    url
+        A folder's path, or a URL such as ``s3://bucket/folder``. Credentials come from where
+        the library of that kind of storage looks for them.
+    durable
+        Whether files must survive a power cut: waiting for a disk takes milliseconds a file, and
+        a folder that goes with the process can do without.
+    """
+
+    url: str
+    durable: bool = True
+
+    @classmethod
+    def at(cls, place: str | Path, *, durable: bool = True) -> Storage:
+        """Storage at a path, made absolute, or a URL."""
+        text = str(place)
+        url = text.rstrip("/") if "://" in text else str(Path(text).absolute())
+        return cls(url, durable)
+
+    @property
+    def is_local(self) -> bool:
+        """Whether it is a folder of a file system of this machine's."""
+        return "://" not in self.url
+
+    @cached_property
+    def _remote(self) -> tuple[Any, str]:
+        """File system and folder of a URL."""
+        import fsspec
+
+        try:
+            system, folder = fsspec.core.url_to_fs(self.url, skip_instance_cache=True)
+        except (ImportError, ValueError) as error:
+            raise LidarpoolError(f"{self.url} cannot be opened: {error}.") from error
+        return system, folder
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Storage, (self.url, self.durable)
+
+    def path(self, name: str) -> str:
+        """Path or URL of a file, for people."""
+        return f"{self.url}/{name}"
+
+    def prepare(self) -> None:
+        """Make the folder.
+
+        Raises
+        ------
+        OSError
+            If that cannot be done.
+        """
+        if self.is_local:
+            Path(self.url).mkdir(parents=True, exist_ok=True)
+            return
+        with suppress(FileExistsError), _as_os_error():
+            system, folder = self._remote
+            system.makedirs(folder, exist_ok=True)
+
+    def write(self, name: str, data: Any) -> None:
+        """Write a file, whole or not at all, and be sure that it stays.
+
+        Parameters
+        ----------
+        name
+            Its name.
+        data
+            Its content: bytes, or a list of them.
+
+        Raises
+        ------
+        OSError
+            If it cannot be written.
+        """
+        pieces = data if isinstance(data, list) else [data]
+        if self.is_local:
+            self._write_file(name, pieces)
+            return
+        with _as_os_error():
+            system, folder = self._remote
+            system.pipe_file(f"{folder}/{name}", b"".join(bytes(piece) for piece in pieces))
+
+    def _write_file(self, name: str, pieces: list[Any]) -> None:
+        folder = Path(self.url)
+        temporary = folder / f"{_TEMPORARY}{name}-{secrets.token_hex(4)}"
+        try:
+            with temporary.open("xb", buffering=0) as file:
+                for piece in pieces:
+                    view = memoryview(piece).cast("B")
+                    while len(view):
+                        view = view[file.write(view) :]
+                if self.durable:
+                    os.fsync(file.fileno())
+            temporary.replace(folder / name)
+        except BaseException:
+            with suppress(OSError):
+                temporary.unlink(missing_ok=True)
+            raise
+        if self.durable:
+            flush_folder(folder)
+
+    def read(self, name: str) -> bytes:
+        """Read a file.
+
+        Raises
+        ------
+        OSError
+            If it cannot be read.
+        """
+        if self.is_local:
+            return Path(self.url, name).read_bytes()
+        with _as_os_error():
+            system, folder = self._remote
+            return bytes(system.cat_file(f"{folder}/{name}"))
+
+    def sees(self, name: str, data: bytes) -> bool:
+        """Whether a file is there with this content: whether this process sees the same place."""
+        try:
+            return self.read(name) == data
+        except Exception:  # whatever a storage or its missing library has to say
+            return False
+
+    def sizes(self) -> dict[str, int]:
+        """Files and their sizes in bytes, whatever they are; none where there is no folder."""
+        if self.is_local:
+            sizes: dict[str, int] = {}
+            with suppress(FileNotFoundError), os.scandir(self.url) as entries:
+                for entry in entries:
+                    with suppress(FileNotFoundError):  # renamed or removed meanwhile
+                        if entry.is_file():
+                            sizes[entry.name] = entry.stat().st_size
+            return sizes
+        try:
+            with _as_os_error():
+                system, folder = self._remote
+                entries = system.ls(folder, detail=True, refresh=True)
+        except FileNotFoundError:
+            return {}
+        return {
+            e["name"].rpartition("/")[2]: e["size"] or 0 for e in entries if e["type"] == "file"
+        }
+
+    def remove(self, names: list[str]) -> None:
+        """Remove files; no error for those that are gone.
+
+        Raises
+        ------
+        OSError
+            If one is there and cannot be removed.
+        """
+        for name in names:
+            if self.is_local:
+                Path(self.url, name).unlink(missing_ok=True)
+            else:
+                with suppress(FileNotFoundError), _as_os_error():
+                    system, folder = self._remote
+                    system.rm_file(f"{folder}/{name}")
+
+    def remove_folder(self) -> None:
+        """Remove the folder where nothing is in it any more."""
+        if self.is_local:
+            with suppress(OSError):
+                Path(self.url).rmdir()
+
+
+@contextmanager
+def _as_os_error() -> Iterator[None]:
+    """Raise an OSError for whatever a library of some storage raises."""
+    try:
+        yield
+    except (OSError, LidarpoolError):
+        raise
+    except Exception as error:
+        raise OSError(f"{type(error).__name__}: {error}") from error
+
+
+def flush_folder(path: Path) -> None:
+    """Wait until the names in a folder are on the disk."""
+    if os.name == "nt":
+        return  # has no handle of a folder to flush
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

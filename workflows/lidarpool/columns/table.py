@@ -1,0 +1,195 @@
+"""The table of columns: everything that a point can have, and where it comes from.
+
+Sensors, stages, parts, exporters, viewer, colouring, report and documentation read this table;
+nothing else lists columns. A column of one's own is a `Column` in `Survey.columns`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.errors import LidarpoolError
+from ..base.words import did_you_mean
+
+Kind = Literal["number", "label"]  # a colour scale, or one colour for each value
+
+_OPEN3D = ("positions", "normals", "colors")  # which writes the files
+
+
+@dataclass(frozen=True)
+class Column:
+    """One quantity that every point of a cloud has.
+
+    Parameters
+    ----------
+    name
+        A Python identifier; in files too, unless `file_name` says otherwise.
+    dtype
+        NumPy's name of the type of one value.
+    unit
+        Unit of the values; "" for none.
+    meaning
+        What it is, in a few words without a full stop.
+    source
+        Name of an attribute of the returns of a batch (`lidarpool.scan.returns.BatchReturns`),
+        or a function that makes the column from them: an array (n,), one value a point. It
+        runs on the worker that casts the rays. "" for columns that the cloud itself makes.
+    coordinates
+        Coordinate system of the values: "world", "sensor", or "" where there is none.
+    kind
+        How it is shown: "number" on a colour scale, "label" with a colour for each value.
+    file_name
+        Its name in files whose formats have a usual one.
+
+    Raises
+    ------
+    LidarpoolError
+        If the name is no identifier or NumPy has no such type.
+    """
+
+    name: str
+    dtype: str
+    unit: str
+    meaning: str
+    source: str | Callable[[Any], NDArray[Any]] = ""
+    coordinates: str = ""
+    kind: Kind = "number"
+    file_name: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.name.isidentifier():
+            raise LidarpoolError(f"A column cannot be called {self.name!r}: use an identifier.")
+        try:
+            known = np.dtype(self.dtype).kind in "iuf"
+        except TypeError:
+            known = False
+        if not known:
+            raise LidarpoolError(
+                f"Column {self.name!r} has the type {self.dtype!r}; give one of whole or real "
+                "numbers, such as uint8 or float32."
+            )
+
+    @property
+    def in_files(self) -> str:
+        """Name of the column in files."""
+        return self.file_name or self.name
+
+    def make(self, returns: Any) -> NDArray[Any]:
+        """Values of this column for the returns of a batch: (n,), of the column's type.
+
+        Raises
+        ------
+        LidarpoolError
+            If its source gives another number of values, or such as the type cannot hold.
+        """
+        source = self.source
+        values = np.asarray(source(returns) if callable(source) else getattr(returns, source))
+        if values.shape != (len(returns),):
+            raise LidarpoolError(
+                f"Column {self.name!r} was made with the shape {values.shape}; it needs one value "
+                f"for each of the {len(returns)} points."
+            )
+        wanted = np.dtype(self.dtype)
+        if wanted.kind in "iu" and len(values):
+            limits = np.iinfo(wanted)
+            if values.dtype.kind == "f" and not np.isfinite(values).all():
+                raise LidarpoolError(f"Column {self.name!r} holds NaN or infinity as {wanted}.")
+            if values.min() < limits.min or values.max() > limits.max:
+                raise LidarpoolError(
+                    f"Column {self.name!r} holds {values.min()} to {values.max()}, and {wanted} "
+                    f"holds {limits.min} to {limits.max}: give it a wider type."
+                )
+        return values.astype(wanted, copy=False)
+
+
+SCAN = Column("scan", "int32", "", "time step that the point comes from", kind="label")
+X = Column("x", "int32", "m", "position along x, to the east on maps", "cell_x", "world")
+Y = Column("y", "int32", "m", "position along y, to the north on maps", "cell_y", "world")
+Z = Column("z", "int32", "m", "position along z, up", "cell_z", "world")
+CHANNEL = Column(
+    "channel",
+    "uint16",
+    "",
+    "beam of the sensor, the lowest is 0",
+    "channel",
+    kind="label",
+    file_name="ring",
+)
+OBJECT = Column("object", "int32", "", "object that was hit", "object", kind="label")
+
+AXES = (X, Y, Z)  # in a part, whole multiples of the precision from the scene's local origin
+ALWAYS = (*AXES, CHANNEL, OBJECT)  # the columns that every part holds; `scan` follows from its rows
+OPTIONAL = (
+    Column("ray", "uint32", "", "number of the ray within its scan", "ray"),
+    Column("time", "int64", "ns", "when the ray was fired, from the survey's start", "time"),
+    Column("azimuth", "float32", "deg", "angle about the sensor's z axis", "azimuth", "sensor"),
+    Column(
+        "elevation", "float32", "deg", "angle above the sensor's xy plane", "elevation", "sensor"
+    ),
+    Column("range", "float32", "m", "distance from the beam's origin", "range", "sensor"),
+    Column("intensity", "float32", "", "cosine of the angle of incidence, 0 to 1", "intensity"),
+    Column("return_number", "uint8", "", "which return of its ray, from 1", "return_number"),
+    Column("returns", "uint8", "", "how many returns its ray has", "returns"),
+    Column("class", "uint8", "", "semantic class; 0 is none", "semantic_class", kind="label"),
+    Column("triangle", "int32", "", "triangle of the scene that was hit", "triangle"),
+)
+
+TABLE = {column.name: column for column in (SCAN, *ALWAYS, *OPTIONAL)}  # {name: column}
+
+
+def chosen(columns: Iterable[str | Column]) -> tuple[Column, ...]:
+    """Columns that are kept beside `ALWAYS`, each once, names looked up in `TABLE`.
+
+    Raises
+    ------
+    LidarpoolError
+        If there is no column of a name, two are called the same, or one is called so that it
+        cannot be written.
+    """
+    kept: dict[str, Column] = {}
+    names = {column.in_files: column for column in TABLE.values()} | TABLE
+    for entry in columns:
+        column = entry
+        if isinstance(column, str):
+            if column not in names:
+                raise LidarpoolError(
+                    f"There is no column {column!r}."
+                    + (did_you_mean(column, names) or f" There are {', '.join(names)}.")
+                )
+            column = names[column]
+        if kept.get(column.name, column) != column or (
+            column.name in TABLE and TABLE[column.name] != column
+        ):
+            raise LidarpoolError(f"Two columns are called {column.name!r}: rename one.")
+        kept[column.name] = column
+    rest = tuple(column for column in kept.values() if column not in (SCAN, *ALWAYS))
+    check_names((SCAN, *ALWAYS, *rest))
+    return rest
+
+
+def check_names(columns: Iterable[Column]) -> None:
+    """Check that columns can be told apart in files; LidarpoolError if not."""
+    taken: set[str] = set()
+    for name in (column.in_files for column in columns):
+        if not name.isascii() or not name.isprintable() or " " in name:
+            raise LidarpoolError(
+                f"A column cannot be called {name!r} in files: use ASCII letters and digits."
+            )
+        if name in _OPEN3D:
+            raise LidarpoolError(
+                f"A column cannot be called {name!r} in files, where Open3D takes it for three "
+                "numbers a point: use another name."
+            )
+        if name in taken:
+            raise LidarpoolError(f"Two columns are called {name!r} in files: rename one.")
+        taken.add(name)
+
+
+def stored(optional: Sequence[Column]) -> tuple[Column, ...]:
+    """All columns that a part holds, in the order in which they are stored."""
+    return (*ALWAYS, *optional)

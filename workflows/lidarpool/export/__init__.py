@@ -1,0 +1,1 @@
+"""Clouds in file formats."""

@@ -1,0 +1,280 @@
+"""Point clouds as binary PLY: written whole or not at all, whatever their size."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import shutil
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.choice import one_of_each_part
+from ..base.errors import LidarpoolError
+from ..base.interrupts import deferred_interrupts
+from ..columns.cloud import CHUNK_POINTS, Cloud, CloudLike
+from ..columns.table import AXES as POSITION
+from ..columns.table import TABLE, Column, check_names
+from .ply_format import AXES, as_held, header, layout, row_type
+
+# Single precision positions are kept where they err by less than this part of the precision.
+_ROUNDING_SHARE = 0.05
+
+
+def save_cloud(path: str | Path, cloud: CloudLike, *, precision_m: float = 0.01) -> int:
+    """Write a cloud, in memory or on disk, to a binary PLY file through Open3D.
+
+    About a million points are in memory at a time: Open3D writes each such piece to a file of
+    its own, which is read back, compared and appended to the others below one header. The
+    bytes are those that Open3D would write at once.
+
+    The file is written under a temporary name in the same folder, read back, flushed to the
+    disk, and only then given its name: there is either the whole new file or what was there
+    before. The same points give the same bytes.
+
+    Parameters
+    ----------
+    path
+        The file; its folder must exist.
+    cloud
+        A `Cloud`, or the `points` of a `Result`. float64 positions are stored in single
+        precision where that errs by less than a twentieth of `precision_m`, else in double.
+    precision_m
+        What the positions were rounded to, in metres.
+
+    Returns
+    -------
+    Size of the file in bytes.
+
+    Raises
+    ------
+    LidarpoolError
+        If it cannot be written whole; no temporary file is left.
+    """
+    path = Path(path)
+    real = real_type(cloud.bounds, precision_m)
+    # The ending stays, since Open3D picks the format by it.
+    temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.tmp.ply")
+    try:
+        _check_target(path, len(cloud), real, cloud.table)
+        try:
+            checksum = _write(temporary, path, cloud, real)
+            size = _check_whole(temporary, path, len(cloud), checksum)
+            _flush(temporary)
+            temporary.replace(path)
+            _flush(path.parent)
+        finally:
+            temporary.unlink(missing_ok=True)
+    except OSError as error:
+        raise LidarpoolError(f"{path} cannot be written: {error.strerror or error}.") from error
+    return size
+
+
+def read_cloud(path: str | Path) -> Cloud:
+    """Read a point cloud that `save_cloud` wrote, with all columns that it holds.
+
+    Raises
+    ------
+    LidarpoolError
+        If the file is missing, cut, or not a binary PLY with x, y and z.
+    """
+    path = Path(path)
+    try:
+        start, count, dtype = layout(path)
+        rows = np.fromfile(path, dtype=dtype, count=count, offset=start)
+    except OSError as error:
+        raise LidarpoolError(f"{path} cannot be read: {error.strerror or error}.") from error
+    except ValueError as error:
+        raise LidarpoolError(f"{path} is not a point cloud of lidarpool: {error}.") from error
+    positions = np.stack([rows[axis] for axis in "xyz"], axis=1)
+    names = {column.in_files: column.name for column in TABLE.values()}
+    columns = {
+        names.get(name, name): _narrowed(names.get(name, name), rows[name])
+        for name in rows.dtype.names or ()
+        if name not in AXES
+    }
+    return Cloud(positions, columns)
+
+
+def _narrowed(name: str, values: NDArray[Any]) -> NDArray[Any]:
+    """Values in the type of their column, where the file had to hold them in another."""
+    return values.astype(TABLE[name].dtype) if name in TABLE else values
+
+
+def read_positions(path: str | Path, most: int) -> tuple[NDArray[np.float64], int]:
+    """Read positions of at most so many points, evenly chosen, and how many there are.
+
+    The others stay on disk.
+
+    Returns
+    -------
+    positions
+        (k, 3) metres, world coordinates.
+    count
+        Points of the whole cloud.
+
+    Raises
+    ------
+    LidarpoolError
+        As `read_cloud`.
+    """
+    path = Path(path)
+    try:
+        start, count, dtype = layout(path)
+        if not count:  # nothing cannot be mapped
+            return np.empty((0, 3)), 0
+        rows = np.memmap(path, dtype, "r", start, (count,))
+    except OSError as error:
+        raise LidarpoolError(f"{path} cannot be read: {error.strerror or error}.") from error
+    except ValueError as error:
+        raise LidarpoolError(f"{path} is not a point cloud of lidarpool: {error}.") from error
+    chosen = rows[one_of_each_part(count, most)]
+    return np.stack([chosen[axis] for axis in "xyz"], axis=1, dtype=np.float64), count
+
+
+def real_type(bounds: NDArray[np.floating], precision_m: float) -> np.dtype[np.floating]:
+    """Least precise type that is precise enough for positions between these bounds."""
+    if bounds.dtype == np.float32:
+        return bounds.dtype
+    farthest = np.float32(np.abs(bounds).max(initial=0.0))
+    enough = np.isfinite(farthest) and np.spacing(farthest) / 2 < _ROUNDING_SHARE * precision_m
+    return np.dtype(np.float32 if enough else np.float64)
+
+
+def _check_target(
+    path: Path, count: int, real: np.dtype[np.floating], table: Sequence[Column]
+) -> None:
+    """Ask before writing: names, the folder, the room on the disk; OSError if it cannot."""
+    check_names((*POSITION, *table))
+    if path.is_dir():
+        raise LidarpoolError(f"{path} is a folder: give the name of a .ply file.")
+    if path.suffix.lower() != ".ply":
+        raise LidarpoolError(f"{path} must end in .ply, the format that is written.")
+    if not path.parent.is_dir():
+        raise LidarpoolError(f"The folder {path.parent} does not exist: make it first.")
+    piece = min(count, CHUNK_POINTS)
+    row = row_type(real, table)
+    needed = sum(len(header(row, n)) + n * row.itemsize for n in (count, piece))
+    free = shutil.disk_usage(path.parent).free
+    if free < needed:
+        raise LidarpoolError(
+            f"{path} needs {needed:,} bytes and its disk has {free:,} free: make room, or write "
+            "to another folder."
+        )
+
+
+def _write(temporary: Path, path: Path, cloud: CloudLike, real: np.dtype[np.floating]) -> int:
+    """Write all pieces to `temporary`; returns the checksum of the rows."""
+    piece = temporary.with_name(temporary.name.replace(".tmp.", ".piece."))
+    checksum = written = 0
+    with temporary.open("xb") as file:
+        try:
+            for chunk in cloud.chunks():
+                narrow = _as_held(chunk, real)
+                _write_open3d(piece, narrow)
+                head, rows = _read_back(piece, path, narrow)
+                if not written:
+                    own = b"element vertex %d\n" % len(chunk)
+                    file.write(head.replace(own, b"element vertex %d\n" % len(cloud)))
+                file.write(rows)
+                checksum = zlib.crc32(rows, checksum)
+                written += len(chunk)
+        finally:
+            piece.unlink(missing_ok=True)
+        if not written:  # which Open3D refuses to write
+            file.write(header(row_type(real, cloud.table), 0))
+    return checksum
+
+
+class _Held(NamedTuple):
+    """Points as a file holds them: in names and types that Open3D writes."""
+
+    positions: NDArray[np.floating]
+    columns: dict[str, NDArray[Any]]
+
+
+def _as_held(cloud: Cloud, real: np.dtype[np.floating]) -> _Held:
+    columns = {column.in_files: as_held(column, cloud[column.name]) for column in cloud.table}
+    return _Held(cloud.positions.astype(real, copy=False), columns)
+
+
+def _write_open3d(path: Path, cloud: _Held) -> None:
+    """Write `cloud` to `path`; whether it worked is for the reading back to say."""
+    # It takes a second, and read_cloud needs none of it. Interrupted in its extension module, it
+    # would pass for one that cannot be loaded, and cannot be loaded again.
+    with deferred_interrupts():
+        import open3d
+
+    o3d: Any = open3d  # its stubs do not know which arguments its functions take
+    points = o3d.t.geometry.PointCloud()
+    points.point.positions = o3d.core.Tensor(np.ascontiguousarray(cloud.positions))
+    for name, values in cloud.columns.items():
+        points.point[name] = o3d.core.Tensor(np.ascontiguousarray(values)[:, None])
+    quiet = o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error)
+    try:
+        with quiet:
+            written = o3d.t.io.write_point_cloud(str(path), points, write_ascii=False)
+    except (RuntimeError, UnicodeError) as error:
+        raise LidarpoolError(f"Open3D cannot write {path.parent}: {error}.") from error
+    if not written:
+        raise LidarpoolError(f"Open3D cannot write to {path.parent}: check folder and disk.")
+
+
+def _read_back(piece: Path, path: Path, cloud: _Held) -> tuple[bytes, memoryview]:
+    """Read a piece of `path` back, compare it with `cloud` bit by bit; its header and rows.
+
+    Open3D says True also when the disk was full and the file is cut.
+    """
+    start, dtype = _layout_of(piece, path, len(cloud.positions))
+    rows = np.fromfile(piece, dtype=dtype, offset=start)
+    columns = {axis: cloud.positions[:, i] for i, axis in enumerate("xyz")}
+    columns |= cloud.columns
+    for name, column in columns.items():
+        if rows[name].tobytes() != column.tobytes():
+            raise LidarpoolError(f"{path} came back from the disk with another {name}: try again.")
+    with piece.open("rb") as file:
+        return file.read(start), rows.view(np.uint8).data
+
+
+def _check_whole(temporary: Path, path: Path, count: int, checksum: int) -> int:
+    """Read the whole file back and compare its checksum; returns its size."""
+    start, _ = _layout_of(temporary, path, count)
+    found = 0
+    with temporary.open("rb") as file:
+        file.seek(start)
+        while data := file.read(1 << 24):
+            found = zlib.crc32(data, found)
+        size = file.tell()
+    if found != checksum:
+        raise LidarpoolError(f"{path} came back from the disk with other bytes: try again.")
+    return size
+
+
+def _layout_of(file: Path, path: Path, count: int) -> tuple[int, np.dtype[np.void]]:
+    """Where the rows of a file begin and their type, if it holds so many points."""
+    try:
+        start, found, dtype = layout(file)
+        if found != count:
+            raise ValueError(f"{found:,} of {count:,} points")
+    except ValueError as error:
+        free = shutil.disk_usage(path.parent).free
+        raise LidarpoolError(
+            f"{path} could not be written whole ({error}); the disk has {free:,} bytes free. "
+            "Make room, or write to another folder."
+        ) from error
+    return start, dtype
+
+
+def _flush(path: Path) -> None:
+    """Wait until the file or folder is on the disk."""
+    if os.name == "nt" and path.is_dir():
+        return  # Windows has no handle of a folder to flush
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

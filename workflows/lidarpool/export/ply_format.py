@@ -1,0 +1,108 @@
+"""The layout of our point clouds as binary PLY: the header, and a row for each point."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.errors import LidarpoolError
+from ..columns.table import Column
+
+AXES = ("x", "y", "z")
+
+_MAGIC = "ply\nformat binary_little_endian 1.0\n"
+_HEADER_LIMIT = 65_536
+_PLY_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
+    "short": "<i2", "int16": "<i2", "ushort": "<u2", "uint16": "<u2",
+    "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4",
+    "float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8",
+}  # fmt: skip
+
+
+# Types that Open3D writes as they are; the others are held in a wider one.
+_HELD = {"u1": "u1", "u2": "<u2", "i1": "<i4", "i2": "<i4", "i4": "<i4", "f4": "<f4", "f8": "<f8",
+         "u4": "<f8", "i8": "<f8", "u8": "<f8"}  # fmt: skip
+_NAMES = {"<f4": "float", "<f8": "double", "<i4": "int", "<u2": "uint16", "|u1": "uchar"}
+_EXACT = 2**53  # whole numbers up to here are themselves in double precision
+
+
+def held_type(column: Column) -> np.dtype[Any]:
+    """Type that a column has in a file."""
+    return np.dtype(_HELD.get(np.dtype(column.dtype).str[1:], "<f8"))
+
+
+def as_held(column: Column, values: NDArray[Any]) -> NDArray[Any]:
+    """Values of a column in the type that it has in a file.
+
+    Raises
+    ------
+    LidarpoolError
+        If a value is too large to be held exactly.
+    """
+    wanted = held_type(column)
+    if wanted == np.float64 and values.dtype.kind in "iu" and len(values):
+        largest = max(abs(int(values.min())), abs(int(values.max())))
+        if largest > _EXACT:
+            raise LidarpoolError(
+                f"Column {column.name!r} holds {largest}, and a PLY file holds whole numbers up to "
+                f"{_EXACT} exactly: leave the column out."
+            )
+    return values.astype(wanted, copy=False)
+
+
+def row_type(real: np.dtype[np.floating], table: Sequence[Column]) -> np.dtype[np.void]:
+    """Row of a file whose positions are of type `real`, in the order in which Open3D writes."""
+    kind = "<f8" if real == np.float64 else "<f4"
+    return np.dtype([(axis, kind) for axis in AXES] + [(c.in_files, held_type(c)) for c in table])
+
+
+def header(row: np.dtype[np.void], count: int) -> bytes:
+    """Header of a file of `count` points, as Open3D writes it."""
+    lines = [f"property {_NAMES[row[name].str]} {name}" for name in row.names or ()]
+    lines = ["comment Created by Open3D", f"element vertex {count}", *lines, "end_header\n"]
+    return (_MAGIC + "\n".join(lines)).encode("ascii")
+
+
+def layout(path: Path) -> tuple[int, int, np.dtype[np.void]]:
+    """Find where the points of a PLY file begin, how many there are, and the type of a row.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be read.
+    ValueError
+        If it is not a whole binary PLY file with our properties; the message is a clause.
+    """
+    if path.is_fifo():  # waits for a writer, and cannot be read anywhere but in order
+        raise ValueError("it is a pipe")
+    with path.open("rb") as file:
+        head, found, _ = file.read(_HEADER_LIMIT).partition(b"end_header\n")
+    text = head.decode("ascii", errors="replace")
+    if not found or not text.startswith(_MAGIC):
+        raise ValueError("it has no header of a binary little-endian PLY file")
+    count, dtype = _parse_header(text)
+    start = len(head) + len(found)
+    announced, size = start + count * dtype.itemsize, path.stat().st_size
+    if size != announced:
+        raise ValueError(f"{count:,} points in {announced:,} bytes announced, {size:,} bytes there")
+    return start, count, dtype
+
+
+def _parse_header(text: str) -> tuple[int, np.dtype[np.void]]:
+    """Take number and type of the rows from a header; ValueError if they are not ours."""
+    elements = [line.split() for line in text.splitlines() if line.startswith("element")]
+    properties = [line.split() for line in text.splitlines() if line.startswith("property")]
+    if len(elements) != 1 or elements[0][1] != "vertex" or not elements[0][-1].isdigit():
+        raise ValueError("it holds more than points, or no points")
+    if any(len(entry) != 3 or entry[1] not in _PLY_TYPES for entry in properties):
+        raise ValueError("it has list properties or unknown types")
+    dtype = np.dtype([(name, _PLY_TYPES[kind]) for _, kind, name in properties])
+    missing = {*AXES} - set(dtype.names or ())
+    if missing:
+        raise ValueError(f"it lacks {', '.join(sorted(missing))}")
+    return int(elements[0][-1]), dtype

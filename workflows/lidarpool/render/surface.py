@@ -1,0 +1,85 @@
+"""A scene's triangles made ready to be looked at: closest hits and smooth normals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from raybeam import RayCaster
+
+from ..scene.scene import Scene
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+# Faces that meet at a flatter angle than this are shaded as one smooth surface.
+CREASE_COSINE = np.cos(np.radians(35))
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Triangles, what casts rays at them, and their normals.
+
+    Parameters
+    ----------
+    scene
+        The triangles.
+    caster
+        Finds closest hits.
+    face_normals
+        (f, 3) unit length; zero for degenerate triangles.
+    vertex_normals
+        (v, 3) unit length, weighted by area; zero where faces cancel out.
+    """
+
+    scene: Scene
+    caster: RayCaster
+    face_normals: Floats
+    vertex_normals: Floats
+
+    @classmethod
+    def of(cls, scene: Scene, backend: str = "auto") -> Surface:
+        """Build what is needed to look at a scene."""
+        a, b, c = (scene.vertices[scene.faces[:, k]] for k in range(3))
+        doubled = np.cross(b - a, c - a)
+        at_vertices = np.zeros_like(scene.vertices)
+        for corner in range(3):
+            for k in range(3):
+                at_vertices[:, k] += np.bincount(
+                    scene.faces[:, corner], weights=doubled[:, k], minlength=len(at_vertices)
+                )
+        caster = RayCaster(scene.vertices, scene.faces, backend=backend)
+        return cls(scene, caster, unit(doubled), unit(at_vertices))
+
+    def normals(self, triangle: Ints, u: Floats, v: Floats, towards: Floats) -> Floats:
+        """Shading normals (n, 3) at hits, turned to the side that a ray came from.
+
+        Interpolated from the corners (Phong 1975), except across creases, where a corner's
+        normal gives way to that of the face.
+
+        Parameters
+        ----------
+        triangle, u, v
+            (n,) from the ray caster.
+        towards
+            (n, 3) directions of the rays.
+        """
+        flat = self.face_normals[triangle]
+        corners = self.scene.faces[triangle]
+        smooth = np.zeros_like(flat)
+        for corner, weight in enumerate((1 - u - v, u, v)):
+            normal = self.vertex_normals[corners[:, corner]]
+            creased = (normal * flat).sum(axis=1) < CREASE_COSINE
+            smooth += weight[:, None] * np.where(creased[:, None], flat, normal)
+        smooth = unit(smooth)
+        away = (flat * towards).sum(axis=1) > 0
+        smooth[away] *= -1
+        return smooth
+
+
+def unit(vectors: Floats) -> Floats:
+    """Scale vectors (n, 3) to length one; those of no length stay zero."""
+    length = np.sqrt((vectors * vectors).sum(axis=1, keepdims=True))
+    return vectors / np.where(length > 0, length, 1.0)

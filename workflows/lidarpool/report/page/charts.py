@@ -1,0 +1,195 @@
+"""Shapes of the page's charts; the axes are text of the page, so that they are legible anywhere."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from poolpart.wording import counted
+
+from ...plan import Plan, Trial
+from ...render.captions import without_common_prefix
+from ...render.stage import nice_step
+from .words import share
+
+HIGH, WIDE = 100, 1000  # units of a drawing, whatever its size on the page
+OBJECTS_MOST = 25
+RINGS_MOST = 128
+TICKS = 6
+_POINTS_MOST = 400  # of a curve
+_LEAST_EXCESS = 1e-6  # a float32 history knows no less
+
+Floats = NDArray[np.float64]
+Tick = tuple[float, str]  # per cent of the axis, label
+
+
+@dataclass(frozen=True)
+class Bar:
+    """A row of a bar chart: name in full and short, number, share of all, length in per cent."""
+
+    name: str
+    label: str
+    count: int
+    share: str
+    percent: float
+
+
+@dataclass(frozen=True)
+class ObjectBars:
+    """Points by object; `rest` tells of those that have no bar."""
+
+    bars: tuple[Bar, ...]
+    rest: str
+
+
+@dataclass(frozen=True)
+class Histogram:
+    """Columns: a path for SVG, ticks below, and the tallest column's count."""
+
+    path: str
+    ticks: tuple[Tick, ...]
+    tallest: int
+    columns: int
+
+
+@dataclass(frozen=True)
+class Convergence:
+    """Curves of the trials' best costs: paths for SVG and ticks on both axes."""
+
+    band: str
+    median: str
+    best: str
+    across: tuple[Tick, ...]
+    up: tuple[Tick, ...]
+    title: str
+
+
+def object_bars(counts: Mapping[str, int]) -> ObjectBars:
+    """Bars of the objects with the most points."""
+    total, ranked = sum(counts.values()), sorted(counts.items(), key=lambda item: -item[1])
+    hit = [item for item in ranked if item[1]]
+    shown = hit[:OBJECTS_MOST]
+    most = shown[0][1] if shown else 1
+    labels = dict(zip(counts, without_common_prefix(list(counts)), strict=True))
+    bars = [Bar(name, labels[name], n, share(n, total), 100 * n / most) for name, n in shown]
+    rest = []
+    if more := hit[OBJECTS_MOST:]:
+        points = sum(count for _, count in more)
+        rest.append(
+            f"{counted(len(more), 'more object')} with {counted(points, 'point')} "
+            f"({share(points, total)})"
+        )
+    if missed := len(ranked) - len(hit):
+        rest.append(f"{counted(missed, 'object')} without points")
+    return ObjectBars(tuple(bars), "; ".join(rest))
+
+
+def range_histogram(counts: NDArray[np.int64], edges: Floats) -> Histogram:
+    """Columns of points by distance, (b,), between edges, (b + 1,), in metres."""
+    low, high = float(edges[0]), float(edges[-1])
+    step = nice_step((high - low) / TICKS)
+    at = np.arange(math.ceil(low / step - 1e-9), high / step + 1e-9) * step
+    ticks = [(100 * (x - low) / (high - low), f"{x:.6g} m") for x in at.tolist()]
+    return Histogram(_columns(counts), tuple(ticks), int(counts.max()), len(counts))
+
+
+def ring_histogram(counts: NDArray[np.int64]) -> Histogram:
+    """Columns of points by layer, (layers,); neighbours together where there are many."""
+    each = -(-len(counts) // RINGS_MOST)
+    columns = np.add.reduceat(counts, np.arange(0, len(counts), each))
+    step = max(1, round(nice_step(len(counts) / TICKS)))
+    wide = len(columns) * each
+    ticks = [(100 * (ring + 0.5) / wide, str(ring)) for ring in range(0, len(counts), step)]
+    return Histogram(_columns(columns), tuple(ticks), int(columns.max()), len(columns))
+
+
+def _columns(counts: NDArray[np.int64]) -> str:
+    """Path of columns as high as the drawing."""
+    width, most = WIDE / len(counts), max(1, int(counts.max()))
+    gap = min(0.15 * width, 2.0)
+    path = []
+    for k, count in enumerate(counts.tolist()):
+        if count:
+            high = max(0.6, HIGH * count / most)
+            path.append(
+                f"M{k * width + gap:.1f} {HIGH}V{HIGH - high:.1f}h{width - 2 * gap:.1f}V{HIGH}Z"
+            )
+    return "".join(path)
+
+
+def convergence(trials: Sequence[Trial], plan: Plan) -> Convergence | None:
+    """Curves of how the trials came down to the shortest path; None where there is nothing."""
+    costs = np.array([trial.history for trial in trials], np.float64)  # (trials, iterations)
+    if not costs.size:
+        return None
+    chosen = np.unique(np.linspace(0, costs.shape[1] - 1, _POINTS_MOST).astype(int))
+    best = next((k for k, trial in enumerate(trials) if trial.trial == plan.trial), 0)
+    scale = _scale(costs, plan.shortest_possible)
+    low, middle, high = np.quantile(costs[:, chosen], (0.1, 0.5, 0.9), axis=0, method="nearest")
+    x = (chosen + 1) / costs.shape[1] * WIDE
+    up, down = scale.line(x, high), scale.line(x[::-1], low[::-1])
+    step = max(1, round(nice_step(costs.shape[1] / TICKS)))
+    return Convergence(
+        band=f"M{up}L{down}Z",
+        median=f"M{scale.line(x, middle)}",
+        best=f"M{scale.line(x, costs[best, chosen])}",
+        across=tuple(
+            (100 * k / costs.shape[1], f"{k:,}") for k in range(0, costs.shape[1] + 1, step)
+        ),
+        up=tuple(scale.ticks()),
+        title=scale.title,
+    )
+
+
+@dataclass(frozen=True)
+class _Scale:
+    """Costs to heights: logarithms of the excess over `shortest`, or metres where it is None."""
+
+    shortest: float | None
+    low: float
+    high: float
+
+    @property
+    def title(self) -> str:
+        if self.shortest is None:
+            return "lowest cost so far, in metres"
+        return "lowest cost so far, above the shortest possible path"
+
+    def line(self, x: Floats, costs: Floats) -> str:
+        """Points of a curve; what is above the drawing runs along its edge."""
+        values = _values(costs, self.shortest)
+        y = HIGH * (1 - (values.clip(self.low, self.high) - self.low) / (self.high - self.low))
+        return "L".join(f"{a:.1f} {b:.2f}" for a, b in zip(x.tolist(), y.tolist(), strict=True))
+
+    def ticks(self) -> Iterable[Tick]:
+        """Whole powers of ten, or round lengths."""
+        if self.shortest is None:
+            step = nice_step((self.high - self.low) / 4)
+            at = np.arange(math.ceil(self.low / step), self.high / step + 1e-9) * step
+            labels = [f"{value:,.6g} m" for value in at.tolist()]
+        else:
+            at = np.arange(self.low, self.high + 0.5)
+            labels = [f"{10.0 ** (power + 2):.4g}%" for power in at.tolist()]
+        for value, label in zip(at.tolist(), labels, strict=True):
+            yield 100 * (value - self.low) / (self.high - self.low), label
+
+
+def _scale(costs: Floats, shortest: float) -> _Scale:
+    base = shortest if 0 < shortest < math.inf else None
+    values = _values(costs, base)
+    least = float(values.min())
+    if base is None:
+        return _Scale(None, least, max(float(np.quantile(values, 0.9)), least + 1e-3))
+    low = math.floor(max(least, math.log10(_LEAST_EXCESS)))
+    return _Scale(base, low, min(max(math.ceil(values.max()), low + 1), max(1, low + 1)))
+
+
+def _values(costs: Floats, shortest: float | None) -> Floats:
+    finite = np.nan_to_num(costs, nan=1e30, posinf=1e30)
+    if shortest is None:
+        return finite
+    return np.asarray(np.log10(np.maximum(finite / shortest - 1, _LEAST_EXCESS)))

@@ -1,0 +1,205 @@
+"""The report of a run: everything a reader wants to check, as plain data for JSON."""
+
+from __future__ import annotations
+
+import math
+import platform
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import numpy as np
+
+from .._version import __version__
+from ..base.task_book import StageTotals, union
+from ..plan import Planning
+from ..run.result import Result
+from ..run.trials import TRIAL
+from ..scan import COLLECT, GENERATE, INTERSECT, SORT
+from ..scene.scene import Scene
+from ..sensor import Sensor, Survey
+from .cloud_numbers import CloudNumbers
+
+_ORDER = (GENERATE, INTERSECT, SORT, COLLECT, TRIAL)  # in which stages are listed
+
+_PACKAGES = (
+    "numpy",
+    "dask",
+    "distributed",
+    "trimesh",
+    "open3d-cpu",
+    "open3d",
+    "matplotlib",
+    "cupy-cuda12x",
+    "cupy-cuda13x",
+)
+
+
+def versions() -> dict[str, str]:
+    """Versions of this package, of Python and of what it stands on."""
+    found = {"lidarpool": __version__, "python": platform.python_version()}
+    for name in _PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def make_report(
+    result: Result,
+    scene: Scene,
+    survey: Survey,
+    planning: Planning | None,
+    files: Sequence[str],
+    numbers: CloudNumbers,
+) -> dict[str, Any]:
+    """Report of a run, ready for JSON.
+
+    Lengths are in metres, times in seconds; what is infinite or unknown is None.
+    """
+    return {
+        "versions": versions(),
+        "machine": {"system": platform.platform(), "processor": platform.machine()},
+        "backend": result.backend,
+        "notes": list(result.notes),
+        "parameters": _parameters(scene, survey),
+        "scans": survey.scan_count,
+        "rays": result.rays,
+        "hits": result.hits,
+        "points": len(result.points),
+        "points_by_object": {
+            name: int(count) for name, count in zip(scene.names, numbers.by_object, strict=True)
+        },
+        "columns": _columns(result, numbers),
+        "seconds": {
+            "total": round(result.seconds, 3),
+            "survey": round(result.survey_seconds, 3),
+            "planning": round(result.planning_seconds, 3),
+            "survey_and_planning_overlap": round(overlap_seconds(result.stages), 3),
+        },
+        "stages": _stages(result.stages),
+        "tasks": _tasks(result.stages),
+        "placement_violations": sum(stage.violations for stage in result.stages),
+        "misplaced_tasks": [
+            asdict(record) for stage in result.stages for record in stage.misplaced
+        ][:20],
+        "replayed": result.replayed,
+        "duplicates_dropped": result.duplicates_dropped,
+        "resumed_scans": result.resumed,
+        "planning": _planning(result, planning, scene),
+        "files": list(files),
+    }
+
+
+def _parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
+    path = survey.path
+    first = [path.pose(station) for station in range(min(path.stations, 10))]
+    return {
+        "objects": len(scene.names),
+        "triangles": len(scene.faces),
+        "origin": scene.origin.tolist(),
+        "sensor": _sensor(survey.sensor),
+        "poses": path.stations,
+        "first_poses": [asdict(pose) for pose in first],
+        "steps": survey.steps,
+        "keep_every": survey.keep_every,
+        "precision_m": survey.precision_m,
+    }
+
+
+def _columns(result: Result, numbers: CloudNumbers) -> list[dict[str, Any]]:
+    """Describe the columns of the cloud beside x, y and z."""
+    return [
+        {
+            "name": column.name,
+            "file_name": column.in_files,
+            "dtype": np.dtype(column.dtype).name,
+            "unit": column.unit,
+            "meaning": column.meaning,
+            "kind": column.kind,
+            "lowest": low,
+            "highest": high,
+        }
+        for column in result.points.table
+        for low, high in [numbers.limits.get(column.name, (0, 0))]
+    ]
+
+
+def _sensor(sensor: Sensor) -> dict[str, Any]:
+    """Describe a sensor: its beams, and the numbers and words of its head."""
+    elevations = np.degrees(sensor.beams.elevation)
+    head = {
+        name: value
+        for name, value in vars(sensor.head).items()
+        if not name.startswith("_") and isinstance(value, (int, float, str))
+    }
+    return {
+        "kind": type(sensor).__name__,
+        "channels": sensor.channels,
+        "elevation_deg": [round(float(elevations.min()), 6), round(float(elevations.max()), 6)],
+        "head": {"kind": type(sensor.head).__name__, **head},
+        "min_range_m": sensor.min_range_m,
+        "max_range_m": _finite(sensor.max_range_m),
+    }
+
+
+def _stages(totals: Iterable[StageTotals]) -> dict[str, dict[str, Any]]:
+    """For each stage: tasks, items, seconds of work, and the span from first start to last stop."""
+    return {
+        stage.stage: {
+            "partition": stage.partition,
+            "tasks": stage.tasks,
+            "items": stage.items,
+            "task_seconds": round(stage.seconds, 4),
+            "span_seconds": round(stage.stop - stage.start, 4),
+            "workers": sorted(stage.workers),
+        }
+        for stage in sorted(totals, key=lambda totals: _ORDER.index(totals.stage))
+    }
+
+
+def _tasks(totals: Iterable[StageTotals]) -> dict[str, dict[str, int]]:
+    """Tasks by the partition that they really ran on, and by stage."""
+    tasks: dict[str, dict[str, int]] = {}
+    for stage in totals:
+        for name, count in stage.resources.items():
+            tasks.setdefault(name, {})[stage.stage] = count
+    return tasks
+
+
+def overlap_seconds(totals: Iterable[StageTotals]) -> float:
+    """Time during which stage 2 and planning trials were both under way."""
+    busy = {stage.stage: union(stage.busy) for stage in totals}
+    casting, planning = (busy.get(stage, []) for stage in (INTERSECT, TRIAL))
+    return sum(max(0.0, min(a[1], b[1]) - max(a[0], b[0])) for a in casting for b in planning)
+
+
+def _planning(result: Result, planning: Planning | None, scene: Scene) -> dict[str, Any] | None:
+    """Tell what was planned and found; places are in world coordinates, as in the scenario."""
+    plan = result.plan
+    if plan is None or planning is None:
+        return None
+    origin = scene.origin[:2]
+    return {
+        "start": (planning.start + origin).tolist(),
+        "target": (planning.target + origin).tolist(),
+        "obstacles": len(planning.radii),
+        "trials": plan.trials,
+        "collision_free_trials": sum(trial.collision_free for trial in result.trials),
+        "particles": planning.particles,
+        "iterations": planning.iterations,
+        "seed": planning.seed,
+        "best_trial": plan.trial,
+        "best_length": plan.length,
+        "shortest_possible": _finite(plan.shortest_possible),
+        "excess": _finite(plan.excess),
+        "clearance": _finite(plan.clearance),
+        "collision_free": plan.collision_free,
+        "path": (plan.path + origin).tolist(),
+    }
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

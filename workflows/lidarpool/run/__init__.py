@@ -1,0 +1,1 @@
+"""Runs: simulate, checks before a run, what is kept, resume, progress."""

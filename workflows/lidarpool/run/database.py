@@ -1,0 +1,320 @@
+"""The database of a run: which parts and trials belong to the result.
+
+One SQLite file. A batch belongs to the result from the moment its receipt is in here; before that
+anything may be lost or done twice, after that a second receipt is dropped. What is not in here is
+offered again: that is all of recovery, and of resuming.
+"""
+
+from __future__ import annotations
+
+import bisect
+import json
+import sqlite3
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.errors import LidarpoolError
+from ..plan import Trial
+from ..scan.messages import Receipt
+from .trial_record import trial_from_json, trial_to_json
+
+FORMAT = 2
+FILE = "run.db"
+
+_TABLES = """
+CREATE TABLE meta (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
+CREATE TABLE parts (
+    first INTEGER PRIMARY KEY, stop INTEGER NOT NULL, name TEXT NOT NULL, rows INTEGER NOT NULL,
+    size INTEGER NOT NULL, hits INTEGER NOT NULL, cells TEXT NOT NULL, summaries BLOB NOT NULL
+);
+CREATE TABLE trials (trial INTEGER PRIMARY KEY, data TEXT NOT NULL);
+"""
+
+
+class RunDatabase:
+    """What has been committed of one run.
+
+    Parameters
+    ----------
+    path
+        The file; made where there is none.
+    scan_count
+        Scans of the survey.
+    durable
+        Whether what is committed must survive a power cut.
+
+    Raises
+    ------
+    LidarpoolError
+        If it is damaged, of another version, in use by another run, or cannot be written.
+    """
+
+    def __init__(self, path: Path, scan_count: int, *, durable: bool = True) -> None:
+        self.path, self.scan_count, self._durable = path, scan_count, durable
+        self.meta: dict[str, str] = {}
+        self.parts: dict[int, Receipt] = {}  # {first scan: its part}
+        self.trials: list[Trial] = []
+        self.committed = np.zeros(scan_count, bool)
+        self.scans_done = 0
+        self.point_count = self.hits = 0
+        self._firsts: list[int] = []  # of the parts, in order
+        self._frames_written = 0
+        self.frames = 0  # scans that were handed out as frames, from the first on
+        with self._explained():
+            self._sql = sqlite3.connect(
+                path, isolation_level=None, timeout=1.0, check_same_thread=False
+            )
+            try:
+                self._open()
+            except BaseException:
+                self._sql.close()
+                raise
+
+    def _open(self) -> None:
+        # The lock is held as long as the database is open: no second run writes to it.
+        self._sql.execute("PRAGMA locking_mode = EXCLUSIVE")
+        self._sql.execute(f"PRAGMA synchronous = {'FULL' if self._durable else 'OFF'}")
+        self._sql.execute("BEGIN IMMEDIATE")
+        if not self._sql.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
+            for statement in _TABLES.split(";"):
+                self._sql.execute(statement)
+            self._set("format", str(FORMAT))
+        self._sql.execute("COMMIT")
+        self.meta = dict(self._sql.execute("SELECT name, value FROM meta"))
+        if self.meta.get("format") != str(FORMAT):
+            raise sqlite3.DatabaseError(
+                f"is of format {self.meta.get('format', 'unknown')}, and this version reads "
+                f"{FORMAT}"
+            )
+        self.frames = self._frames_written = int(self.meta.get("frames", 0))
+        rows = self._sql.execute(
+            "SELECT first, stop, name, rows, size, hits, cells, "
+            "CASE WHEN stop > ? THEN summaries ELSE x'' END FROM parts ORDER BY first",
+            (self.frames,),
+        )
+        for row in rows:
+            first, stop, name, count, size, hits, cells, summaries = row
+            self._enter(
+                Receipt(
+                    -1, first, stop, name, count, size, hits, tuple(json.loads(cells)), summaries
+                )
+            )
+        self.trials = [
+            trial_from_json(data.encode())
+            for (data,) in self._sql.execute("SELECT data FROM trials ORDER BY trial")
+        ]
+
+    # -- what there is -------------------------------------------------------------------
+
+    @property
+    def complete(self) -> bool:
+        """Whether all scans are committed and were handed out."""
+        return self.scans_done == self.scan_count and self.frames == self.scan_count
+
+    @property
+    def ordered(self) -> list[Receipt]:
+        """The parts in scan order."""
+        return [self.parts[first] for first in self._firsts]
+
+    @property
+    def cells(self) -> NDArray[np.int64] | None:
+        """Lowest and highest cell of all points, (2, 3); None where there are none."""
+        found = [part.cells for part in self.parts.values() if part.cells]
+        if not found:
+            return None
+        table = np.array(found, np.int64).reshape(-1, 2, 3)
+        return np.stack([table[:, 0].min(axis=0), table[:, 1].max(axis=0)])
+
+    @property
+    def parts_done(self) -> int:
+        """Parts that are committed."""
+        return len(self.parts)
+
+    def unframed(self) -> list[Receipt]:
+        """Parts that hold scans which were not handed out as frames, in order."""
+        at = max(0, bisect.bisect_right(self._firsts, self.frames) - 1)
+        return [p for first in self._firsts[at:] if (p := self.parts[first]).stop > self.frames]
+
+    def forget_summaries(self, part: Receipt) -> None:
+        """Drop the summaries of a part from memory: all of them were handed out."""
+        self.parts[part.first] = replace(part, summaries=b"", records=())
+
+    def summaries_of(self, scans: Sequence[int]) -> list[tuple[int, bytes]]:
+        """Summaries of the parts that hold some scans: (first scan, summaries), in order."""
+        found: dict[int, bytes] = {}
+        with self._explained():
+            for scan in scans:
+                part = self.part_of(scan)
+                if part.first not in found:
+                    query = "SELECT summaries FROM parts WHERE first = ?"
+                    found[part.first] = self._sql.execute(query, (part.first,)).fetchone()[0]
+        return sorted(found.items())
+
+    def part_of(self, scan: int) -> Receipt:
+        """Part that holds a scan which is committed; KeyError where it is not."""
+        at = bisect.bisect_right(self._firsts, scan) - 1
+        part = self.parts[self._firsts[at]] if at >= 0 else None
+        if part is None or scan >= part.stop:
+            raise KeyError(scan)
+        return part
+
+    def missing(self, first: int, stop: int) -> list[tuple[int, int]]:
+        """Return the scans from `first` to `stop` that are not committed, as half-open ranges."""
+        absent = np.flatnonzero(~self.committed[first:stop]) + first
+        cuts = np.flatnonzero(np.diff(absent) > 1) + 1
+        return [(int(run[0]), int(run[-1]) + 1) for run in np.split(absent, cuts) if len(run)]
+
+    # -- what comes in -------------------------------------------------------------------
+
+    def set(self, **values: str) -> None:
+        """Keep some values.
+
+        Raises
+        ------
+        LidarpoolError
+            If the disk is full or fails, as in all methods that write.
+        """
+        with self._transaction():
+            for name, value in values.items():
+                self._set(name, value)
+        self.meta |= values
+
+    def commit(self, receipts: Sequence[Receipt]) -> list[Receipt]:
+        """Enter parts in one transaction; returns those that were new.
+
+        One that has a scan which is committed already is left out as a whole.
+        """
+        new: list[Receipt] = []
+        taken: set[int] = set()
+        for receipt in receipts:
+            scans = range(receipt.first, receipt.stop)
+            if not self.committed[receipt.first : receipt.stop].any() and taken.isdisjoint(scans):
+                new.append(receipt)
+                taken.update(scans)
+        if new:
+            with self._transaction():
+                self._sql.executemany(
+                    "INSERT INTO parts VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+                    [
+                        (p.first, p.stop, p.name, p.rows, p.size, p.hits, json.dumps(p.cells),
+                         p.summaries)
+                        for p in new
+                    ],
+                )  # fmt: skip
+                self._write_frames()
+            for receipt in new:
+                self._enter(receipt)
+        return new
+
+    def drop(self, receipts: Sequence[Receipt]) -> None:
+        """Forget parts that are not in storage any more: their scans are offered again."""
+        with self._transaction():
+            self._sql.executemany(
+                "DELETE FROM parts WHERE first = ?", [(p.first,) for p in receipts]
+            )
+        for part in receipts:
+            del self.parts[part.first]
+            self._firsts.remove(part.first)
+            self.committed[part.first : part.stop] = False
+            self.scans_done -= part.stop - part.first
+            self.point_count -= part.rows
+            self.hits -= part.hits
+
+    def add_trial(self, trial: Trial) -> None:
+        """Keep a planning trial."""
+        with self._transaction():
+            self._sql.execute(
+                "INSERT OR IGNORE INTO trials VALUES (?, ?)",
+                (trial.trial, trial_to_json(trial).decode()),
+            )
+        self.trials.append(trial)
+
+    def save_frames(self) -> None:
+        """Keep how many frames were handed out; they go along with each commit anyway."""
+        if self.frames != self._frames_written:
+            with self._transaction():
+                self._write_frames()
+
+    def unlock(self) -> None:
+        """Let others use the file; what is in it can still be read."""
+        with self._explained():
+            self._sql.execute("PRAGMA locking_mode = NORMAL")
+            self._sql.execute("SELECT count(*) FROM meta").fetchone()  # the lock goes with a read
+
+    def close(self) -> None:
+        """Let go of the file."""
+        self._sql.close()
+
+    def _enter(self, part: Receipt) -> None:
+        if not 0 <= part.first < part.stop <= self.scan_count:
+            raise sqlite3.DatabaseError(
+                f"holds scans {part.first} to {part.stop - 1} of {self.scan_count}"
+            )
+        if self.committed[part.first : part.stop].any():
+            raise sqlite3.DatabaseError(f"holds scans {part.first} to {part.stop - 1} twice")
+        self.parts[part.first] = part
+        bisect.insort(self._firsts, part.first)
+        self.committed[part.first : part.stop] = True
+        self.scans_done += part.stop - part.first
+        self.point_count += part.rows
+        self.hits += part.hits
+
+    def _set(self, name: str, value: str) -> None:
+        self._sql.execute("INSERT OR REPLACE INTO meta VALUES (?, ?)", (name, value))
+
+    def _write_frames(self) -> None:
+        if self.frames != self._frames_written:
+            self._set("frames", str(self.frames))
+            self._frames_written = self.frames
+
+    @contextmanager
+    def _transaction(self) -> Iterator[None]:
+        with self._explained():
+            self._sql.execute("BEGIN IMMEDIATE")
+            try:
+                yield
+                self._sql.execute("COMMIT")
+            except BaseException:
+                if self._sql.in_transaction:
+                    self._sql.execute("ROLLBACK")
+                raise
+
+    @contextmanager
+    def _explained(self) -> Iterator[None]:
+        """Say of an error of SQLite what it means."""
+        try:
+            yield
+        except sqlite3.OperationalError as error:
+            if "locked" in str(error):
+                raise LidarpoolError(f"Another run is using {self.path.parent}.") from error
+            if "no such" in str(error):  # table or column
+                raise self._damage(error) from error
+            raise LidarpoolError(
+                f"{self.path} cannot be written ({error}): make room on its disk, or give another "
+                "folder."
+            ) from error
+        except (sqlite3.Error, ValueError, TypeError, KeyError) as error:
+            raise self._damage(error) from error
+
+    def _damage(self, error: Exception) -> LidarpoolError:
+        text = str(error)
+        clause = text if text.startswith(("is of", "holds")) else f"is damaged ({text})"
+        return LidarpoolError(f"{self.path} cannot be continued: it {clause}.")
+
+
+def parts_of(path: Path) -> tuple[str, list[str]]:
+    """Where the parts of a run are, and their names; nothing where that cannot be read."""
+    if not path.is_file():
+        return "", []
+    try:
+        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as sql:
+            names = [name for (name,) in sql.execute("SELECT name FROM parts")]
+            place = sql.execute("SELECT value FROM meta WHERE name = 'parts'").fetchone()
+    except sqlite3.Error:
+        return "", []
+    return (place[0] if place else ""), names

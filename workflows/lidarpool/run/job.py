@@ -1,0 +1,91 @@
+"""What a run is to do; it does not change while it is done."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from ..base.errors import LidarpoolError
+from ..plan import Planning
+from ..scan.watch import PATIENCE_S, WAIT_S
+from ..scenario.scenario import Scenario
+from ..scene.scene import Scene
+from ..sensor import Survey
+from .checks import check_counts, check_precision
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """A survey, beside it perhaps a planning, and how both are to be run.
+
+    Parameters
+    ----------
+    scene, survey, planning
+        What to scan, how, and what to plan meanwhile.
+    backend
+        Ray-casting backend of stage 2: auto, cuda, embree or numpy.
+    queue_capacity
+        Items that stage 1 may be ahead of stage 2.
+    collectors
+        Tasks of stage 4.
+    scans_per_second
+        How fast scans are made; None for as fast as they are cast.
+    wait_s
+        How long to wait for partitions that are still empty when the run begins, seconds.
+    patience_s
+        How long to wait for partitions that become empty, seconds.
+
+    Raises
+    ------
+    LidarpoolError
+        If a number is below 1, or the survey's precision too fine for the scene.
+    """
+
+    scene: Scene
+    survey: Survey
+    planning: Planning | None = None
+    backend: str = "auto"
+    queue_capacity: int = 10
+    collectors: int = 2
+    scans_per_second: float | None = None
+    wait_s: float = WAIT_S
+    patience_s: float = PATIENCE_S
+
+    def __post_init__(self) -> None:
+        check_precision(self.scene, self.survey)
+        check_counts(queue_capacity=self.queue_capacity, collectors=self.collectors)
+        for name in ("wait_s", "patience_s"):
+            if not getattr(self, name) >= 0:
+                raise LidarpoolError(f"{name} is {getattr(self, name)}; it must be 0 or more.")
+        if self.scans_per_second is not None and not 0 < self.scans_per_second < float("inf"):
+            raise LidarpoolError(
+                f"scans_per_second is {self.scans_per_second}; it must be above 0, or None for "
+                "as many as are cast."
+            )
+
+    @property
+    def trials(self) -> int:
+        """Planning trials that there are to be."""
+        return self.planning.trials if self.planning else 0
+
+
+def make_job(
+    scenario: Scenario, backend: str | None = None, no_plan: bool = False, **options: Any
+) -> Job:
+    """Read the scene and put together what a scenario asks for; options go first.
+
+    Raises
+    ------
+    LidarpoolError
+        If a mesh file cannot be read, or fields do not fit together or the scene.
+    """
+    scene = scenario.build_scene()
+    return Job(
+        scene,
+        scenario.survey(scene),
+        None if no_plan else scenario.plan(scene),
+        backend or scenario.pool.backend,
+        scenario.pool.queue_capacity,
+        scenario.pool.collectors,
+        **options,
+    )

@@ -1,0 +1,79 @@
+"""What a run gives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from poolpart import TaskRecord
+
+from ..base.task_book import StageTotals
+from ..columns.cloud import Cloud
+from ..columns.parts import StoredCloud
+from ..plan import Plan, Trial
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """What a run gives.
+
+    Parameters
+    ----------
+    points
+        The points, in parts: to be read in order a piece at a time, or written with `save_cloud`.
+    plan, trials
+        The best path and all trials; None and empty where nothing was planned.
+    backend
+        Name of the ray-casting backend that was used.
+    rays, hits
+        Rays fired, and those that hit something.
+    records
+        Tasks of the run: where each ran and when; of a stage with thousands, every so many.
+    stages
+        All tasks of each stage together.
+    seconds, survey_seconds, planning_seconds
+        Wall time of all, of the survey and of the planning.
+    replayed, duplicates_dropped
+        Batches that had to be offered again, and scans that came twice because of it.
+    resumed
+        Scans whose points are of an earlier run. `records` and seconds are of this run only.
+    notes
+        What a user should know, such as that the GPU partition had no GPU.
+    """
+
+    points: StoredCloud
+    plan: Plan | None
+    trials: tuple[Trial, ...]
+    backend: str
+    rays: int
+    hits: int
+    records: tuple[TaskRecord, ...]
+    stages: tuple[StageTotals, ...]
+    seconds: float
+    survey_seconds: float
+    planning_seconds: float
+    replayed: int
+    duplicates_dropped: int
+    resumed: int
+    notes: tuple[str, ...]
+    _hit_counts: Callable[[], NDArray[np.int64]] = field(repr=False)
+    _sample_rays: Callable[[], NDArray[np.float32]] = field(repr=False)
+
+    @cached_property
+    def cloud(self) -> Cloud:
+        """The points in memory, read when first asked for."""
+        return self.points.load()
+
+    @cached_property
+    def hit_counts(self) -> NDArray[np.int64]:
+        """Rays that hit each triangle of the scene, (f,), read when first asked for."""
+        return self._hit_counts()
+
+    @cached_property
+    def sample_rays(self) -> NDArray[np.float32]:
+        """First and last point of some rays, (k, 2, 3), metres, local coordinates."""
+        return self._sample_rays()

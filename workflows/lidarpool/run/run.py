@@ -1,0 +1,345 @@
+"""A run on a cluster: the survey and, beside it, the planning, stepped in turn."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from typing import TypeVar
+
+from distributed import Client
+from distributed.client import FutureCancelledError
+from distributed.comm.core import CommClosedError
+
+from poolpart import (
+    Backoff,
+    Partition,
+    PipeClosed,
+    PipeFailed,
+    PoolError,
+    assign_devices,
+)
+
+from ..base.errors import LidarpoolError
+from ..base.task_book import TaskBook
+from ..plan import best
+from ..scan import (
+    GPU,
+    LIDAR,
+    OTHER,
+    Frame,
+    Receipt,
+    RigPlan,
+    SurveyDriver,
+    SurveyOptions,
+    Watch,
+)
+from .checks import find_workers
+from .progress import Progress
+from .result import Result
+from .store import RunStore
+from .trials import TrialPump
+
+T = TypeVar("T")
+
+# What Dask raises, here or there, once the scheduler is gone.
+_CLUSTER_LOST = (OSError, CommClosedError, FutureCancelledError, PipeClosed, PipeFailed)
+
+PROGRESS_EVERY_S = 0.1
+SAVE_EVERY_S = 1.0  # how many frames were handed out
+LOST_S = 0.5  # for a client to notice that its scheduler is gone
+PAUSED_S = 0.1  # from one look at a paused run to the next
+
+
+def _silent(words: str) -> None:
+    """Tell nobody."""
+
+
+class Run:
+    """One run on one cluster, checked and ready to be driven.
+
+    Parameters
+    ----------
+    client
+        Client of the cluster.
+    store
+        Where parts and receipts go, and what an earlier run has left there.
+    wants_pause
+        Asked over and over; while it says yes, what is under way arrives and no more is begun.
+    tell
+        Called, every few seconds, with what the run waits for.
+
+    Raises
+    ------
+    LidarpoolError
+        If the cluster lacks something.
+    """
+
+    def __init__(
+        self,
+        client: Client,
+        store: RunStore,
+        wants_pause: Callable[[], bool] = lambda: False,
+        tell: Callable[[str], None] = _silent,
+    ) -> None:
+        job = store.job
+        self.client, self.job, self.store = client, job, store
+        self._wants_pause, self._tell = wants_pause, tell
+        self._paused_s, self._paused_at = 0.0, 0.0  # seconds in all; since when, 0 for not
+        # For when it is lost; a client that was never connected is refused in a moment.
+        self.address: str = getattr(client.scheduler, "address", "")
+        try:
+            planning, backend = job.planning is not None, store.backend or job.backend
+            pool, casting, backend = find_workers(
+                client,
+                job.collectors,
+                planning,
+                backend,
+                store.advice,
+                wait_s=job.wait_s,
+                tell=tell,
+            )
+            store.backend = backend
+            assign_devices(client, casting)  # all at once: those that see few of them choose first
+        except LidarpoolError:
+            raise
+        except Exception as error:  # which one, depends on what was being asked
+            if client.status != "running" or isinstance(error, CommClosedError):
+                raise self._told_lost() from error
+            raise
+        self.partitions: dict[str, Partition] = pool.partitions()
+        self.notes: list[str] = []
+        if not any(worker.gpus for worker in casting):
+            self.notes.append(
+                f"no GPU in partition GPU: {len(casting)} CPU worker{'s' * (len(casting) > 1)} "
+                f"cast{'s' * (len(casting) == 1)} the rays with {backend}"
+            )
+        self.callers_error: BaseException | None = None  # raised by a callback
+
+    def _told_lost(self) -> LidarpoolError:
+        return LidarpoolError(
+            f"The cluster at {self.address} cannot be reached any more, or somebody cancelled "
+            "the tasks of this run; it has ended without a result."
+        )
+
+    def drive(
+        self,
+        on_frame: Callable[[Frame], None] | None,
+        on_progress: Callable[[Progress], None] | None,
+    ) -> Result:
+        """Run to the end; whatever is raised, everything has been stopped by then."""
+        started = time.monotonic()
+        pumps: list[SurveyDriver | TrialPump] = []
+        trials = None
+        try:
+            if self.job.planning is not None:  # first: no slot of OTHER waits for the survey
+                trials = TrialPump(
+                    self.client, self.partitions[OTHER], self.job.planning, self.store.db.trials
+                )
+                pumps.append(trials)
+                trials.step()
+            survey = self._survey_driver(on_frame)
+            pumps.append(survey)
+            survey.start()
+            times = self._loop(pumps, survey, trials, on_progress, started)
+            for pump in pumps:
+                pump.finish()
+            self.notes += survey.notes
+        except BaseException as error:
+            # A client that loses its scheduler cancels all futures: tasks seem to be cancelled.
+            # After some seconds it gives up and closes, and any call of it makes any error.
+            lost = _is_lost(self.client, error)
+            reason = str(error) or type(error).__name__
+            _stop(self.client, pumps, f"the run was stopped: {reason}")
+            if error is self.callers_error:
+                raise
+            if isinstance(error, PoolError) and not lost:
+                raise LidarpoolError(str(error)) from error
+            if isinstance(error, _CLUSTER_LOST) or (lost and isinstance(error, Exception)):
+                raise self._told_lost() from error
+            raise
+        self.store.db.save_frames()
+        self.store.tidy()
+        if self._paused_s >= 1:
+            self.notes.append(f"the run was paused for {self._paused_s:.0f} s, in its times too")
+        return make_result(
+            self.store,
+            books=[survey.book, *([trials.book] if trials else [])],
+            seconds=time.monotonic() - started,
+            survey_seconds=times[SurveyDriver],
+            planning_seconds=times.get(TrialPump, 0.0),
+            replayed=survey.offered_again,
+            duplicates_dropped=survey.duplicates_dropped,
+            notes=self.notes,
+        )
+
+    def _survey_driver(self, on_frame: Callable[[Frame], None] | None) -> SurveyDriver:
+        def take(frame: Frame) -> None:
+            if on_frame:
+                self._call(on_frame, frame)
+
+        def on_parts(parts: list[Receipt]) -> None:
+            if self.store.on_parts:
+                self.store.on_parts(parts)
+
+        job = self.job
+        return SurveyDriver(
+            self.client,
+            self.partitions,
+            RigPlan(job.scene, job.survey, self.store.backend),
+            self.store.db,
+            self.store.storage,
+            self.store.points_of_scan,
+            take,
+            on_parts,
+            SurveyOptions(job.queue_capacity, job.collectors, job.scans_per_second, job.patience_s),
+        )
+
+    def _call(self, callback: Callable[[T], None], argument: T) -> None:
+        """Call back the caller; an OSError of theirs must not be taken for the cluster's."""
+        try:
+            callback(argument)
+        except BaseException as error:
+            self.callers_error = error
+            raise
+
+    def _loop(
+        self,
+        pumps: list[SurveyDriver | TrialPump],
+        survey: SurveyDriver,
+        trials: TrialPump | None,
+        on_progress: Callable[[Progress], None] | None,
+        started: float,
+    ) -> dict[type, float]:
+        """Step the pumps until all have finished; returns when each did, in seconds."""
+        pause = Backoff(least_s=0.001, most_s=0.05)
+        watch = Watch(
+            self.client,
+            [GPU, OTHER] if trials else [GPU],
+            lasting=[LIDAR],
+            patience_s=self.job.patience_s,
+            tell=self._tell,
+        )
+        times: dict[type, float] = {}
+        told = saved = float("-inf")
+        while len(times) < len(pumps):
+            moved = False
+            still = self._look_at_pause(pumps)
+            for pump in pumps:
+                if not pump.finished:
+                    moved |= pump.step()
+                elif type(pump) not in times:
+                    times[type(pump)] = time.monotonic() - started
+                    watch.forget([OTHER] if pump is trials else [GPU, LIDAR])
+            for trial in trials.trials[len(self.store.db.trials) :] if trials else ():
+                self.store.db.add_trial(trial)
+            now = time.monotonic()
+            if now - saved >= SAVE_EVERY_S:
+                saved = now
+                self.store.db.save_frames()
+            watch.look(now)
+            if on_progress and (now - told >= PROGRESS_EVERY_S or len(times) == len(pumps)):
+                told = now
+                self._call(on_progress, self._progress(survey, trials, now - started, still))
+            if still:
+                time.sleep(PAUSED_S)
+            else:
+                if moved:
+                    pause.reset()
+                (time.sleep if survey.finished else survey.wait)(0.0 if moved else pause.next())
+        return times
+
+    def _look_at_pause(self, pumps: Sequence[SurveyDriver | TrialPump]) -> bool:
+        """Ask whether the run is to pause; returns whether it stands still.
+
+        It is stepped all the while: a worker that dies is noticed, and a lost cluster. As nothing
+        is under way when it stands still, there is nothing that could take too long.
+        """
+        wanted = self._wants_pause()
+        for pump in pumps:
+            pump.paused = wanted
+        still, now = wanted and all(pump.idle for pump in pumps), time.monotonic()
+        if still and not self._paused_at:
+            self._paused_at = now
+            self.store.db.save_frames()
+        elif not still and self._paused_at:
+            self._paused_s, self._paused_at = self._paused_s + now - self._paused_at, 0.0
+        return still
+
+    def _progress(
+        self, survey: SurveyDriver, trials: TrialPump | None, seconds: float, paused: bool
+    ) -> Progress:
+        db = self.store.db
+        return Progress(
+            scans=self.job.survey.scan_count,
+            generated=survey.generated,
+            cast=min(self.store.resumed + survey.cast, self.job.survey.scan_count),
+            framed=db.frames,
+            collected=db.scans_done,
+            points=db.point_count,
+            trials=self.job.trials,
+            trials_done=len(trials.trials) if trials else 0,
+            seconds=seconds,
+            replayed=survey.offered_again,
+            paused=paused,
+            waits_for=survey.waits_for,
+        )
+
+
+def make_result(
+    store: RunStore,
+    books: Sequence[TaskBook] = (),
+    seconds: float = 0.0,
+    survey_seconds: float = 0.0,
+    planning_seconds: float = 0.0,
+    replayed: int = 0,
+    duplicates_dropped: int = 0,
+    notes: Iterable[str] = (),
+) -> Result:
+    """Put the result together once everything is committed; see `Result`."""
+    job = store.job
+    trials = tuple(sorted(store.db.trials, key=lambda trial: trial.trial))
+    return Result(
+        points=store.points(),
+        plan=best(trials, job.planning) if job.planning else None,
+        trials=trials,
+        backend=store.backend,
+        rays=job.survey.ray_count,
+        hits=store.db.hits,
+        records=tuple(record for book in books for record in book.records),
+        stages=tuple(totals for book in books for totals in book.stages.values()),
+        seconds=seconds,
+        survey_seconds=survey_seconds,
+        planning_seconds=planning_seconds,
+        replayed=replayed,
+        duplicates_dropped=duplicates_dropped,
+        resumed=store.resumed,
+        notes=(*store.notes, *notes),
+        _hit_counts=store.hit_counts,
+        _sample_rays=store.sample_rays,
+    )
+
+
+def _is_lost(client: Client, error: BaseException) -> bool:
+    """Whether the scheduler is gone: a call may fail a moment before the client knows."""
+    until = time.monotonic() + LOST_S
+    while (
+        client.status == "running" and isinstance(error, _CLUSTER_LOST) and time.monotonic() < until
+    ):
+        time.sleep(0.01)
+    return client.status != "running"
+
+
+def _stop(client: Client, pumps: list[SurveyDriver | TrialPump], reason: str) -> None:
+    """Stop what can be stopped; the cluster may be gone, and then nothing can."""
+    if client.status != "running":  # Dask would try for half a minute to reach it
+        return
+    for pump in pumps:
+        for step in (lambda pump=pump: pump.stop(reason), pump.finish):
+            try:
+                # The first error is the one to tell of.
+                with suppress(OSError, CommClosedError, FutureCancelledError, RuntimeError):
+                    step()
+            except Exception:
+                if client.status == "running":
+                    raise

@@ -1,0 +1,146 @@
+"""A whole run from Python: `simulate`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import nullcontext
+from pathlib import Path
+
+from distributed import Client
+
+from ..plan import Planning
+from ..scan import Frame
+from ..scan.watch import PATIENCE_S, WAIT_S
+from ..scene.scene import Scene
+from ..sensor import Survey
+from .checks import check_backend_here, check_counts
+from .connection import local_client
+from .job import Job
+from .progress import Progress
+from .result import Result
+from .run import Run, make_result
+from .store import RunStore
+
+
+def simulate(
+    scene: Scene,
+    survey: Survey,
+    planning: Planning | None = None,
+    *,
+    client: Client | None = None,
+    backend: str = "auto",
+    on_frame: Callable[[Frame], None] | None = None,
+    on_progress: Callable[[Progress], None] | None = None,
+    queue_capacity: int = 10,
+    collectors: int = 2,
+    scans_per_second: float | None = None,
+    gpu_workers: int | None = None,
+    other_workers: int | None = None,
+    tls: bool = False,
+    wait_s: float = WAIT_S,
+    patience_s: float = PATIENCE_S,
+    folder: str | Path | None = None,
+    parts: str | Path | None = None,
+    resume: bool = False,
+) -> Result:
+    """Scan a scene on a partitioned cluster and plan a path meanwhile.
+
+    Parameters
+    ----------
+    scene, survey
+        What to scan, and how; poses in the scene's local coordinates.
+    planning
+        A path to plan on the OTHER partition while the survey runs; None for none.
+    client
+        Client of a cluster whose workers declare the resources GPU, LIDAR and OTHER. Without
+        one, a local cluster is started on the loopback interface and stopped in the end.
+    backend
+        Ray-casting backend of stage 2: auto, cuda, embree or numpy.
+    on_frame
+        Called with each frame, in scan order, while the survey runs; its points are in storage by
+        then, see `Frame.points`. It is called in this thread: while it takes its time the
+        pipeline waits, and nothing is lost.
+    on_progress
+        Called some ten times a second with how far things are.
+    queue_capacity
+        Items that stage 1 may be ahead of stage 2.
+    collectors
+        Tasks of stage 4.
+    scans_per_second
+        How fast scans are made, as by a sensor that takes its time; by default as fast as
+        they are cast.
+    gpu_workers, other_workers
+        Workers of a local cluster; by default what suits the machine.
+    tls
+        Encrypt the traffic of a local cluster, with a certificate made for it.
+    wait_s, patience_s
+        How long to wait for partitions that are still empty, and for those that become empty,
+        seconds.
+    folder
+        A folder to keep the run in, so that nothing is lost should this process or its machine
+        die; the one that it lies in must exist. It stays there in the end: remove it with
+        `remove_run` once the result is where it belongs. Without one, the points are in a
+        temporary folder as long as the result is in use.
+    parts
+        Where the points go, part by part: a folder that the workers see, or a URL that fsspec
+        opens, such as ``s3://bucket/survey``. They stay there. By default they go into `folder`.
+    resume
+        Go on from what an earlier run has left in `folder`; from the beginning if there is
+        nothing. `on_frame` gets the frames that it has not had yet, but for those of the last
+        second before the earlier run died, which it gets again.
+
+    Returns
+    -------
+    Result
+        The same survey gives the same cloud on any cluster.
+
+    Raises
+    ------
+    LidarpoolError
+        If the cluster lacks something or a task fails, if `folder` holds an unfinished run and
+        `resume` is not set, if that is damaged, or of another scene, survey, planning or
+        version; one or two lines say which and what to do. KeyboardInterrupt passes through
+        once everything has been stopped.
+
+    Examples
+    --------
+    >>> from lidarpool import Scene, Survey, simulate
+    >>> if __name__ == "__main__":                                     # doctest: +SKIP
+    ...     result = simulate(Scene.seed(), Survey(poses=[(0, 0, 1)]))
+    ...     print(len(result.cloud), "points")
+    """
+    job = Job(
+        scene,
+        survey,
+        planning,
+        backend,
+        queue_capacity,
+        collectors,
+        scans_per_second,
+        wait_s,
+        patience_s,
+    )
+    check_counts(gpu_workers=gpu_workers, other_workers=other_workers)
+    if client is None:
+        check_backend_here(backend)
+    store = RunStore(job, None if folder is None else Path(folder), parts, resume=resume)
+    with store.kept_on_error():
+        if store.complete:
+            store.db.unlock()
+            return make_result(store)
+        if client is None:
+            check_backend_here(store.backend or backend, store.advice)
+        with (
+            local_client(
+                gpu_workers=gpu_workers,
+                collectors=collectors,
+                other_workers=other_workers,
+                planning=planning is not None,
+                tls=tls,
+            )
+            if client is None
+            else nullcontext(client) as client
+        ):
+            result = Run(client, store).drive(on_frame, on_progress)
+            store.db.unlock()
+            return result

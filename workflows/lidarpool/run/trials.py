@@ -1,0 +1,142 @@
+"""The driver's side of planning: trials on the OTHER partition, a few under way at a time."""
+
+from __future__ import annotations
+
+import time
+import uuid
+from collections import Counter, deque
+from collections.abc import Sequence
+
+from distributed import Client, Future
+
+from poolpart import Partition, fetch_available, look_for_tasks, recorded
+
+from ..base.errors import LidarpoolError
+from ..base.task_book import TaskBook
+from ..plan import Plan, Planning, Trial, best, run_trial
+from ..scan.failures import was_killed
+
+TRIAL = "trial"
+ROUNDS_MOST = 3  # submissions of a trial whose workers die
+LOOK_EVERY_S = 1.0
+
+
+class TrialPump:
+    """Runs the trials of a planning; `step` it until `finished`, as `scan.SurveyPump`.
+
+    Parameters
+    ----------
+    client
+        Client of the cluster.
+    partition
+        Where the trials run.
+    planning
+        What to plan.
+    done
+        Trials that an earlier run has finished.
+    """
+
+    def __init__(
+        self,
+        client: Client,
+        partition: Partition,
+        planning: Planning,
+        done: Sequence[Trial] = (),
+    ) -> None:
+        self.client, self.partition, self.planning = client, partition, planning
+        self.trials: list[Trial] = list(done)
+        self.book = TaskBook()
+        self._run_id = uuid.uuid4().hex[:8]
+        known = {trial.trial for trial in done}
+        self._waiting = deque(n for n in range(planning.trials) if n not in known)  # numbers
+        self._running: dict[Future, int] = {}  # {future: number of the trial}
+        self._rounds: Counter[int] = Counter()  # {number: how often it was submitted}
+        self._looked_at = time.monotonic()
+        self.paused = False  # whether no more trials are started
+        # One waits behind each that runs: no slot idles, and a dying worker takes few along.
+        self._most = 2 * max(1, partition.slots)
+
+    @property
+    def finished(self) -> bool:
+        """Whether all trials have ended."""
+        return len(self.trials) == self.planning.trials
+
+    @property
+    def idle(self) -> bool:
+        """Whether no trial is under way."""
+        return not self._running
+
+    def step(self) -> bool:
+        """Take results and submit more; returns whether there was anything to do.
+
+        Raises
+        ------
+        LidarpoolError
+            If a trial has failed.
+        """
+        if self._running and time.monotonic() - self._looked_at > LOOK_EVERY_S:
+            self._leave_silent_workers()
+        done = [f for f in self._running if f.status in ("error", "cancelled")]
+        for future in done:
+            self._take_failure(future, self._running.pop(future))
+        finished = [f for f in self._running if f.status == "finished"]
+        found = fetch_available(self.client, [f.key for f in finished]) if finished else {}
+        for future in finished:
+            if future.key in found:
+                del self._running[future]
+                trial, record = found[future.key]
+                self.trials.append(trial)
+                self.book.add(record)
+        room = 0 if self.paused else min(self._most - len(self._running), len(self._waiting))
+        for _ in range(room):
+            self._submit(self._waiting.popleft())
+        return bool(done or found or room > 0)
+
+    def _submit(self, number: int, worker: str | None = None) -> None:
+        future = self.partition.submit(
+            recorded,
+            TRIAL,
+            self.partition.name,
+            run_trial,
+            self.planning,
+            number,
+            key=f"{TRIAL}-{self._run_id}-{number}.{self._rounds[number]}",
+            worker=worker,
+        )
+        self._rounds[number] += 1
+        self._running[future] = number
+
+    def _take_failure(self, future: Future, number: int) -> None:
+        if future.status == "cancelled":
+            raise LidarpoolError(f"Planning trial {number} was cancelled from outside this run.")
+        # Dask gives up what was on several workers that died, whoever ended them.
+        if was_killed(future) and self._rounds[number] < ROUNDS_MOST:
+            self._waiting.append(number)
+            return
+        error = future.exception(timeout=10)
+        raise LidarpoolError(f"Planning trial {number} failed: {error}")
+
+    def _leave_silent_workers(self) -> None:
+        """Run trials elsewhere whose workers give no sign of life, or have gone."""
+        self._looked_at = time.monotonic()
+        keys = [future.key for future in self._running]
+        seen = look_for_tasks(self.client, self.partition.name, keys)
+        heard = sorted(seen.members - seen.silent)
+        # One that was bound to a worker which has gone since waits for it for ever.
+        waiting = {key for key, place in seen.tasks.items() if place.state == "no-worker"}
+        lost = [f for f in self._running if f.key in waiting or seen.out_of_reach(f.key)]
+        for place, future in enumerate(lost if heard else []):
+            self._submit(self._running.pop(future), heard[place % len(heard)])
+
+    def stop(self, reason: str) -> None:
+        """Start no more trials; those that run end by themselves in a fraction of a second."""
+        self.client.cancel(list(self._running))
+
+    def finish(self) -> None:
+        """Let go of everything on the scheduler."""
+        self._running.clear()
+
+    def plan(self) -> Plan:
+        """Best plan of all trials, whatever order they ended in."""
+        self.trials.sort(key=lambda trial: trial.trial)
+        return best(self.trials, self.planning)

@@ -1,0 +1,123 @@
+"""Batches under way: consecutive scans that are not committed yet, and who has them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from enum import Enum
+
+from distributed import Future
+
+PIECES = 16  # a batch in which something is wrong is divided into so many
+
+
+class Place(Enum):
+    """Where a batch is."""
+
+    WAITING = "waiting"  # to be offered to a GPU worker
+    CASTING = "casting"  # offered to one
+    CAST = "cast"  # its columns are on that worker
+    COLLECTING = "collecting"  # a collector was told of them
+
+
+@dataclass(eq=False)
+class Batch:
+    """Consecutive scans on their way to a part.
+
+    Parameters
+    ----------
+    first, stop
+        Its scans.
+    number
+        Batches that were taken before: bounds how far the last is ahead of the first.
+    """
+
+    first: int
+    stop: int
+    number: int
+    place: Place = Place.WAITING
+    offer: int = -1  # number of the last offer; receipts of earlier ones count as well
+    worker: str = ""  # address of the GPU worker
+    collector: str = ""  # name of the task of stage 4
+    future: Future | None = None
+    since: float = 0.0  # when it came to where it is
+    deaths: Counter[str] = field(default_factory=Counter)  # {stage: workers that died with it}
+    kills: Counter[str] = field(default_factory=Counter)  # {stage: of them, with nothing else}
+    suspects: set[str] = field(default_factory=set)  # stages whose workers it may have killed
+
+    @property
+    def scans(self) -> list[int]:
+        """Numbers of its scans."""
+        return list(range(self.first, self.stop))
+
+    @property
+    def name(self) -> str:
+        """Its scans, for people."""
+        last = self.stop - 1
+        return f"scan {last}" if self.first == last else f"scans {self.first} to {last}"
+
+    def to(self, place: Place, now: float) -> None:
+        """Note that it has come somewhere."""
+        self.place, self.since = place, now
+
+
+class Batches:
+    """The batches under way, in the order in which they were taken."""
+
+    def __init__(self) -> None:
+        self._batches: dict[int, Batch] = {}  # {first scan: batch}
+        self._taken = 0
+
+    def __len__(self) -> int:
+        return len(self._batches)
+
+    def __iter__(self) -> Iterator[Batch]:
+        return iter(list(self._batches.values()))
+
+    def __contains__(self, batch: Batch) -> bool:
+        return self._batches.get(batch.first) is batch
+
+    @property
+    def span(self) -> int:
+        """How many batches the newest is ahead of the oldest."""
+        numbers = [batch.number for batch in self._batches.values()]
+        return self._taken - min(numbers) if numbers else 0
+
+    def at(self, *places: Place) -> list[Batch]:
+        """Batches at some places."""
+        return [batch for batch in self._batches.values() if batch.place in places]
+
+    def add(self, first: int, stop: int) -> Batch:
+        """Take scans."""
+        batch = Batch(first, stop, self._taken)
+        self._taken += 1
+        self._batches[first] = batch
+        return batch
+
+    def remove(self, batch: Batch) -> None:
+        """Let go of a batch; its result is not needed any more."""
+        if batch in self:
+            del self._batches[batch.first]
+        batch.future = None
+
+    def within(self, first: int, stop: int) -> list[Batch]:
+        """Batches whose scans are all among these."""
+        return [b for b in self._batches.values() if first <= b.first and b.stop <= stop]
+
+    def split(self, batch: Batch) -> list[Batch]:
+        """Divide a batch into smaller ones, as suspect as it was."""
+        self.remove(batch)
+        size = -(-(batch.stop - batch.first) // PIECES)
+        pieces = []
+        for first in range(batch.first, batch.stop, size):
+            piece = Batch(first, min(first + size, batch.stop), batch.number)
+            piece.suspects = set(batch.suspects)
+            self._batches[first] = piece
+            pieces.append(piece)
+        return pieces
+
+    def clear(self) -> None:
+        """Let go of all."""
+        for batch in self:
+            self.remove(batch)

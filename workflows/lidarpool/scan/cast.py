@@ -1,0 +1,106 @@
+"""Stage 2: what becomes of a batch on a GPU worker: its rays are cast, and its columns made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from poolpart import Recorder, TaskRecord, trace
+
+from ..columns.parts import PartColumns
+from .failures import naming_scans
+from .messages import samples_of_scan, summary_type
+from .names import GPU, INTERSECT
+from .returns import BatchReturns
+from .rig import rig_of
+
+
+@dataclass(frozen=True)
+class CastBatch:
+    """What stage 2 makes of a batch.
+
+    Parameters
+    ----------
+    part
+        Its columns.
+    summaries
+        Of its scans, (scans,) of `messages.summary_type`.
+    record
+        The task.
+    """
+
+    part: PartColumns
+    summaries: NDArray[np.void]
+    record: TaskRecord
+
+
+def intersect(handle: str, first: int, stop: int, run: str = "") -> CastBatch:
+    """Cast the rays of scans `first` to `stop` and make their columns; runs on a GPU worker.
+
+    Parameters
+    ----------
+    handle
+        Of the worker's rig.
+    first, stop
+        The scans.
+    run
+        Id of the survey, for traces.
+
+    Raises
+    ------
+    RigMissing
+        If the worker has no such rig.
+    RuntimeError
+        If casting or a column fails, naming the scans.
+    """
+    rig = rig_of(handle)
+    recorder = Recorder(INTERSECT, GPU)
+    scans = list(range(first, stop))
+    trace("intersect.start", run=run, stage=INTERSECT, scans=scans)
+    with naming_scans(first, stop - 1):
+        found = list(rig.cast(first, stop))
+        trace("intersect.cast", run=run, stage=INTERSECT, scans=scans)
+        part = _part(first, found)
+        summaries = np.concatenate([_summaries(returns) for returns in found])
+    batch = CastBatch(part, summaries, recorder.done(stop - first))
+    trace("intersect.end", run=run, stage=INTERSECT, scans=scans)
+    return batch
+
+
+def _part(first: int, found: list[BatchReturns]) -> PartColumns:
+    columns = {
+        column.name: _joined([column.make(returns) for returns in found])
+        for column in found[0].survey.stored_columns
+    }
+    tally = np.sum([np.asarray(returns.found.tally) for returns in found], axis=0)
+    triangles = np.flatnonzero(tally)
+    return PartColumns(
+        first,
+        _joined([returns.counts for returns in found]),
+        columns,
+        triangles.astype(np.int32),
+        tally[triangles].astype(np.int64),
+    )
+
+
+def _joined(arrays: list[NDArray]) -> NDArray:  # type: ignore[type-arg]
+    return np.ascontiguousarray(arrays[0]) if len(arrays) == 1 else np.concatenate(arrays)
+
+
+def _summaries(returns: BatchReturns) -> NDArray[np.void]:
+    kind = summary_type(samples_of_scan(returns.survey.scan_count))
+    out = np.zeros(len(returns.specs), kind)
+    out["hits"], out["points"] = returns.found.hits, returns.counts
+    # Sample rays: spread over the points of each scan, their ends in float32.
+    samples = kind["samples"].shape[0]
+    begins = np.cumsum(returns.counts) - returns.counts
+    steps = np.arange(samples) / max(samples - 1, 1)
+    last = np.maximum(returns.counts - 1, 0)
+    rows = begins[:, None] + np.floor(steps * last[:, None]).astype(np.int64)
+    there = (np.arange(samples) < returns.counts[:, None]) & (returns.counts[:, None] > 0)
+    out["samples"] = np.nan
+    if len(returns):
+        out["samples"][there] = returns.positions[rows[there]]
+    return out

@@ -1,0 +1,764 @@
+"""The driver's side of the survey: it offers batches, commits parts and hands out frames.
+
+Everything happens in `step`, called over and over from one thread; nothing in it waits for long.
+There is one rule of recovery: what is not committed is offered again, and what is not handed out
+is sorted again, whatever was lost. Only so many batches are under way at a time, and the last is
+only so far ahead of the first: that bounds every queue, the sorter's memory and the workers'.
+"""
+
+from __future__ import annotations
+
+import secrets
+import statistics
+import time
+import uuid
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from distributed import Client
+
+from poolpart import (
+    Partition,
+    Pipe,
+    PipeFailed,
+    TaskRecord,
+    fetch_available,
+    forget_pipes,
+    take_held,
+    take_news,
+    trace,
+)
+
+from .._version import __version__
+from ..base.errors import LidarpoolError
+from ..base.task_book import TaskBook
+from ..columns.cloud import Cloud
+from ..columns.parts import SUFFIX
+from ..columns.storage import Storage
+from .batches import Batch, Batches, Place
+from .cast import intersect
+from .failures import raise_if_failed, rig_is_missing, was_killed, words_on_memory
+from .long_stages import LongStages, Work
+from .messages import Frame, Receipt, samples_of_scan, summary_type
+from .names import COLLECT, GENERATE, GPU, INTERSECT, LIDAR, SORT
+from .rig import RigPlan
+from .stages import collect, generate, sort_frames
+from .watch import PATIENCE_S
+from .workers import CastingWorkers
+
+BATCH_SECONDS = 0.2  # casting time that makes a batch worth its overhead
+BATCH_RAYS = 1_000_000  # bounds a batch's memory
+BATCHES_LEAST = 16  # for each slot, so that none idles for long in the end
+AHEAD = 2  # batches that a worker is offered for each of its slots: it need not wait for the next
+COLLECTING = 3  # batches that a collector is given at a time
+SPAN = 8  # batches that the newest may be ahead of the oldest, for each that may be under way
+SUSPECT_DEATHS = 2  # workers that may die with a batch before it is tried alone
+KILLS_MOST = 3  # workers that a single scan may kill, alone
+LATE_S = 60.0  # a batch is late when it takes so long at one place, and
+LATE_FACTOR = 20.0  # so much longer than others
+STALL_S = 60.0  # without news of what was given to be sorted; then it is given again
+LAST_WORDS_S = 3.0  # for the stages to end after everything was committed
+PUT_S = 30.0  # for a pipe that is never full
+
+
+class Book(Protocol):
+    """What is committed: `lidarpool.run.database.RunDatabase`."""
+
+    frames: int
+    scans_done: int
+
+    def missing(self, first: int, stop: int) -> list[tuple[int, int]]:
+        """Return the scans of a range that are not committed, as half-open ranges."""
+
+    def commit(self, receipts: Sequence[Receipt]) -> list[Receipt]:
+        """Enter parts in one transaction; returns those that were new."""
+
+    def part_of(self, scan: int) -> Receipt:
+        """Part that holds a scan which is committed."""
+
+    def unframed(self) -> list[Receipt]:
+        """Parts that hold scans which were not handed out as frames, in order."""
+
+    def forget_summaries(self, part: Receipt) -> None:
+        """Drop the summaries of a part from memory: all of them were handed out."""
+
+
+@dataclass(frozen=True)
+class SurveyOptions:
+    """How a survey is run.
+
+    Parameters
+    ----------
+    queue_capacity
+        Items that stage 1 may be ahead.
+    collectors
+        Number of tasks of stage 4.
+    scans_per_second
+        How fast stage 1 describes scans, as a sensor that takes its time; None for as fast as
+        they are taken.
+    patience_s
+        How long to wait for workers that are gone, seconds.
+    """
+
+    queue_capacity: int = 10
+    collectors: int = 2
+    scans_per_second: float | None = None
+    patience_s: float = PATIENCE_S
+
+
+class SurveyDriver:
+    """Runs one survey on the partitions of a cluster.
+
+    Parameters
+    ----------
+    client
+        Client of the cluster.
+    partitions
+        The GPU and LIDAR partitions, by name.
+    plan
+        Scene, survey and backend.
+    book
+        What is committed; scans that are in it are not made again.
+    storage
+        Where parts go.
+    read
+        Reads the points of a scan that is committed.
+    on_frame
+        Called with each frame, in scan order, in the driver's thread.
+    on_parts
+        Called with parts that were committed.
+    options
+        How it is run.
+    """
+
+    def __init__(
+        self,
+        client: Client,
+        partitions: dict[str, Partition],
+        plan: RigPlan,
+        book: Book,
+        storage: Storage,
+        read: Callable[[int], Cloud],
+        on_frame: Callable[[Frame], None],
+        on_parts: Callable[[list[Receipt]], None],
+        options: SurveyOptions,
+    ) -> None:
+        self.client, self.survey, self.run_id = client, plan.survey, uuid.uuid4().hex[:8]
+        self._gpu, self._lidar = partitions[GPU], partitions[LIDAR]
+        self._db, self._storage = book, storage
+        self._read, self._on_frame, self._on_parts = read, on_frame, on_parts
+        self._options = options
+        self.book = TaskBook()
+        self.batches = Batches()
+        self.workers = CastingWorkers(client, self._gpu, self.run_id, plan)
+        self.generated = 0  # scans that were taken from stage 1, from the first on
+        self.cast = 0  # scans that stage 2 has finished
+        self.offered_again = 0
+        self.duplicates_dropped = 0
+        self.paused = False  # whether no more scans are taken; what is under way arrives
+        self._offers: dict[int, Batch] = {}  # {number of an offer: its batch}
+        self._offer_count = 0
+        self._seconds: deque[float] = deque(maxlen=64)  # that batches took to be cast
+        self._condemned: list[str] = []  # why scans cannot be done
+        # Named as parts are: what a driver that was killed leaves goes with those of no receipt.
+        self._probe = (f".probe-{self.run_id}{SUFFIX}", secrets.token_bytes(16))
+        self._hidden: list[str] = []  # names of LIDAR workers that do not see the storage
+        self._summary = summary_type(samples_of_scan(self.survey.scan_count))
+        self._sorter = -1  # number of the attempt that is heard
+        self._sorted_at = time.monotonic()  # when the last frames came
+        self._scans = self._pipe("scans", options.queue_capacity)
+        self._receipts = self._pipe("receipts", 64)
+        self._frames = self._pipe("frames", 64)
+        self._inlets: dict[str, Pipe] = {}  # {name of a stage 3 or 4: its pipe}
+        commands: dict[str, Callable[[int], Work]] = {
+            GENERATE: self._generate,
+            SORT: self._sort,
+        }
+        for number in range(options.collectors):
+            commands[f"{COLLECT}-{number}"] = self._collector(f"{COLLECT}-{number}")
+        self.stages = LongStages(
+            client, self._lidar, self.run_id, commands, self._stage_died, options.patience_s
+        )
+        self._inbox: dict[str, list[Any]] = {}  # {name of a pipe: what has come by it}
+        self._closed_at: float | None = None  # when all was committed and the pipes were closed
+
+    # -- the long stages -------------------------------------------------------------------
+
+    def _pipe(self, name: str, capacity: int) -> Pipe:
+        return Pipe(f"lidarpool-{self.run_id}-{name}", capacity, self.client)
+
+    def _fields(self, stage: str, number: int) -> dict[str, Any]:
+        return {"run": self.run_id, "stage": stage, "attempt": number}
+
+    def _generate(self, number: int) -> Work:
+        fields = self._fields(GENERATE, number)
+        return generate, (
+            fields,
+            __version__,
+            self.survey,
+            self._scans,
+            self.generated,
+            self._options.scans_per_second,
+        )
+
+    def _sort(self, number: int) -> Work:
+        """Start a sorter with a pipe of its own, and everything that was not handed out in it."""
+        self._sorter = number
+        self._sorted_at = time.monotonic()
+        inlet = self._new_inlet(SORT, number)
+        self._have_sorted(self._db.unframed())
+        fields = self._fields(SORT, number)
+        size = self._summary.itemsize
+        return sort_frames, (fields, __version__, size, self._db.frames, inlet, self._frames)
+
+    def _collector(self, name: str) -> Callable[[int], Work]:
+        def command(number: int) -> Work:
+            inlet = self._new_inlet(name, number)
+            fields = self._fields(COLLECT, number)
+            return collect, (
+                fields,
+                __version__,
+                self._storage,
+                self._probe,
+                inlet,
+                self._receipts,
+            )
+
+        return command
+
+    def _new_inlet(self, name: str, number: int) -> Pipe:
+        """Make the pipe of one start of a stage; that of an earlier one ends with it."""
+        if (earlier := self._inlets.pop(name, None)) is not None:
+            forget_pipes(self.client, [earlier.name])
+        pipe = self._inlets[name] = self._pipe(f"{name}-{number}", 1_000_000).create()
+        return pipe
+
+    def _have_sorted(self, parts: list[Receipt]) -> None:
+        """Tell the sorter of parts; one that is not there is told when it is started."""
+        if SORT in self._inlets and parts:
+            items = [{"first": part.first, "data": part.summaries} for part in parts]
+            self._trace("handon", SORT, [s for p in parts for s in range(p.first, p.stop)])
+            self._put(self._inlets[SORT], items)
+
+    def _put(self, pipe: Pipe, item: list[dict[str, Any]]) -> None:
+        """Put into a pipe whose length is bounded by what is under way."""
+        with suppress(PipeFailed):  # its stage is being replaced, and is told all of it then
+            pipe.put(item, timeout_s=PUT_S, unbounded=True)
+
+    def _stage_died(self, name: str) -> None:
+        """Take back what a collector had; a sorter is told everything when it is started."""
+        for batch in self.batches.at(Place.COLLECTING):
+            if batch.collector == name:
+                alone = len(self.batches.at(Place.COLLECTING)) == 1
+                batch.to(Place.CAST, time.monotonic())
+                self._count_again(batch, f"the worker of {name} died")
+                self._note_death(batch, COLLECT, alone)
+
+    # -- how far it is ---------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Make the pipes and start the stages; after this `stop` and `finish` must be called."""
+        try:
+            self._storage.prepare()
+            self._storage.write(*self._probe)
+        except OSError as error:
+            raise self._unwritable(error.strerror or str(error)) from error
+        for pipe in (self._scans, self._receipts, self._frames):
+            pipe.create()
+        self.workers.look()
+        self.stages.start()
+
+    @property
+    def complete(self) -> bool:
+        """Whether every scan is committed and was handed out."""
+        count = self.survey.scan_count
+        return self._db.scans_done == count and self._db.frames == count
+
+    @property
+    def idle(self) -> bool:
+        """Whether no scan is under way."""
+        return not self.batches and self._db.frames >= self._next_missing
+
+    @property
+    def _next_missing(self) -> int:
+        """First scan that is not committed, as far as can be framed."""
+        missing = self._db.missing(
+            self._db.frames, min(self._db.frames + 1, self.survey.scan_count)
+        )
+        return self._db.frames if missing else self._db.frames + 1
+
+    @property
+    def finished(self) -> bool:
+        """True once all stages have exited, or the time for their last words has elapsed."""
+        if self._closed_at is None:
+            return False
+        return self.stages.done or time.monotonic() - self._closed_at > LAST_WORDS_S
+
+    @property
+    def waits_for(self) -> str:
+        """Partition whose slots other runs hold, so that the stages cannot start; else empty."""
+        return self._lidar.name if self.stages.waiting else ""
+
+    @property
+    def notes(self) -> list[str]:
+        """What a user should know of how it went."""
+        notes = [*self.stages.notes, *self.workers.notes]
+        if self._hidden:
+            notes.append(
+                f"{', '.join(sorted(set(self._hidden)))} of partition {LIDAR} cannot see "
+                f"{self._storage.url}: parts came to it through the driver"
+            )
+        return notes
+
+    # -- one turn --------------------------------------------------------------------------
+
+    def step(self) -> bool:
+        """Do what can be done now; returns whether anything was.
+
+        Raises
+        ------
+        LidarpoolError
+            If a task of the survey has failed, naming stage and scans.
+        """
+        moved = self._take_receipts() | self._take_frames()
+        if self._closed_at is not None:  # last words only
+            return moved
+        moved |= self._see_to_casts()
+        self._look()
+        moved |= self._take_scans()
+        moved |= self._hand_on()
+        moved |= self._offer()
+        if self._condemned and not self.batches:
+            raise LidarpoolError("\n".join(self._condemned))
+        if self.complete:
+            for pipe in self._inlets.values():
+                pipe.close()
+            self._closed_at = time.monotonic()
+        return moved
+
+    def wait(self, seconds: float) -> None:
+        """Wait until there may be something to do, but no longer than so.
+
+        All that came is taken by the same request: each costs driver and scheduler a millisecond.
+        """
+        pipes = [self._receipts.name, self._frames.name]
+        if self._room > 0 and self._closed_at is None:
+            pipes.append(self._scans.name)
+        casting = self.batches.at(Place.CASTING)
+        keys = [b.future.key for b in casting if b.future and b.future.status == "pending"]
+        if self._closed_at is not None:
+            seconds = min(seconds, 0.001)
+        news = take_news(self.client, seconds, pipes, [*keys, *self.workers.preparing])
+        for name, items in news.items():
+            self._inbox.setdefault(name, []).extend(items)
+
+    def _trace(self, event: str, stage: str, scans: Sequence[int], **more: Any) -> None:
+        trace(f"driver.{event}", run=self.run_id, stage=stage, scans=list(scans), **more)
+
+    def _look(self) -> None:
+        """See, once in a while, to workers and stages."""
+        if self.workers.due:
+            self.workers.look()
+            self._leave_lost_workers()
+            self._leave_late()
+        else:
+            self.workers.check()
+        self.stages.look(self._db.scans_done + self._db.frames)
+        unframed = self._db.scans_done and self._next_missing > self._db.frames
+        if unframed and time.monotonic() - self._sorted_at > STALL_S and SORT in self._inlets:
+            self._sorted_at = time.monotonic()
+            self._have_sorted(self._db.unframed())
+
+    # -- stage 1: taking scans ---------------------------------------------------------------
+
+    @property
+    def _most(self) -> int:
+        """Batches that may be under way."""
+        collecting = COLLECTING * self._options.collectors
+        return AHEAD * self.workers.slot_count + collecting + 2
+
+    @property
+    def _room(self) -> int:
+        """Batches that may be taken now."""
+        if self.paused or self._condemned or self.batches.span >= SPAN * self._most:
+            return 0
+        return self._most - len(self.batches)
+
+    def _take_scans(self) -> bool:
+        items = self._inbox.pop(self._scans.name, [])
+        for first, stop in items:
+            # A generator that was started again describes what is here already.
+            new = max(first, self.generated)
+            if new > first:
+                self._drop_duplicates(GENERATE, range(first, min(new, stop)))
+            if new >= stop:
+                continue
+            self._trace("take", GENERATE, range(new, stop))
+            self.generated = stop
+            for run in self._db.missing(new, stop):
+                self.batches.add(*run)
+        return bool(items)
+
+    def _drop_duplicates(self, stage: str, scans: range) -> None:
+        self.duplicates_dropped += len(scans)
+        self._trace("duplicate", stage, scans)
+
+    # -- stage 2: casting --------------------------------------------------------------------
+
+    def _offer(self) -> bool:
+        """Offer waiting batches to workers that have room."""
+        waiting = self.batches.at(Place.WAITING)
+        if not waiting or not self.workers.slots:
+            return False
+        load = dict.fromkeys(self.workers.slots, 0)
+        alone: set[str] = set()  # workers that have a suspect
+        for batch in self.batches.at(Place.CASTING):
+            if batch.worker in load:
+                load[batch.worker] += 1
+                if INTERSECT in batch.suspects:
+                    alone.add(batch.worker)
+        cast = len(self.batches.at(Place.CAST, Place.COLLECTING))
+        moved = False
+        for batch in waiting:
+            suspect = INTERSECT in batch.suspects
+            rooms = {
+                address: load[address] / (1 if suspect else AHEAD * slots)
+                for address, slots in self.workers.slots.items()
+                if address not in alone
+            }
+            address = min(rooms, key=lambda a: (rooms[a], a), default="")
+            if not address or rooms[address] >= 1:
+                if suspect:  # the others must not keep every worker from it
+                    break
+                continue
+            if cast + sum(load.values()) >= self._most:
+                break
+            self._cast(batch, address)
+            load[address] += 1
+            if suspect:
+                alone.add(address)
+            moved = True
+        return moved
+
+    def _cast(self, batch: Batch, address: str) -> None:
+        offer, self._offer_count = self._offer_count, self._offer_count + 1
+        self._offers[offer] = batch
+        batch.offer, batch.worker, batch.collector = offer, address, ""
+        batch.future = self._gpu.submit(
+            intersect,
+            self.workers.handle,
+            batch.first,
+            batch.stop,
+            self.run_id,
+            key=f"{INTERSECT}-{self.run_id}-{batch.first}.{offer}",
+            worker=address,
+        )
+        batch.to(Place.CASTING, time.monotonic())
+        self._trace("submit", INTERSECT, batch.scans)
+
+    def _see_to_casts(self) -> bool:
+        moved = False
+        for batch in self.batches.at(Place.CASTING):
+            future = batch.future
+            assert future is not None
+            if future.status == "finished":
+                batch.to(Place.CAST, time.monotonic())
+                self.cast += batch.stop - batch.first
+                moved = True
+            elif future.status == "error" and rig_is_missing(future):
+                self.workers.drop(batch.worker)
+                self._again(batch, "its worker has no scene any more")
+            elif future.status == "error" and was_killed(future):
+                self._lost(batch, died=True)
+            elif future.status not in ("pending", "lost"):
+                raise_if_failed(future, f"stage {INTERSECT}, {batch.name}")
+        return moved
+
+    def _leave_lost_workers(self) -> None:
+        """Offer again what is on workers that have gone, or give no sign of life."""
+        seen = self.workers.seen
+        for batch in self.batches.at(Place.CASTING, Place.CAST):
+            if batch.worker not in seen.members:
+                self._lost(batch, died=batch.place is Place.CASTING)
+            elif batch.worker in seen.silent and self.workers.slots:
+                self._lost(batch, died=False)
+
+    def _lost(self, batch: Batch, died: bool) -> None:
+        alone = not any(
+            other.worker == batch.worker
+            for other in self.batches.at(Place.CASTING)
+            if other is not batch
+        )
+        self._again(batch, "its worker died" if died else "its worker is gone or silent")
+        if died:
+            self._note_death(batch, INTERSECT, alone)
+
+    def _leave_late(self) -> None:
+        """Offer again what takes far longer than other batches."""
+        now = time.monotonic()
+        usual = statistics.median(self._seconds) if self._seconds else 0.0
+        late = max(LATE_S, LATE_FACTOR * usual)
+        for batch in self.batches.at(Place.CASTING, Place.COLLECTING):
+            others = len(self.workers.slots) > 1 or batch.place is Place.COLLECTING
+            if now - batch.since > late and others and self._seconds:
+                self._again(batch, "it is late")
+
+    def _again(self, batch: Batch, reason: str) -> None:
+        """Have a batch cast once more."""
+        if batch.future is not None:
+            batch.future.cancel()
+            batch.future = None
+        batch.to(Place.WAITING, time.monotonic())
+        self._count_again(batch, reason)
+
+    def _count_again(self, batch: Batch, reason: str) -> None:
+        self.offered_again += 1
+        self._trace("replay", INTERSECT, batch.scans, reason=reason)
+
+    # -- a batch that kills its workers ------------------------------------------------------
+
+    def _note_death(self, batch: Batch, stage: str, alone: bool) -> None:
+        """Count the death of a worker against a batch that was there.
+
+        What was there at two deaths is tried alone. An innocent batch passes; one whose worker
+        dies again is divided, down to single scans, and a scan is to blame when worker after
+        worker has died of it alone.
+        """
+        batch.deaths[stage] += 1
+        if stage not in batch.suspects:
+            if batch.deaths[stage] >= SUSPECT_DEATHS:
+                batch.suspects.add(stage)
+            return
+        if not alone:
+            return
+        if batch.stop - batch.first > 1:
+            for piece in self.batches.split(batch):
+                piece.to(Place.WAITING, time.monotonic())
+            return
+        batch.kills[stage] += 1
+        if batch.kills[stage] >= KILLS_MOST:
+            self.batches.remove(batch)
+            where = self._gpu if stage == INTERSECT else self._lidar
+            self._condemned.append(
+                f"{batch.name} kills the worker that runs stage {stage}: {KILLS_MOST} of them "
+                "died, one after the other, with no other scan in that stage"
+                f"{words_on_memory(self.client, [batch.worker])}. Look into the logs of the "
+                f"{where.name} workers."
+            )
+
+    # -- stage 4: collecting -----------------------------------------------------------------
+
+    def _hand_on(self) -> bool:
+        """Tell collectors of batches that were cast."""
+        ready = self.batches.at(Place.CAST)
+        if not ready:
+            return False
+        names = [n for n in self._inlets if n != SORT and self.stages.worker_of(n)]
+        load = dict.fromkeys(names, 0)
+        busy = self.batches.at(Place.COLLECTING)
+        for batch in busy:
+            if batch.collector in load:
+                load[batch.collector] += 1
+        if any(COLLECT in batch.suspects for batch in busy):
+            return False
+        suspects = [batch for batch in ready if COLLECT in batch.suspects]
+        if suspects:
+            ready = suspects[:1]
+            if busy:
+                return False
+        told: dict[str, list[dict[str, Any]]] = {}  # {collector: what it is told}
+        for batch in ready:
+            room = [name for name in names if load[name] < COLLECTING]
+            if not room:
+                break
+            near = [n for n in room if _host(self.stages.worker_of(n)) == _host(batch.worker)]
+            name = min(near or room, key=lambda n: (load[n], n))
+            load[name] += 1
+            told.setdefault(name, []).append(self._collect(batch, name))
+        for name, items in told.items():
+            self._put(self._inlets[name], items)
+        return bool(told)
+
+    def _collect(self, batch: Batch, name: str) -> dict[str, Any]:
+        """Give a batch to a collector; returns what to tell it."""
+        assert batch.future is not None
+        batch.collector = name
+        batch.to(Place.COLLECTING, time.monotonic())
+        self._trace("handon", COLLECT, batch.scans)
+        part = f"{batch.first:08d}-{batch.stop:08d}-{secrets.token_hex(4)}{SUFFIX}"
+        return {
+            "offer": batch.offer,
+            "key": batch.future.key,
+            "at": batch.worker,
+            "first": batch.first,
+            "stop": batch.stop,
+            "name": part,
+        }
+
+    def _under_way(self, offer: int) -> Batch | None:
+        """Batch of an offer, None where it is committed or was divided."""
+        batch = self._offers.get(offer)
+        return batch if batch is not None and batch in self.batches else None
+
+    def _take_receipts(self) -> bool:
+        answers = self._inbox.pop(self._receipts.name, [])
+        receipts: list[Receipt] = []
+        for answer in answers:
+            if "failed" in answer:
+                raise self._unwritable(answer["failed"])
+            if "hidden" in answer:
+                self._hidden.append(answer["hidden"])
+                continue
+            if "lost" in answer:
+                # A collector that was replaced may tell of what another has committed since.
+                batch = self._under_way(answer["lost"])
+                if batch is not None and batch.place is Place.COLLECTING:
+                    self._again(batch, "its columns could not be fetched")
+                continue
+            receipt = Receipt.from_wire(answer["receipt"])
+            if receipt.held_at and not self._fetch_held(receipt):
+                continue
+            receipts.append(receipt)
+        if receipts:
+            self._commit(receipts)
+        return bool(answers)
+
+    def _fetch_held(self, receipt: Receipt) -> bool:
+        """Write a part that a worker holds, which does not see the storage."""
+        data = take_held(self.client, receipt.held_at, receipt.name)
+        if data is None:
+            if (batch := self._under_way(receipt.offer)) is not None:
+                self._again(batch, "its part was lost")
+            return False
+        try:
+            self._storage.write(receipt.name, data)
+        except OSError as error:
+            raise self._unwritable(error.strerror or str(error)) from error
+        return True
+
+    def _unwritable(self, reason: str) -> LidarpoolError:
+        return LidarpoolError(
+            f"The points cannot be kept in {self._storage.url} ({reason}): make room there, or "
+            "give another place with --parts."
+        )
+
+    def _commit(self, receipts: list[Receipt]) -> None:
+        new = self._db.commit(receipts)
+        for receipt in receipts:
+            scans = range(receipt.first, receipt.stop)
+            if any(receipt is one for one in new):
+                self._trace("points", COLLECT, scans)
+            else:
+                self._drop_duplicates(COLLECT, scans)
+                with suppress(OSError):  # what is left there is removed in the end
+                    self._storage.remove([receipt.name])
+        for receipt in new:
+            self._learn(receipt.records)
+            for batch in self.batches.within(receipt.first, receipt.stop):
+                self.batches.remove(batch)
+            self._offers.pop(receipt.offer, None)
+        if new:
+            self._have_sorted(new)
+            self._on_parts(new)
+
+    def _learn(self, records: Sequence[TaskRecord]) -> None:
+        """Enter tasks of stage 2, and tell stage 1 how many scans to put into one item."""
+        for record in records:
+            self.book.add(record)
+            if record.stage == INTERSECT:
+                self._seconds.append(record.seconds)
+                self._scans.advise(self._wished_scans(record))
+
+    def _wished_scans(self, last: TaskRecord) -> int:
+        """Say how many scans an item should have: at most twice as many as the last."""
+        rays_per_scan = max(1, self.survey.ray_count // self.survey.scan_count)
+        slots = self.workers.slot_count
+        most = min(BATCH_RAYS // rays_per_scan, self.survey.scan_count // (BATCHES_LEAST * slots))
+        per_scan = max(last.seconds, 1e-6) / last.items
+        return max(1, min(int(BATCH_SECONDS / per_scan), 2 * last.items, most))
+
+    # -- stage 3: frames in order --------------------------------------------------------------
+
+    def _take_frames(self) -> bool:
+        items = self._inbox.pop(self._frames.name, [])
+        for item in items:
+            summaries = np.frombuffer(item["data"], self._summary)
+            scans = range(item["first"], item["first"] + len(summaries))
+            if item["attempt"] != self._sorter:
+                self._trace("stale", SORT, scans)
+                continue
+            self._sorted_at = time.monotonic()
+            if item["first"] < self._db.frames:
+                known = range(item["first"], min(scans.stop, self._db.frames))
+                self._drop_duplicates(SORT, known)
+            for scan, summary in zip(scans, summaries, strict=True):
+                if scan == self._db.frames:
+                    self._hand_out(scan, summary)
+        return bool(items)
+
+    def _hand_out(self, scan: int, summary: np.void) -> None:
+        samples = summary["samples"]
+        frame = Frame(
+            scan,
+            self.survey.pose(scan),
+            self.survey.scan(scan).ray_count(self.survey.sensor),
+            int(summary["hits"]),
+            int(summary["points"]),
+            samples[~np.isnan(samples[:, 0])],
+            self._read,
+        )
+        self._trace("frame", SORT, [scan])
+        self._on_frame(frame)
+        # Only now: a frame that the caller failed on is handed to them again.
+        self._db.frames = scan + 1
+        part = self._db.part_of(scan)
+        if scan + 1 == part.stop:
+            self._db.forget_summaries(part)
+        self._trace("release", SORT, [scan])
+
+    # -- the end -----------------------------------------------------------------------------
+
+    @property
+    def _pipes(self) -> list[Pipe]:
+        return [self._scans, self._receipts, self._frames, *self._inlets.values()]
+
+    def stop(self, reason: str) -> None:
+        """End every stage at once; `finish` does the rest."""
+        self.client.cancel([batch.future for batch in self.batches if batch.future is not None])
+        for pipe in self._pipes:
+            with suppress(PipeFailed):  # not made yet, or gone already
+                pipe.fail(reason)
+
+    def finish(self) -> None:
+        """Wait a moment for the stages to end, and leave nothing on the scheduler."""
+        try:
+            deadline = (self._closed_at or time.monotonic()) + LAST_WORDS_S
+            while not self.stages.done and time.monotonic() < deadline:
+                time.sleep(0.01)
+            self._take_last_records()
+        finally:
+            forget_pipes(self.client, [pipe.name for pipe in self._pipes])
+            self.stages.forget_lock()
+            # In one message: a client that leaves right behind a second is missed by the answer.
+            self.client.cancel([*self.stages.futures.values(), *self.workers.futures])
+            self.workers.release()
+            self.batches.clear()
+            with suppress(OSError):
+                self._storage.remove([self._probe[0]])
+
+    def _take_last_records(self) -> None:
+        """Take the stages' own records; those whose worker cannot be reached are done without."""
+        ended = [f for f in self.stages.futures.values() if f.status == "finished"]
+        found = fetch_available(self.client, [future.key for future in ended])
+        for future in ended:
+            if future.key in found:
+                self.book.add(found[future.key])
+
+
+def _host(address: str) -> str:
+    """Host of a worker's address."""
+    return address.rpartition("/")[2].rpartition(":")[0]

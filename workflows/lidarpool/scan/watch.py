@@ -1,0 +1,109 @@
+"""Waiting for partitions that are empty: how long, and what is said meanwhile."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+
+from distributed import Client
+
+from poolpart import worker_identities
+
+from ..base.errors import LidarpoolError
+
+WATCH_EVERY_S = 1.0
+TELL_EVERY_S = 5.0  # what is waited for
+WAIT_S = 10.0  # for partitions that are empty when a run begins
+PATIENCE_S = 60.0  # for those that become empty; a nanny needs a few seconds
+
+
+class Watch:
+    """Notices a partition that stays without workers, or without such as take tasks.
+
+    Dask itself would wait for ever.
+
+    Parameters
+    ----------
+    client
+        Client of the cluster.
+    names
+        Partitions whose workers get new tasks all the time.
+    lasting
+        Partitions whose tasks last as long as the run: workers that take no more are as good.
+    patience_s
+        How long one may be empty, seconds.
+    tell
+        Called, every few seconds, with what is waited for.
+    """
+
+    def __init__(
+        self,
+        client: Client,
+        names: Iterable[str],
+        lasting: Iterable[str] = (),
+        patience_s: float = PATIENCE_S,
+        tell: Callable[[str], None] = lambda words: None,
+    ) -> None:
+        self.client, self.lasting = client, frozenset(lasting)
+        self.patience_s, self._tell = patience_s, tell
+        self._looked = self._told = time.monotonic()
+        # {partition: when workers were last there}
+        self._seen = dict.fromkeys([*names, *self.lasting], self._looked)
+        self._paused: set[str] = set()  # partitions that have only such
+        self._pauses: dict[str, float] = {}  # {partition: when all were last seen paused}
+
+    def forget(self, names: Iterable[str]) -> None:
+        """Look after these partitions no more: nothing is left to do there."""
+        for name in names:
+            self._seen.pop(name, None)
+
+    def look(self, now: float) -> None:
+        """Check, once in a while; LidarpoolError if a partition has been empty for too long."""
+        if now - self._looked < WATCH_EVERY_S:
+            return
+        self._looked = now
+        self._paused = set()
+        working: set[str] = set()
+        for worker in worker_identities(self.client).values():
+            for name in self._seen.keys() & worker["resources"].keys():
+                if worker["status"] == "running" or name in self.lasting:
+                    self._seen[name] = now
+                    working.add(name)
+                else:
+                    self._paused.add(name)
+        for name in self._paused - working:
+            self._pauses[name] = now
+        self._say(now)
+        for name, seen in self._seen.items():
+            if now - seen > self.patience_s:
+                raise LidarpoolError(self._error(name))
+
+    def _say(self, now: float) -> None:
+        """Tell what is waited for; also of workers that pause again and again."""
+        waiting = [name for name, seen in self._seen.items() if now - seen > 2 * WATCH_EVERY_S]
+        pausing = [n for n, at in self._pauses.items() if now - at < 2 * TELL_EVERY_S]
+        if not (waiting or pausing) or now - self._told < TELL_EVERY_S:
+            return
+        self._told = now
+        for name in waiting:
+            if name not in pausing:
+                left = self.patience_s - (now - self._seen[name])
+                self._tell(
+                    f"waiting for workers of partition {name}, for another {max(0.0, left):.0f} s"
+                )
+        for name in pausing:
+            self._tell(
+                f"the workers of partition {name} pause: their memory is nearly full "
+                "(give them a larger --memory-limit)"
+            )
+
+    def _error(self, name: str) -> str:
+        start = f'start some with --resources "{name}=1" and run it again.'
+        seconds = f"{self.patience_s:.0f} s"
+        if name in self._paused:
+            return (
+                f"The workers of partition {name!r} have taken no tasks for {seconds}, so the run "
+                "was ended: Dask pauses those whose memory is nearly full. Give them a larger "
+                f"--memory-limit, or {start}"
+            )
+        return f"Partition {name!r} has had no workers for {seconds}, so the run was ended: {start}"

@@ -1,0 +1,208 @@
+"""The workers of stage 2 as the driver sees them: prepared, refused, silent, gone."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+from distributed import Client, Future
+
+from poolpart import Partition, Whereabouts, look_for_tasks
+
+from .._version import __version__
+from ..base.errors import LidarpoolError
+from .failures import raise_if_failed, was_killed, words_on_memory
+from .rig import RigPlan, drop_rig
+
+LOOK_EVERY_S = 1.0
+SETUP_DEATHS = 4  # workers in a row that may die while they prepare themselves
+RELEASE_S = 3.0  # for workers to forget their rigs
+PREPARING = "preparing the scene on the GPU workers"
+
+
+class CastingWorkers:
+    """The GPU workers that have a rig; each makes its own, also one that joins late.
+
+    A worker is looked over before it opens anything: one with another version of lidarpool is
+    refused by name and casts nothing.
+
+    Parameters
+    ----------
+    client, partition
+        Where they are.
+    handle
+        Name of their rigs.
+    plan
+        What rigs are made of.
+    """
+
+    def __init__(self, client: Client, partition: Partition, handle: str, plan: RigPlan) -> None:
+        self._client, self._partition = client, partition
+        self.handle, self._packed = handle, plan.packed()
+        self._plan: Future | None = None  # the packed plan, on the workers
+        self._setups: dict[str, Future] = {}  # {address: task that prepares the worker}
+        self._refused: dict[str, str] = {}  # {address: why}
+        self._count = 0
+        self._died: list[str] = []  # while they prepared themselves, one after the other
+        self._looked_at = float("-inf")
+        self.seen = Whereabouts()
+        self.slots: dict[str, int] = {}  # {address of a prepared worker: batches at a time}
+        self.notes: list[str] = []  # what a user should know
+
+    @property
+    def futures(self) -> list[Future]:
+        """All tasks that prepare workers."""
+        return [*self._setups.values(), *([self._plan] if self._plan else [])]
+
+    @property
+    def slot_count(self) -> int:
+        """Batches that all prepared workers cast at a time; at least 1."""
+        return max(1, sum(self.slots.values()))
+
+    @property
+    def due(self) -> bool:
+        """Whether it is time to look again."""
+        return time.monotonic() - self._looked_at > LOOK_EVERY_S
+
+    @property
+    def preparing(self) -> list[str]:
+        """Keys of the tasks that prepare workers now."""
+        return [f.key for a, f in self._setups.items() if a not in self.slots]
+
+    def look(self) -> None:
+        """See to workers that have come or gone.
+
+        Raises
+        ------
+        LidarpoolError
+            If preparing the scene fails, or ends one worker after the other.
+        """
+        self._looked_at = time.monotonic()
+        keys = [future.key for future in self.futures]
+        self.seen = look_for_tasks(self._client, self._partition.name, keys)
+        for address in self._setups.keys() - self.seen.members:
+            self._remove(address)
+        for address in sorted(self.seen.members - self._setups.keys() - self.seen.silent):
+            if address not in self._refused:
+                self._prepare(address)
+        self.check()
+
+    def check(self) -> None:
+        """Note which workers are prepared by now."""
+        for address, future in list(self._setups.items()):
+            if address in self.slots:
+                if address in self.seen.silent:
+                    del self.slots[address]
+            elif future.status == "finished" and address not in self.seen.silent:
+                self._take(address, future)
+            elif future.status == "error" and not was_killed(future):
+                raise_if_failed(future, PREPARING)
+        if self._plan is not None and self._plan.status in ("lost", "cancelled", "error"):
+            self._plan = None  # sent again for the next worker that needs it
+
+    def drop(self, address: str) -> None:
+        """Prepare a worker anew: its rig is gone."""
+        self._setups.pop(address, None)
+        self.slots.pop(address, None)
+
+    def release(self) -> None:
+        """Have the workers forget their rigs; those that cannot be reached are done without."""
+        addresses = [a for a in self.slots if a in self.seen.members]
+        self.slots.clear()
+        if addresses and self._client.status == "running":
+            with suppress(TimeoutError):  # Dask tries for half a minute to reach one that is ending
+                self._client.run(
+                    drop_rig,
+                    self.handle,
+                    workers=addresses,
+                    on_error="ignore",
+                    callback_timeout=RELEASE_S,
+                )
+
+    def _prepare(self, address: str) -> None:
+        if self._plan is None:
+            with warnings.catch_warnings():
+                # A large scene is a large graph, and there is no other way to have it made again.
+                warnings.filterwarnings("ignore", message="Sending large graph")
+                self._plan = self._partition.submit(
+                    _same, self._packed, key=f"scene-{self.handle}-{self._count}"
+                )
+        self._count += 1
+        self._setups[address] = self._partition.submit(
+            _preparation(__version__),
+            self.handle,
+            self._plan,
+            key=f"prepare-{self.handle}-{self._count}",
+            priority=10,
+            worker=address,
+        )
+
+    def _take(self, address: str, future: Future) -> None:
+        """Enter a worker that has answered."""
+        answer: dict[str, Any] = future.result(timeout=10)
+        if answer["version"] != __version__:
+            self._refused[address] = answer["version"]
+            del self._setups[address]
+            self.notes.append(
+                f"worker {answer['worker']} at {address} has lidarpool "
+                f"{answer['version'] or 'not installed'}, the run {__version__}: it cast nothing"
+            )
+            if self._refused.keys() >= self.seen.members:
+                raise LidarpoolError(
+                    f"No worker of partition {self._partition.name!r} has lidarpool {__version__}: "
+                    f"the one at {address} has {answer['version'] or 'none'}. Install the same "
+                    "version on both sides."
+                )
+            return
+        self.slots[address] = max(1, answer["slots"].get(self._partition.name, 1))
+        self._died.clear()
+
+    def _remove(self, address: str) -> None:
+        """Forget a worker that has gone; it may have died of the scene."""
+        future = self._setups.pop(address)
+        self._refused.pop(address, None)
+        if self.slots.pop(address, None) is not None:
+            return
+        place = self.seen.tasks.get(future.key)
+        if place is not None and place.deaths:
+            self._died.append(address)
+        if len(self._died) >= SETUP_DEATHS and not self.slots:
+            raise LidarpoolError(
+                f"{PREPARING} has ended {len(self._died)} of them, one after the other"
+                f"{words_on_memory(self._client, self._died)}: "
+                "look into their logs, or try another backend."
+            )
+
+
+def _same(packed: bytes) -> bytes:
+    return packed
+
+
+def _preparation(wanted: str) -> Callable[[str, bytes], dict[str, Any]]:
+    """Make the task that prepares a worker.
+
+    It is nested, so that it travels by value: a worker that lacks the package, or has another
+    version of it, can still say so.
+    """
+
+    def prepare(handle: str, packed: bytes) -> dict[str, Any]:
+        from distributed import get_worker
+
+        worker = get_worker()
+        slots = {name: int(count) for name, count in worker.state.total_resources.items()}
+        answer = {"worker": str(worker.name), "version": "", "slots": slots}
+        try:
+            from lidarpool._version import __version__
+        except ModuleNotFoundError:
+            return answer
+        answer["version"] = __version__
+        if __version__ == wanted:
+            from lidarpool.scan.rig import set_up
+
+            set_up(handle, packed)
+        return answer
+
+    return prepare

@@ -1,0 +1,332 @@
+"""The sections of a scenario file: their fields, limits and defaults."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, Strict, model_validator
+
+from ..columns.table import OPTIONAL
+from ..scene.transform import Transform
+from ..sensor import Sensor
+
+# Their directions take 2.4 GB; real lidars have five million.
+RAY_LIMIT = 100_000_000
+
+COLUMN_NAMES = tuple(column.in_files for column in OPTIONAL)
+
+# Nothing on Earth is farther from the origin of its map.
+Coordinate = Annotated[float, Field(ge=-1e8, le=1e8)]
+Angle = Annotated[float, Field(ge=-36_000, le=36_000)]
+Factor = Annotated[float, Field(ge=-1e9, le=1e9)]
+# YAML has lists only, which strict validation would not take for tuples.
+Pair = Annotated[tuple[Coordinate, Coordinate], Strict(False)]
+Triple = Annotated[tuple[Coordinate, Coordinate, Coordinate], Strict(False)]
+Angles = Annotated[tuple[Angle, Angle, Angle], Strict(False)]
+Factors = Annotated[tuple[Factor, Factor, Factor], Strict(False)]
+Row = Annotated[tuple[Factor, Factor, Factor, Factor], Strict(False)]
+Matrix = Annotated[tuple[Row, Row, Row, Row], Strict(False)]
+
+
+class Section(BaseModel):
+    """Fields of a scenario: no others, finite numbers, no conversion of text to numbers."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+class MeshFile(Section):
+    """A mesh file and where it stands; in YAML the file's name alone will do.
+
+    The mesh is scaled, turned about the world's x, y and z axes, and moved; or `matrix` says
+    it all. Relative names start from the scenario's folder.
+    """
+
+    file: Annotated[
+        str,
+        Field(
+            min_length=1,
+            max_length=4096,
+            description=".glb .gltf .obj .stl .ply .off .dae or .3mf, from the scenario's folder",
+        ),
+    ]
+    unit: Annotated[
+        Literal["um", "mm", "cm", "dm", "m", "km", "in", "ft", "yd", "mi"] | None,
+        Field(description="length unit of the file; by default what it states, else metres"),
+    ] = None
+    up_axis: Annotated[
+        Literal["x", "y", "z"] | None,
+        Field(description="axis of the file that points up; by default what its format states"),
+    ] = None
+    translation: Annotated[Triple, Field(description="moved by so many metres, last")] = (0, 0, 0)
+    rotation_deg: Annotated[
+        Angles, Field(description="turned about the world's x, y and z axes, degrees")
+    ] = (0, 0, 0)
+    scale: Annotated[
+        Factors, Field(description="one factor, or one for each axis; applied first")
+    ] = (1, 1, 1)
+    matrix: Annotated[
+        Matrix | None, Field(description="all of the placement at once, 4 rows of 4, metres")
+    ] = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short_forms(cls, value: Any) -> Any:
+        if isinstance(value, str):
+            return {"file": value}
+        if isinstance(value, dict) and type(value.get("scale")) in (int, float):
+            return value | {"scale": [value["scale"]] * 3}
+        return value
+
+    @model_validator(mode="after")
+    def _one_placement(self) -> MeshFile:
+        placed = self.model_fields_set & {"translation", "rotation_deg", "scale"}
+        if self.matrix is not None and placed:
+            raise ValueError(f"give either matrix or {', '.join(sorted(placed))}, not both.")
+        if 0 in self.scale:
+            raise ValueError("scale is 0 along an axis, which flattens the mesh.")
+        return self
+
+    def transform(self) -> Transform:
+        """Return the placement in the world."""
+        if self.matrix is not None:
+            return Transform.from_matrix(self.matrix)
+        return Transform.place(self.translation, self.rotation_deg, self.scale)
+
+
+class Ground(Section):
+    """A level rectangle under the scene, `margin_m` wider than it on each side."""
+
+    height_m: Annotated[Coordinate, Field(description="z of the rectangle, metres")] = 0.0
+    margin_m: Annotated[
+        float, Field(ge=0, le=1e6, description="wider than the scene on each side, metres")
+    ] = 5.0
+
+
+class SceneSection(Section):
+    """What is scanned: mesh files, the six default objects, or both.
+
+    `preset` is 'seed' where no files are given, else 'none'.
+    """
+
+    preset: Annotated[
+        Literal["seed", "none"] | None,
+        Field(
+            description="seed (six objects) where no files are given; with files: none",
+            examples=["seed"],
+        ),
+    ] = None
+    files: Annotated[
+        tuple[MeshFile, ...],
+        Strict(False),
+        Field(
+            max_length=10_000,
+            description="mesh files, by name or with unit, up_axis, scale, rotation_deg, "
+            "translation",
+            examples=[["hall.glb", {"file": "part.stl", "unit": "mm", "translation": [1, 0, 0]}]],
+        ),
+    ] = ()
+    ground: Annotated[
+        Ground | None,
+        Field(
+            description="a level rectangle below it all, metres",
+            examples=[{"height_m": 0, "margin_m": 5}],
+        ),
+    ] = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short_forms(cls, value: Any) -> Any:
+        if isinstance(value, str):
+            return {"preset": value} if value in ("seed", "none") else {"files": [value]}
+        if isinstance(value, dict) and isinstance(value.get("files"), (str, dict)):
+            return value | {"files": [value["files"]]}
+        return {"files": value} if isinstance(value, list) else value
+
+    @model_validator(mode="after")
+    def _something(self) -> SceneSection:
+        if self.preset == "none" and not self.files:
+            raise ValueError("there is nothing to scan: give files, or preset: seed.")
+        return self
+
+    @property
+    def has_seed(self) -> bool:
+        """Whether the six default objects are in it."""
+        return self.preset == "seed" or (self.preset is None and not self.files)
+
+
+class SensorSection(Section):
+    """The lidar: a turning head with evenly spaced azimuths and elevations; see `Sensor`."""
+
+    rays_per_revolution: Annotated[
+        int, Field(ge=1, le=10_000_000, description="azimuths in one turn")
+    ] = 1000
+    layers: Annotated[int, Field(ge=1, le=65_535, description="elevations (rings)")] = 40
+    vertical_fov_deg: Annotated[
+        float, Field(gt=0, le=180, description="degrees, half of it below the horizon")
+    ] = 60.0
+    step_deg: Annotated[
+        float, Field(gt=0, le=360, description="degrees turned in one time step")
+    ] = 10.0
+    rate_hz: Annotated[
+        float, Field(gt=0, le=1e6, description="turns a second: when each ray is fired")
+    ] = 10.0
+    min_range_m: Annotated[
+        float, Field(ge=0, le=1e8, description="metres; nearer returns are not seen")
+    ] = 0.0
+    max_range_m: Annotated[
+        float,
+        Field(gt=0, allow_inf_nan=True, description="metres; farther returns are not seen"),
+    ] = float("inf")
+
+    @model_validator(mode="after")
+    def _bounded(self) -> SensorSection:
+        rays = self.rays_per_revolution * self.layers
+        if rays > RAY_LIMIT:
+            raise ValueError(
+                f"rays_per_revolution times layers is {rays:,}; at most {RAY_LIMIT:,} rays make "
+                "a revolution."
+            )
+        return self
+
+    def sensor(self) -> Sensor:
+        """Return the lidar; LidarpoolError where the fields do not fit together."""
+        return Sensor.grid(**self.model_dump())
+
+
+class PoseSection(Section):
+    """Where the sensor stands, in world coordinates; in YAML [x, y, z] will do."""
+
+    position: Annotated[Triple, Field(description="x, y and z, metres")]
+    yaw_deg: Annotated[Angle, Field(description="turned about z, first")] = 0.0
+    pitch_deg: Annotated[Angle, Field(description="turned about the new y, then")] = 0.0
+    roll_deg: Annotated[Angle, Field(description="turned about the new x, last")] = 0.0
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short_form(cls, value: Any) -> Any:
+        return {"position": value} if isinstance(value, list) else value
+
+
+class CloudSection(Section):
+    """What is kept of the hits."""
+
+    keep_every: Annotated[
+        int, Field(ge=1, le=1_000_000, description="of the hits of each scan, every n-th")
+    ] = 5
+    precision_m: Annotated[
+        float, Field(ge=1e-6, le=1000, description="metres that points are rounded to")
+    ] = 0.01
+    columns: Annotated[
+        tuple[Literal[COLUMN_NAMES], ...],  # type: ignore[valid-type]
+        Strict(False),
+        Field(
+            description="what points have beside x, y, z, scan, ring and object: "
+            + ", ".join(COLUMN_NAMES),
+            examples=[["time", "range", "intensity"]],
+        ),
+    ] = ()
+
+
+class Obstacle(Section):
+    """A disc to keep out of; or the bounding circle of the objects of a name.
+
+    `object` may hold * and ?, and is all of the entry in the short form: `- Shelf*`.
+    """
+
+    object: Annotated[
+        Annotated[str, Field(min_length=1)] | None,
+        Field(description="name of objects of the scene, may hold * and ?"),
+    ] = None
+    centre: Annotated[Pair | None, Field(description="x and y of a disc, metres")] = None
+    radius_m: Annotated[
+        Annotated[float, Field(gt=0, le=1e6)] | None, Field(description="of the disc, metres")
+    ] = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short_form(cls, value: Any) -> Any:
+        return {"object": value} if isinstance(value, str) else value
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> Obstacle:
+        disc = self.centre is not None and self.radius_m is not None
+        if (self.object is None) != disc or (
+            self.object is not None and self.model_fields_set > {"object"}
+        ):
+            raise ValueError("give either object, or both centre and radius_m.")
+        return self
+
+
+class PlanningSection(Section):
+    """The path planned beside the survey, in the plane, world coordinates.
+
+    `enabled` is as given, else whether there are a start and a target. `obstacles` is 'auto'
+    (the bounding circle of each object that is not flat) or a list; `clearance_m` is added to
+    each radius.
+    """
+
+    enabled: Annotated[
+        bool | None,
+        Field(description="by default whether there are start and target", examples=[True]),
+    ] = None
+    start: Annotated[
+        Pair | None,
+        Field(description="x and y, metres; the default objects have one", examples=[[25, 25]]),
+    ] = None
+    target: Annotated[
+        Pair | None,
+        Field(description="x and y, metres; the default objects have one", examples=[[-30, -20]]),
+    ] = None
+    obstacles: Annotated[
+        Annotated[tuple[Obstacle, ...], Strict(False)] | None,
+        Field(
+            description="circles about all objects that are not flat (auto), or names and discs",
+            examples=["auto", ["Shelf*", {"centre": [-6, -1], "radius_m": 1}]],
+        ),
+    ] = None
+    clearance_m: Annotated[
+        float, Field(ge=0, le=1000, description="metres kept from obstacles")
+    ] = 0.0
+    trials: Annotated[
+        int, Field(ge=1, le=1_000_000, description="particle swarms, each with its own seed")
+    ] = 100
+    particles: Annotated[int, Field(ge=1, le=10_000_000, description="of each swarm")] = 1000
+    iterations: Annotated[int, Field(ge=1, le=1_000_000, description="of each swarm")] = 300
+    waypoints: Annotated[
+        int, Field(ge=1, le=100, description="corners of the path between its ends")
+    ] = 5
+    seed: Annotated[
+        int, Field(ge=0, le=2**63 - 1, description="the same seed gives the same path")
+    ] = 0
+
+    @model_validator(mode="before")
+    @classmethod
+    def _auto(cls, value: Any) -> Any:
+        if isinstance(value, dict) and value.get("obstacles") == "auto":
+            return value | {"obstacles": None}
+        return value
+
+
+class PoolSection(Section):
+    """The partitions, and what runs on them; sizes that are not given follow the machine.
+
+    `gpu` and `other` are workers of a cluster on this machine; one that is running already has
+    the workers it has. `collectors` and `queue_capacity` hold for both.
+    """
+
+    gpu: Annotated[
+        Annotated[int, Field(ge=1, le=10_000)] | None,
+        Field(description="workers that cast rays; by default one a GPU", examples=[1]),
+    ] = None
+    other: Annotated[
+        Annotated[int, Field(ge=1, le=10_000)] | None,
+        Field(description="workers that plan; by default they follow the cores", examples=[1]),
+    ] = None
+    collectors: Annotated[int, Field(ge=1, le=64, description="tasks that make points of hits")] = 2
+    queue_capacity: Annotated[
+        int, Field(ge=1, le=100_000, description="items that stage 1 may be ahead of stage 2")
+    ] = 10
+    backend: Annotated[
+        Literal["auto", "cuda", "embree", "numpy"],
+        Field(description="cuda, embree or numpy; auto takes the fastest that is there"),
+    ] = "auto"

@@ -1,0 +1,1 @@
+"""Scenes: meshes, files, transforms, and made-up ones."""

@@ -1,0 +1,72 @@
+"""One named triangle mesh: what mesh files and made-up shapes become before they are a scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..base.errors import LidarpoolError
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles of one object, in world coordinates.
+
+    Parameters
+    ----------
+    name
+        What the object is called; never empty.
+    vertices
+        float64 (v, 3), metres, Z-up, finite.
+    faces
+        int64 (f, 3), indices into `vertices`, at least one face.
+
+    Raises
+    ------
+    LidarpoolError
+        If there is no triangle, a shape is wrong, a coordinate is NaN or infinite, or a face
+        names a vertex that does not exist.
+    """
+
+    name: str
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "vertices", points_array(self.name, self.vertices))
+        faces = np.asarray(self.faces)
+        if faces.ndim != 2 or faces.shape[1] != 3 or not np.issubdtype(faces.dtype, np.integer):
+            raise LidarpoolError(
+                f"The faces of {self.name!r} have shape {faces.shape} and type {faces.dtype}; "
+                "expected integers of shape (f, 3)."
+            )
+        if not len(faces):
+            raise LidarpoolError(f"Object {self.name!r} has no triangles.")
+        if faces.min() < 0 or faces.max() >= len(self.vertices):
+            raise LidarpoolError(
+                f"The faces of {self.name!r} name vertices {faces.min()} to {faces.max()}; "
+                f"there are {len(self.vertices)}, counted from 0."
+            )
+        object.__setattr__(self, "faces", np.ascontiguousarray(faces, dtype=np.int64))
+
+
+def points_array(name: str, points: ArrayLike) -> NDArray[np.float64]:
+    """`points` as a contiguous float64 (n, 3) array of finite numbers.
+
+    Raises
+    ------
+    LidarpoolError
+        If it is not that; the message starts with `name`.
+    """
+    array = np.ascontiguousarray(points, dtype=np.float64)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise LidarpoolError(f"The vertices of {name!r} have shape {array.shape}; expected (v, 3).")
+    bad = ~np.isfinite(array).all(axis=1)
+    if bad.any():
+        raise LidarpoolError(
+            f"{int(bad.sum())} of the {len(array)} vertices of {name!r} are NaN or infinite, "
+            f"the first is number {int(bad.argmax())}: repair the mesh."
+        )
+    return array

@@ -1,0 +1,247 @@
+"""The scene: all triangles of all objects, near a local origin."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.errors import LidarpoolError
+from .mesh import Mesh, points_array
+from .meshfile import load_meshes
+from .shapes import seed_objects
+from .transform import Transform
+
+# Single precision, which ray casters use, resolves a millimetre up to here.
+FAR_FROM_ZERO_M = 10_000.0
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Triangles to be scanned, and which object each belongs to.
+
+    Coordinates are local: world = `vertices` + `origin`. The origin is zero unless the scene
+    lies farther than 10 km from zero (georeferenced data); then it is a point of whole metres
+    in the scene's middle, so that single precision is enough for the local coordinates.
+
+    Parameters
+    ----------
+    vertices
+        float64 (v, 3), metres, Z-up, local.
+    faces
+        int32 (f, 3), f >= 1, indices into `vertices`.
+    face_object
+        int32 (f,), for each triangle the index of its object in `names`.
+    names
+        Names of the objects, each one once.
+    origin
+        float64 (3,), whole metres.
+
+    Raises
+    ------
+    LidarpoolError
+        If there is no triangle, or the arrays do not fit together.
+    """
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int32]
+    face_object: NDArray[np.int32]
+    names: tuple[str, ...]
+    origin: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        vertices = points_array("the scene", self.vertices)
+        faces = np.ascontiguousarray(self.faces, dtype=np.int32)
+        owners = np.ascontiguousarray(self.face_object, dtype=np.int32)
+        origin = points_array("the scene's origin", np.reshape(self.origin, (1, -1)))[0]
+        if faces.ndim != 2 or faces.shape[1:] != (3,) or not len(faces):
+            raise LidarpoolError(f"A scene needs triangles, faces of (f, 3), not {faces.shape}.")
+        if faces.min() < 0 or faces.max() >= len(vertices):
+            raise LidarpoolError(f"Faces must name the {len(vertices)} vertices, from 0 up.")
+        if owners.shape != faces.shape[:1] or owners.min() < 0 or owners.max() >= len(self.names):
+            raise LidarpoolError(
+                f"face_object must give one of the {len(self.names)} objects, from 0 up, for "
+                f"each of the {len(faces)} faces."
+            )
+        object.__setattr__(self, "names", tuple(self.names))
+        for name, array in (
+            ("vertices", vertices),
+            ("faces", faces),
+            ("face_object", owners),
+            ("origin", origin),
+        ):
+            array = array.view()
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+
+    @classmethod
+    def seed(cls) -> Scene:
+        """Return the default scene: six surfaces of revolution, 76,800 triangles.
+
+        Examples
+        --------
+        >>> len(Scene.seed().faces)
+        76800
+        """
+        return cls.from_meshes(seed_objects())
+
+    @classmethod
+    def load(
+        cls,
+        path: str | Path,
+        *,
+        unit: str | None = None,
+        up_axis: str | None = None,
+        transform: Transform | None = None,
+    ) -> Scene:
+        """Read a mesh file: .glb .gltf .obj .stl .ply .off .dae .3mf.
+
+        Parameters
+        ----------
+        path
+            The file; its objects keep their names.
+        unit
+            Length unit of the file: um, mm, cm, dm, m, km, in, ft, yd or mi. None takes what
+            the file states, else metres.
+        up_axis
+            Axis of the file that points up: x, y or z. None takes what the file or its format
+            states, else z.
+        transform
+            Where the mesh stands in the world, in metres, after unit and up axis: a
+            `lidarpool.scene.transform.Transform`.
+
+        Raises
+        ------
+        LidarpoolError
+            If the file cannot be read whole, or there are no triangles in it.
+        """
+        return cls.from_meshes(load_meshes(path, unit=unit, up_axis=up_axis, transform=transform))
+
+    @classmethod
+    def from_meshes(cls, meshes: Iterable[Mesh]) -> Scene:
+        """Put objects together, each mesh one object.
+
+        Parameters
+        ----------
+        meshes
+            In world coordinates. Names that occur twice are numbered: Shelf, Shelf.2.
+
+        Raises
+        ------
+        LidarpoolError
+            If there are none, or more vertices or triangles than 32 bits can count.
+        """
+        parts = list(meshes)
+        if not parts:
+            raise LidarpoolError("A scene needs at least one object with triangles.")
+        vertex_counts = [len(mesh.vertices) for mesh in parts]
+        face_counts = [len(mesh.faces) for mesh in parts]
+        if max(sum(vertex_counts), sum(face_counts)) > np.iinfo(np.int32).max:
+            raise LidarpoolError(
+                f"The scene has {sum(vertex_counts)} vertices and {sum(face_counts)} triangles; "
+                f"at most {np.iinfo(np.int32).max} of each can be numbered."
+            )
+        first = np.concatenate([[0], np.cumsum(vertex_counts[:-1])])
+        vertices = np.concatenate([mesh.vertices for mesh in parts])
+        faces = np.concatenate([m.faces + at for m, at in zip(parts, first, strict=True)])
+        origin = local_origin(vertices)
+        return cls(
+            vertices=vertices - origin,
+            faces=faces.astype(np.int32),
+            face_object=np.repeat(np.arange(len(parts), dtype=np.int32), face_counts),
+            names=unique_names([mesh.name for mesh in parts]),
+            origin=origin,
+        )
+
+    @classmethod
+    def merge(cls, scenes: Iterable[Scene]) -> Scene:
+        """Put scenes together, with a new common origin; objects keep their order.
+
+        Raises
+        ------
+        LidarpoolError
+            If there are none.
+        """
+        return cls.from_meshes([mesh for scene in scenes for mesh in scene.meshes()])
+
+    def meshes(self) -> tuple[Mesh, ...]:
+        """Return the objects that have triangles, in world coordinates and in order."""
+        order = np.argsort(self.face_object, kind="stable")
+        ends = np.cumsum(np.bincount(self.face_object, minlength=len(self.names)))[:-1]
+        out = []
+        for name, rows in zip(self.names, np.split(order, ends), strict=True):
+            if len(rows):
+                used, faces = np.unique(self.faces[rows], return_inverse=True)
+                out.append(Mesh(name, self.vertices[used] + self.origin, faces.reshape(-1, 3)))
+        return tuple(out)
+
+    @cached_property
+    def bounds(self) -> NDArray[np.float64]:
+        """Lowest and highest corner of the triangles, local coordinates: (2, 3)."""
+        used = self.vertices[np.unique(self.faces)]
+        return np.stack([used.min(axis=0), used.max(axis=0)])
+
+    @cached_property
+    def object_bounds(self) -> NDArray[np.float64]:
+        """Lowest and highest corner of each object, local coordinates: (objects, 2, 3).
+
+        An object without triangles has (+inf, -inf).
+        """
+        corners = self.vertices[self.faces]
+        low = np.full((len(self.names), 3), np.inf)
+        high = np.full((len(self.names), 3), -np.inf)
+        np.minimum.at(low, self.face_object, corners.min(axis=1))
+        np.maximum.at(high, self.face_object, corners.max(axis=1))
+        return np.stack([low, high], axis=1)
+
+    @cached_property
+    def footprints(self) -> NDArray[np.float64]:
+        """Circle that holds each object seen from above, local: (objects, 3) as x, y, radius.
+
+        The circle is centred on the object's bounding rectangle and reaches its farthest
+        vertex: exact for discs and rectangles, at most 1.42 times too wide for other outlines.
+        """
+        centres = self.object_bounds[..., :2].mean(axis=1)
+        reach = np.zeros(len(self.names))
+        for corner in range(3):
+            offset = self.vertices[self.faces[:, corner], :2] - centres[self.face_object]
+            np.maximum.at(reach, self.face_object, np.hypot(*offset.T))
+        return np.column_stack([centres, reach])
+
+
+def local_origin(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Choose the origin for world coordinates (v, 3): zero, or whole metres in their middle.
+
+    Whole metres are exact in double precision, so that subtracting them and adding them again
+    gives the same coordinates.
+    """
+    middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+    if np.abs(middle).max() <= FAR_FROM_ZERO_M:
+        return np.zeros(3)
+    return np.round(middle)
+
+
+def unique_names(names: Sequence[str]) -> tuple[str, ...]:
+    """Make names unique by numbering those that occur before: Shelf, then Shelf.2.
+
+    Examples
+    --------
+    >>> unique_names(["Shelf", "Shelf", "Shelf.2", "Shelf"])
+    ('Shelf', 'Shelf.3', 'Shelf.2', 'Shelf.4')
+    """
+    given = set(names)
+    taken: set[str] = set()
+    numbers: dict[str, int] = {}  # {name: the last number given to it}
+    out = []
+    for name in names:
+        unique = name
+        while unique in taken or (unique != name and unique in given):
+            numbers[name] = numbers.get(name, 1) + 1
+            unique = f"{name}.{numbers[name]}"
+        taken.add(unique)
+        out.append(unique)
+    return tuple(out)

@@ -1,0 +1,103 @@
+"""Scenes as mesh files, through trimesh."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from trimesh.exchange.gltf import export_glb
+from trimesh.exchange.obj import export_obj
+from trimesh.exchange.ply import export_ply
+
+from ..base.errors import LidarpoolError
+from .scene import Scene
+from .transform import UP_AXES
+
+SUFFIXES = (".ply", ".glb", ".obj")
+
+
+def write_scene(path: str | Path, scene: Scene) -> Path:
+    """Write a scene to a mesh file that `Scene.load` reads again.
+
+    Parameters
+    ----------
+    path
+        One of `SUFFIXES`. A .ply holds one object without a name; .glb and .obj keep objects
+        and names. All store metres; .glb is turned to Y-up, as its standard asks, the others
+        are Z-up. Coordinates are those of the world; .ply and .glb hold single precision.
+    scene
+        What to write.
+
+    Returns
+    -------
+    The path. What was there before is replaced only when the new file is whole.
+
+    Raises
+    ------
+    LidarpoolError
+        As for `check_target`, or if the disk is full.
+    """
+    path = Path(path)
+    check_target(path)
+    data = _WRITERS[path.suffix.lower()](scene)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        with partial.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+    except OSError as error:
+        raise LidarpoolError(f"{path} cannot be written: {error.strerror}.") from error
+    finally:
+        partial.unlink(missing_ok=True)
+    return path
+
+
+def check_target(path: Path) -> None:
+    """Check that a scene can be written there, before it is made.
+
+    Raises
+    ------
+    LidarpoolError
+        If the ending is not one of `SUFFIXES`, or there is no such folder or no right to write.
+    """
+    if path.suffix.lower() not in SUFFIXES:
+        raise LidarpoolError(
+            f"{path} has the ending {path.suffix or '(none)'}; "
+            f"scenes are written as {', '.join(SUFFIXES)}."
+        )
+    if not path.parent.is_dir():
+        raise LidarpoolError(f"The folder {path.parent} does not exist: make it first.")
+    if path.is_dir() or not os.access(path.parent, os.W_OK):
+        raise LidarpoolError(f"{path} cannot be written: choose another place.")
+
+
+def _ply(scene: Scene) -> bytes:
+    whole = trimesh.Trimesh(scene.vertices + scene.origin, scene.faces, process=False)
+    return bytes(export_ply(whole, vertex_normal=False))
+
+
+def _glb(scene: Scene) -> bytes:
+    # UP_AXES["y"] turns Y-up to Z-up; its transpose turns back.
+    return bytes(export_glb(_objects(scene, UP_AXES["y"].T), include_normals=False))
+
+
+def _obj(scene: Scene) -> bytes:
+    text = export_obj(_objects(scene, np.eye(3)), include_normals=False, include_texture=False)
+    return str(text).encode()
+
+
+def _objects(scene: Scene, turn: np.ndarray[Any, np.dtype[np.float64]]) -> trimesh.Scene:
+    """Every object as a geometry and node of its own, vertices turned by a matrix (3, 3)."""
+    out = trimesh.Scene()
+    for mesh in scene.meshes():
+        geometry = trimesh.Trimesh(mesh.vertices @ turn.T, mesh.faces, process=False)
+        out.add_geometry(geometry, node_name=mesh.name, geom_name=mesh.name)
+    return out
+
+
+_WRITERS = {".ply": _ply, ".glb": _glb, ".obj": _obj}

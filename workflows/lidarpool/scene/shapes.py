@@ -1,0 +1,168 @@
+"""Made-up objects: surfaces of revolution, and the six of the default survey."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..base.errors import LidarpoolError
+from .mesh import Mesh
+
+SEED_RADIUS_M = 2.0
+SEED_RINGS = 80
+SEED_SEGMENTS = 80
+SEED_POSITIONS = (
+    (-20.0, -20.0),
+    (20.0, -20.0),
+    (-20.0, 20.0),
+    (20.0, 20.0),
+    (-10.0, -5.0),
+    (5.0, 5.0),
+)
+
+# Control polygons from the lower pole to the upper one: (radius, height) in metres. The first
+# and the last leg are level, so that the surface is smooth where it meets the axis; a doubled
+# point makes a tighter bend. The widest radius is stretched to SEED_RADIUS_M afterwards.
+SEED_OUTLINES: dict[str, tuple[tuple[float, float], ...]] = {
+    "Vase": (
+        (0.0, 0.0), (1.1, 0.0), (1.1, 0.0), (1.2, 0.3), (2.4, 1.4), (2.0, 2.9), (0.7, 3.4),
+        (0.7, 4.1), (1.3, 4.5), (1.3, 4.6), (1.1, 4.6), (0.5, 4.1), (0.5, 3.5), (0.0, 3.5),
+    ),
+    "Bell": (
+        (0.0, 0.0), (2.0, 0.0), (2.0, 0.0), (2.0, 0.25), (1.75, 0.5), (1.4, 1.5), (1.3, 3.0),
+        (0.9, 3.5), (0.3, 3.6), (0.3, 3.8), (0.55, 4.0), (0.4, 4.4), (0.0, 4.4),
+    ),
+    "Pawn": (
+        (0.0, 0.0), (2.0, 0.0), (2.0, 0.0), (2.0, 0.5), (1.7, 0.8), (1.3, 0.9), (0.8, 1.6),
+        (0.6, 2.7), (0.7, 2.8), (1.2, 2.9), (1.2, 3.1), (0.6, 3.2), (0.6, 3.3), (1.3, 3.6),
+        (1.3, 4.7), (0.6, 5.1), (0.0, 5.1),
+    ),
+    "Spindle": (
+        (0.0, 0.0), (0.25, 0.0), (0.5, 0.6), (2.2, 1.7), (2.2, 2.1), (0.9, 2.6), (0.4, 3.6),
+        (0.6, 3.9), (0.3, 4.3), (0.0, 4.3),
+    ),
+    # Low, since the pawn stands behind it as seen from the default poses.
+    "Bowl": (
+        (0.0, 0.0), (1.1, 0.0), (1.1, 0.0), (1.0, 0.25), (0.5, 0.4), (0.5, 0.55), (1.9, 0.7),
+        (2.2, 1.6), (2.0, 2.2), (1.85, 2.2), (2.0, 1.6), (1.7, 0.95), (0.0, 0.8),
+    ),
+}  # fmt: skip
+
+
+def seed_objects(rings: int = SEED_RINGS, segments: int = SEED_SEGMENTS) -> tuple[Mesh, ...]:
+    """Make the six objects of the default survey: sphere, vase, bell, pawn, spindle, bowl.
+
+    Each stands on z = 0 at its place in `SEED_POSITIONS`, is `SEED_RADIUS_M` in radius and has
+    `2 * rings * segments` triangles: 76,800 in all as they come.
+    """
+    angles = np.linspace(-np.pi / 2, np.pi / 2, rings + 2)
+    sphere = SEED_RADIUS_M * np.stack([np.cos(angles), 1 + np.sin(angles)], axis=1)
+    profiles = {"Sphere": sphere} | {
+        name: resample(smooth(outline), rings + 2) for name, outline in SEED_OUTLINES.items()
+    }
+    meshes = []
+    for (name, profile), (x, y) in zip(profiles.items(), SEED_POSITIONS, strict=True):
+        profile[:, 0] *= SEED_RADIUS_M / profile[:, 0].max()
+        mesh = revolve(profile, segments, name=name)
+        meshes.append(Mesh(name, mesh.vertices + np.array([x, y, 0.0]), mesh.faces))
+    return tuple(meshes)
+
+
+def revolve(profile: ArrayLike, segments: int, name: str = "Revolved") -> Mesh:
+    """Turn a profile about the z axis into a closed surface.
+
+    Parameters
+    ----------
+    profile
+        (n, 2), n >= 3: radius and height in metres, from the lower pole on the axis round the
+        outside to the upper pole. The radii of the two ends are taken as zero, those between
+        must be positive.
+    segments
+        Steps around the axis, at least 3.
+
+    Returns
+    -------
+    Mesh
+        `2 * (n - 2) * segments` triangles, outward normals, one vertex at each pole and none
+        doubled at the seam: watertight if the profile does not cross itself.
+
+    Raises
+    ------
+    LidarpoolError
+        If the profile or `segments` is not as above.
+    """
+    line = np.asarray(profile, dtype=np.float64)
+    if line.ndim != 2 or line.shape[1:] != (2,) or len(line) < 3 or not (line[1:-1, 0] > 0).all():
+        raise LidarpoolError(
+            f"A profile of shape {line.shape} cannot be revolved: it needs three or more "
+            "(radius, height) pairs, with positive radii between its ends."
+        )
+    if segments < 3:
+        raise LidarpoolError(f"segments is {segments}; it must be at least 3.")
+    rings = len(line) - 2
+    azimuth = 2 * np.pi * np.arange(segments) / segments
+    radius, height = line[1:-1].T
+    around = np.empty((rings, segments, 3))
+    around[..., 0] = radius[:, None] * np.cos(azimuth)
+    around[..., 1] = radius[:, None] * np.sin(azimuth)
+    around[..., 2] = height[:, None]
+    poles = [[0.0, 0.0, line[0, 1]], [0.0, 0.0, line[-1, 1]]]
+    vertices = np.concatenate([around.reshape(-1, 3), poles])
+    return Mesh(name, vertices, _revolved_faces(rings, segments))
+
+
+def _revolved_faces(rings: int, segments: int) -> NDArray[np.int64]:
+    """Faces over `rings` circles of `segments` vertices, the poles being the last two vertices."""
+    grid = np.arange(rings * segments).reshape(rings, segments)
+    following = np.roll(grid, -1, axis=1)
+    low, low_next, high, high_next = grid[:-1], following[:-1], grid[1:], following[1:]
+    first, last = rings * segments, rings * segments + 1
+    bands = [
+        np.stack([low, low_next, high_next], axis=-1).reshape(-1, 3),
+        np.stack([low, high_next, high], axis=-1).reshape(-1, 3),
+    ]
+    bottom = np.stack([np.full(segments, first), following[0], grid[0]], axis=-1)
+    top = np.stack([np.full(segments, last), grid[-1], following[-1]], axis=-1)
+    return np.concatenate([bottom, *bands, top])
+
+
+def smooth(outline: ArrayLike, rounds: int = 5) -> NDArray[np.float64]:
+    """Round off a polygon by cutting its corners (Chaikin 1974); both ends stay.
+
+    Parameters
+    ----------
+    outline
+        (n, 2) control points.
+    rounds
+        How often the corners are cut; the limit is a quadratic B-spline, which never leaves
+        the convex hull of three neighbouring control points, so radii stay positive.
+
+    Returns
+    -------
+    (m, 2) float64
+    """
+    line = np.asarray(outline, dtype=np.float64)
+    for _ in range(rounds):
+        near = 0.75 * line[:-1] + 0.25 * line[1:]
+        far = 0.25 * line[:-1] + 0.75 * line[1:]
+        cut = np.stack([near, far], axis=1).reshape(-1, line.shape[1])
+        line = np.concatenate([line[:1], cut, line[-1:]])
+    return line
+
+
+def resample(line: ArrayLike, count: int) -> NDArray[np.float64]:
+    """Place `count` points on a polyline at equal distances along it, both ends included.
+
+    Parameters
+    ----------
+    line
+        (n, d) points; neighbours may coincide.
+
+    Returns
+    -------
+    (count, d) float64
+    """
+    points = np.asarray(line, dtype=np.float64)
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    at = np.linspace(0.0, length[-1], count)
+    return np.stack([np.interp(at, length, column) for column in points.T], axis=1)

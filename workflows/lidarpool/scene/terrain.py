@@ -1,0 +1,108 @@
+"""Made-up hills and mountains."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.errors import LidarpoolError
+from .mesh import Mesh
+from .scene import Scene
+
+Float = NDArray[np.float64]
+
+LEAST_TRIANGLES = 2
+MOST_TRIANGLES = 100_000_000
+LONGEST_M = 1e7  # what is farther from the middle than 1e8 m is refused when it is read
+_COARSEST = 4  # cells of the first octave along a side
+_OCTAVES = 11
+_ROUGHNESS = 0.5  # height of each octave over that of the one before
+_RELIEF = 0.16  # greatest height over the side's length
+
+
+def terrain(triangles: int = 2_000_000, seed: int = 0, side_m: float = 1000.0) -> Scene:
+    """Make a square of fractal terrain: ridges and valleys at every scale, flatter low down.
+
+    The height is a sum of octaves of gradient noise (Perlin 1985), folded into ridges, where
+    each octave is damped by the height that there is already: a multifractal (Musgrave, Kolb
+    and Mace 1989).
+
+    Parameters
+    ----------
+    triangles
+        At least 2. The scene has as many as fill a grid with them: up to one row fewer.
+    seed
+        The same numbers give the same terrain.
+    side_m
+        Length of a side, metres; (0, 0) is in the middle, and z = 0 is the lowest point.
+
+    Raises
+    ------
+    LidarpoolError
+        For a number that is out of range.
+
+    Examples
+    --------
+    >>> len(terrain(2_000).faces)
+    1984
+    """
+    if not LEAST_TRIANGLES <= triangles <= MOST_TRIANGLES:
+        raise LidarpoolError(
+            f"A terrain of {triangles} triangles cannot be made: "
+            f"give {LEAST_TRIANGLES} to {MOST_TRIANGLES}."
+        )
+    if seed < 0 or not 0 < side_m <= LONGEST_M:
+        raise LidarpoolError(
+            f"seed is {seed} and side_m {side_m}; seed must be at least 0, side_m above 0 and at "
+            f"most {LONGEST_M:,.0f}."
+        )
+    rows = int(np.sqrt(triangles / 2))
+    columns = triangles // (2 * rows)
+    x, y = np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1)
+    height = _heights(x, y, np.random.default_rng(seed))
+    points = np.empty((columns + 1, rows + 1, 3))
+    points[..., 0], points[..., 1] = (x[:, None] - 0.5) * side_m, (y - 0.5) * side_m
+    points[..., 2] = height * side_m
+    corner = (np.arange(columns)[:, None] * (rows + 1) + np.arange(rows)).reshape(-1)
+    beside = corner + rows + 1
+    faces = np.empty((len(corner), 2, 3), np.int64)
+    faces[:, 0] = np.stack([corner, beside, beside + 1], axis=-1)
+    faces[:, 1] = np.stack([corner, beside + 1, corner + 1], axis=-1)
+    return Scene.from_meshes([Mesh("terrain", points.reshape(-1, 3), faces.reshape(-1, 3))])
+
+
+def _heights(x: Float, y: Float, rng: np.random.Generator) -> Float:
+    """Heights from 0 to `_RELIEF` over a grid of coordinates in 0 to 1: (len(x), len(y))."""
+    total = np.zeros((len(x), len(y)))
+    damping = np.ones_like(total)
+    for octave in range(_OCTAVES):
+        cells = _COARSEST << octave
+        if octave and cells > 2 * max(len(x), len(y)):
+            break  # finer than the grid can show
+        ridge = 1 - np.abs(_noise(x * cells, y * cells, rng))
+        ridge *= ridge * damping
+        total += _ROUGHNESS**octave * ridge
+        # What lies high is rough: there the next octave counts in full.
+        np.clip(1.6 * ridge, 0, 1, out=damping)
+    total -= total.min()
+    highest = total.max()
+    return total * (_RELIEF / highest) if highest else total
+
+
+def _noise(x: Float, y: Float, rng: np.random.Generator) -> Float:
+    """Gradient noise over a grid, about -1 to 1; a lattice of unit steps: (len(x), len(y))."""
+    shape = (int(x.max()) + 2, int(y.max()) + 2)
+    angle = rng.uniform(0, 2 * np.pi, shape)
+    slopes = np.cos(angle), np.sin(angle)
+    i, j = x.astype(np.int64), y.astype(np.int64)
+    u, v = (x - i)[:, None], (y - j)[None, :]
+    blend_u, blend_v = (t * t * t * (t * (6 * t - 15) + 10) for t in (u, v))
+    out = np.zeros((len(x), len(y)))
+    for right in (0, 1):
+        for up in (0, 1):
+            at = np.ix_(i + right, j + up)
+            part = slopes[0][at] * (u - right) + slopes[1][at] * (v - up)
+            part *= blend_u if right else 1 - blend_u
+            part *= blend_v if up else 1 - blend_v
+            out += part
+    return out * 1.4

@@ -1,0 +1,112 @@
+"""Units, up axes and placements: from the coordinates of a mesh file to those of the world."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..base.errors import LidarpoolError
+from ..sensor import Pose
+
+# Metres in one of each unit.
+UNITS_M = {
+    "um": 1e-6,
+    "mm": 1e-3,
+    "cm": 1e-2,
+    "dm": 1e-1,
+    "m": 1.0,
+    "km": 1e3,
+    "in": 0.0254,
+    "ft": 0.3048,
+    "yd": 0.9144,
+    "mi": 1609.344,
+}
+
+# Proper rotations that take the named axis to +z; the rows hold only 0 and ±1, so that
+# turning large coordinates loses no digit.
+UP_AXES = {
+    "x": np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]),
+    "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+    "z": np.eye(3),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Transform:
+    """An affine placement in the world: p -> linear @ p + offset.
+
+    Parameters
+    ----------
+    linear
+        float64 (3, 3), invertible.
+    offset
+        float64 (3,), metres.
+
+    Raises
+    ------
+    LidarpoolError
+        If the numbers are not finite or `linear` flattens the mesh.
+    """
+
+    linear: NDArray[np.float64]
+    offset: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        linear = np.array(self.linear, dtype=np.float64)
+        offset = np.array(self.offset, dtype=np.float64)
+        if linear.shape != (3, 3) or offset.shape != (3,):
+            raise LidarpoolError(
+                f"A transform needs a (3, 3) matrix and 3 offsets, not {linear.shape} and "
+                f"{offset.shape}."
+            )
+        if not (np.isfinite(linear).all() and np.isfinite(offset).all()):
+            raise LidarpoolError("A transform must be of finite numbers.")
+        if np.linalg.matrix_rank(linear) < 3:
+            raise LidarpoolError("The transform flattens the mesh: its matrix has no inverse.")
+        object.__setattr__(self, "linear", linear)
+        object.__setattr__(self, "offset", offset)
+
+    @classmethod
+    def place(
+        cls,
+        translation: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        scale: float | tuple[float, float, float] = 1.0,
+    ) -> Transform:
+        """Scale, then turn about the world's x, y and z axes in this order, then move.
+
+        Parameters
+        ----------
+        translation
+            Metres.
+        rotation_deg
+            Degrees about x, y and z.
+        scale
+            One factor, or one for each axis; not zero.
+        """
+        roll, pitch, yaw = rotation_deg
+        turn = Pose((0.0, 0.0, 0.0), yaw_deg=yaw, pitch_deg=pitch, roll_deg=roll).rotation
+        turn = np.eye(3) if turn is None else turn
+        return cls(turn * np.broadcast_to(scale, 3), np.array(translation, dtype=np.float64))
+
+    @classmethod
+    def from_matrix(cls, matrix: ArrayLike) -> Transform:
+        """Take a transform from a homogeneous (4, 4) matrix whose last row is 0 0 0 1."""
+        array = np.asarray(matrix, dtype=np.float64)
+        if array.shape != (4, 4) or not np.array_equal(array[3], [0, 0, 0, 1]):
+            raise LidarpoolError(
+                "A transform matrix has four rows of four numbers, the last one 0 0 0 1; "
+                f"given: {array.tolist()}."
+            )
+        return cls(array[:3, :3], array[:3, 3])
+
+    def apply(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the transformed points, float64 (n, 3)."""
+        return points @ self.linear.T + self.offset
+
+    @property
+    def mirrors(self) -> bool:
+        """Whether it turns surfaces inside out, so that faces must be wound the other way."""
+        return bool(np.linalg.det(self.linear) < 0)

@@ -1,0 +1,181 @@
+"""The beams of a sensor, and the head that moves them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from fractions import Fraction
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..base.errors import LidarpoolError
+
+CHANNELS_MOST = 65_535  # the type of the column
+
+
+@dataclass(frozen=True, eq=False)
+class Beams:
+    """The beams of a sensor: all of them are fired once in each firing.
+
+    Channel 0 is the first of them, usually the lowest.
+
+    Parameters
+    ----------
+    elevation
+        float64 (c,): angle above the sensor's xy plane, radians.
+    azimuth
+        float64 (c,): offset from the head's azimuth, radians; 0 by default.
+    time_ns
+        float64 (c,): when a beam is fired within a firing, nanoseconds; 0 by default.
+    origin
+        float64 (c, 3): where a beam leaves when the head is at azimuth 0, metres, in the sensor's
+        axes; the sensor's centre by default.
+
+    Raises
+    ------
+    LidarpoolError
+        If the lengths differ, a value is not finite, or there are no beams or too many.
+    """
+
+    elevation: NDArray[np.float64]
+    azimuth: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    time_ns: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
+
+    def __post_init__(self) -> None:
+        count = np.size(self.elevation)
+        if not 1 <= count <= CHANNELS_MOST:
+            raise LidarpoolError(f"A sensor has 1 to {CHANNELS_MOST} beams, not {count}.")
+        for name, shape in (
+            ("elevation", (count,)),
+            ("azimuth", (count,)),
+            ("time_ns", (count,)),
+            ("origin", (count, 3)),
+        ):
+            object.__setattr__(self, name, _table(name, getattr(self, name), shape))
+
+    def __len__(self) -> int:
+        return len(self.elevation)
+
+    @classmethod
+    def even(cls, layers: int, vertical_fov_deg: float) -> Beams:
+        """Beams evenly spaced over a vertical field of view, both ends included.
+
+        Half of it is below the horizon; a single beam looks straight ahead.
+        """
+        half = np.radians(vertical_fov_deg) / 2
+        return cls(np.linspace(-half, half, layers) if layers > 1 else np.zeros(1))
+
+
+class Head(Protocol):
+    """What moves the beams: in one time step it passes some firings, numbered from 0."""
+
+    @property
+    def period(self) -> int | None:
+        """Firings after which it stands as before; None where it never does exactly."""
+
+    def firings(self, step: int) -> tuple[int, int]:
+        """First firing of a time step, and one past the last; steps meet without gap."""
+
+    def times_ns(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
+        """When firings begin, nanoseconds since the head started: (k,)."""
+
+    def azimuths(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Where the head looks at firings, radians: (k,)."""
+
+
+@dataclass(frozen=True)
+class Spin:
+    """A head that spins counter-clockwise, seen from above, from the sensor's +x axis.
+
+    Parameters
+    ----------
+    firings_per_turn
+        Firings in one turn; not a whole number where firing rate and turning rate do not fit.
+    step_deg
+        Degrees turned in one time step, in (0, 360].
+    rate_hz
+        Turns a second.
+
+    Raises
+    ------
+    LidarpoolError
+        If a value is out of its range, or a time step holds no firing at all.
+
+    Examples
+    --------
+    >>> head = Spin(firings_per_turn=1000, step_deg=10)
+    >>> head.firings(0), head.firings(1)
+    ((0, 28), (28, 56))
+    """
+
+    firings_per_turn: float = 1000
+    step_deg: float = 10.0
+    rate_hz: float = 10.0
+
+    def __post_init__(self) -> None:
+        checks = (
+            ("firings_per_turn", 1 <= self.firings_per_turn < 2**31, "1 to 2147483647"),
+            ("step_deg", 0 < self.step_deg <= 360, "above 0, at most 360"),
+            ("rate_hz", 0 < self.rate_hz <= 1e6, "above 0, at most 1e6"),
+        )
+        for name, good, allowed in checks:
+            if not good:
+                raise LidarpoolError(f"{name} is {getattr(self, name)}; it must be {allowed}.")
+        if self._firings_per_step < 1:
+            raise LidarpoolError(
+                f"step_deg {self.step_deg} is less than one firing "
+                f"({360 / self.firings_per_turn:g} degrees), so some scans would be empty: make "
+                "step_deg or the number of firings larger."
+            )
+
+    @cached_property
+    def _firings_per_step(self) -> Fraction:
+        """How many firings the head passes in a time step, exactly.
+
+        Neither 0.1 nor 360/7 degrees is itself in binary. The nearest fraction with a denominator
+        of at most a million is what was meant, for decimals and for parts of a turn; with it, the
+        steps of a turn hold each firing once.
+        """
+        step = Fraction(self.step_deg).limit_denominator(1_000_000)
+        per_turn = Fraction(self.firings_per_turn).limit_denominator(1_000_000)
+        return step * per_turn / 360
+
+    @property
+    def period(self) -> int | None:
+        """See `Head.period`."""
+        return (
+            int(self.firings_per_turn)
+            if self.firings_per_turn == int(self.firings_per_turn)
+            else None
+        )
+
+    def firings(self, step: int) -> tuple[int, int]:
+        """See `Head.firings`; after one turn the numbers go on."""
+        per_step = self._firings_per_step
+        return math.ceil(step * per_step), math.ceil((step + 1) * per_step)
+
+    def times_ns(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
+        """See `Head.times_ns`."""
+        return np.asarray(firings, np.float64) * (1e9 / (self.rate_hz * self.firings_per_turn))
+
+    def azimuths(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
+        """See `Head.azimuths`."""
+        within = np.asarray(firings % self.firings_per_turn, np.float64)
+        return 2 * np.pi * within / self.firings_per_turn
+
+
+def _table(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Read-only float64 array of a shape; zeros where none were given."""
+    array = np.array(values, np.float64)
+    if not array.size:
+        array = np.zeros(shape)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise LidarpoolError(
+            f"Beams.{name} must be {shape} finite numbers, one for each beam; given: {array.shape}."
+        )
+    array.flags.writeable = False
+    return array

@@ -1,0 +1,165 @@
+"""A lidar: beams, and a head that moves them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.errors import LidarpoolError
+from .beams import CHANNELS_MOST, Beams, Head, Spin
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor:
+    """Beams that a head moves. In each firing all beams are fired once.
+
+    A sensor of another kind has beams or a head of its own, or is a subclass with other
+    `directions`, `origins` or `times_ns`: nothing else has to know of it. Its fields are what
+    tells it from others (see `lidarpool.base.fingerprint`), so keep what it depends on in them.
+
+    Parameters
+    ----------
+    beams, head
+        What is fired, and where it looks.
+    min_range_m, max_range_m
+        Returns nearer or farther than this, in metres, are not seen. A ray goes on through what
+        is nearer.
+
+    Raises
+    ------
+    LidarpoolError
+        If a range is out of bounds.
+
+    Examples
+    --------
+    >>> sensor = Sensor.grid(rays_per_revolution=1000, layers=40, step_deg=10)
+    >>> sensor.channels, sensor.firings(1)
+    (40, (28, 56))
+    """
+
+    beams: Beams = field(default_factory=lambda: Beams.even(40, 60.0))
+    head: Head = field(default_factory=Spin)
+    min_range_m: float = 0.0
+    max_range_m: float = float("inf")
+
+    def __post_init__(self) -> None:
+        checks = (
+            ("min_range_m", 0 <= self.min_range_m < float("inf"), "finite, at least 0"),
+            ("max_range_m", self.max_range_m > self.min_range_m, "above min_range_m"),
+        )
+        for name, good, allowed in checks:
+            if not good:
+                raise LidarpoolError(f"{name} is {getattr(self, name)}; it must be {allowed}.")
+
+    @classmethod
+    def grid(
+        cls,
+        rays_per_revolution: int = 1000,
+        layers: int = 40,
+        vertical_fov_deg: float = 60.0,
+        step_deg: float = 10.0,
+        min_range_m: float = 0.0,
+        max_range_m: float = float("inf"),
+        rate_hz: float = 10.0,
+    ) -> Sensor:
+        """Make a spinning sensor with evenly spaced azimuths and elevations.
+
+        Azimuth 0 is the sensor's +x axis and grows counter-clockwise seen from above; channel 0
+        is the lowest.
+
+        Parameters
+        ----------
+        rays_per_revolution
+            Firings in one turn.
+        layers
+            Channels, evenly spaced over the vertical field of view, both ends included; one
+            channel looks straight ahead.
+        vertical_fov_deg
+            Vertical field of view in degrees, half of it below the horizon, in (0, 180].
+        step_deg
+            Degrees turned in one time step, in (0, 360].
+        min_range_m, max_range_m
+            As of every sensor.
+        rate_hz
+            Turns a second.
+
+        Raises
+        ------
+        LidarpoolError
+            If a value is outside its range, or a time step holds no firing at all.
+        """
+        checks = (
+            ("rays_per_revolution", rays_per_revolution, rays_per_revolution >= 1, "at least 1"),
+            ("layers", layers, 1 <= layers <= CHANNELS_MOST, f"1 to {CHANNELS_MOST}"),
+            (
+                "vertical_fov_deg",
+                vertical_fov_deg,
+                0 < vertical_fov_deg <= 180,
+                "above 0, at most 180",
+            ),
+        )
+        for name, value, good, allowed in checks:
+            if not good:
+                raise LidarpoolError(f"{name} is {value}; it must be {allowed}.")
+        return cls(
+            Beams.even(layers, vertical_fov_deg),
+            Spin(rays_per_revolution, step_deg, rate_hz),
+            min_range_m,
+            max_range_m,
+        )
+
+    @property
+    def channels(self) -> int:
+        """Beams, and so rays a firing."""
+        return len(self.beams)
+
+    @property
+    def period(self) -> int | None:
+        """Firings after which directions and origins repeat; None where they never do."""
+        return self.head.period
+
+    def firings(self, step: int) -> tuple[int, int]:
+        """First firing of time step `step`, and one past the last.
+
+        Successive steps meet without gap or overlap; the numbers go on from turn to turn.
+        """
+        return self.head.firings(step)
+
+    def directions(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Make the unit directions of firings (k,), in the sensor's axes: (k, channels, 3)."""
+        azimuth, beams = self.head.azimuths(firings)[:, None], self.beams
+        if beams.azimuth.any():
+            azimuth = azimuth + beams.azimuth
+        out = np.empty((len(firings), self.channels, 3))
+        out[..., 0] = np.cos(azimuth) * self._level
+        out[..., 1] = np.sin(azimuth) * self._level
+        out[..., 2] = np.sin(beams.elevation)
+        return out
+
+    def origins(self, firings: NDArray[np.int64]) -> NDArray[np.float64] | None:
+        """Where the rays of firings (k,) leave, in the sensor's axes: (k, channels, 3), metres.
+
+        None where all leave from the sensor's centre.
+        """
+        if not self.beams.origin.any():
+            return None
+        azimuth = self.head.azimuths(firings)[:, None]
+        x, y, z = self.beams.origin.T
+        out = np.empty((len(firings), self.channels, 3))
+        out[..., 0] = np.cos(azimuth) * x - np.sin(azimuth) * y
+        out[..., 1] = np.sin(azimuth) * x + np.cos(azimuth) * y
+        out[..., 2] = z
+        return out
+
+    def times_ns(self, firings: NDArray[np.int64]) -> NDArray[np.int64]:
+        """When the rays of firings (k,) are fired, since the head started: (k, channels)."""
+        times = self.head.times_ns(firings)[:, None] + self.beams.time_ns
+        return np.rint(times).astype(np.int64)
+
+    @cached_property
+    def _level(self) -> NDArray[np.float64]:
+        """Part of each beam in the sensor's xy plane, (c,)."""
+        return np.cos(self.beams.elevation)
