@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lidarpool import Cloud, Column, LidarpoolError, save_cloud
-from lidarpool.columns.cloud import counts_by_object
 from lidarpool.columns.table import ALWAYS, OPTIONAL, TABLE, chosen, stored
 from lidarpool.scan.returns import BatchReturns
 
@@ -132,7 +131,6 @@ def test_a_cloud_gives_its_columns_in_their_types():
     assert [c.name for c in cloud.table] == ["scan", "object", "mine"]
     assert cloud.table[0] is TABLE["scan"] and cloud.table[2].dtype == "<f8"
     assert cloud.bounds.tolist() == [[0, 1, 2], [12, 13, 14]]
-    assert counts_by_object(cloud, 4).tolist() == [2, 2, 1, 0]
     again = pickle.loads(pickle.dumps(cloud))
     assert np.array_equal(again.positions, cloud.positions) and again.scan.tolist() == [
         0,

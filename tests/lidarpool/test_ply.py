@@ -144,16 +144,7 @@ def existing(tmp_path):
     return path, untouched
 
 
-def test_a_disk_too_small_is_noticed_before_writing(tmp_path, monkeypatch):
-    path, untouched = existing(tmp_path)
-    usage = type("Usage", (), {"free": 1000})
-    monkeypatch.setattr(ply.shutil, "disk_usage", lambda _: usage)
-    with pytest.raises(LidarpoolError, match=r"needs 44,\d{3} bytes and its disk has 1,000 free"):
-        save_cloud(path, sample(1000))
-    assert untouched()
-
-
-@pytest.mark.parametrize("fault", ["cut", "changed", "fewer", "interrupted", "no space"])
+@pytest.mark.parametrize("fault", ["cut", "fewer", "interrupted", "no space"])
 def test_a_faulty_write_leaves_the_earlier_result(tmp_path, monkeypatch, fault):
     path, untouched = existing(tmp_path)
     write = ply._write_open3d
@@ -163,12 +154,9 @@ def test_a_faulty_write_leaves_the_earlier_result(tmp_path, monkeypatch, fault):
             columns = {name: values[1:] for name, values in cloud.columns.items()}
             cloud = cloud._replace(positions=cloud.positions[1:], columns=columns)
         write(target, cloud)
-        data = bytearray(target.read_bytes())
+        data = target.read_bytes()
         if fault == "cut":
             target.write_bytes(data[:-500])
-        if fault == "changed":
-            data[-1] ^= 1
-            target.write_bytes(data)
         if fault == "interrupted":
             raise KeyboardInterrupt
         if fault == "no space":
@@ -177,7 +165,6 @@ def test_a_faulty_write_leaves_the_earlier_result(tmp_path, monkeypatch, fault):
     monkeypatch.setattr(ply, "_write_open3d", faulty)
     expected = {
         "cut": (LidarpoolError, "could not be written whole"),
-        "changed": (LidarpoolError, "another object"),
         "fewer": (LidarpoolError, "999 of 1,000 points"),
         "interrupted": (KeyboardInterrupt, None),
         "no space": (LidarpoolError, "No space left"),
@@ -207,19 +194,13 @@ def mounted(tmp_path):
     subprocess.run(["umount", folder], capture_output=True, check=False)
 
 
-def test_a_full_disk(mounted, monkeypatch):
+def test_a_full_disk(mounted):
+    """Open3D says True here."""
     folder = mounted()
     path, untouched = existing(folder)
-    with pytest.raises(LidarpoolError, match="make room"):
+    with pytest.raises(LidarpoolError, match=r"could not be written whole.*Make room"):
         save_cloud(path, sample(50_000))
     assert untouched()
-    # Another process took the room after we had asked for it: Open3D says True here.
-    usage = type("Usage", (), {"free": 10**9})
-    monkeypatch.setattr(ply.shutil, "disk_usage", lambda _: usage)
-    with pytest.raises(LidarpoolError, match="could not be written whole"):
-        save_cloud(path, sample(50_000))
-    assert untouched()
-    monkeypatch.undo()
     save_cloud(path, sample(2000))
     assert len(read_cloud(path)) == 2000
 

@@ -188,7 +188,7 @@ def test_a_run_that_has_kept_nothing_is_in_nobodys_way(folder):
 
 
 def test_how_jobs_are_run_is_no_part_of_what_they_are(unfinished):
-    other = replace(JOB, collectors=5, queue_capacity=3, scans_per_second=2.0, patience_s=1.0)
+    other = replace(JOB, collectors=5, queue_capacity=3, patience_s=1.0)
     RunStore(other, unfinished, resume=True).db.close()
 
 

@@ -136,14 +136,6 @@ class Cloud:
         return cls(np.concatenate([part.positions for part in parts]), columns, first.own)
 
 
-def counts_by_object(cloud: CloudLike, objects: int) -> NDArray[np.int64]:
-    """Count the points of each object: (objects,)."""
-    counts = np.zeros(objects, np.int64)
-    for chunk in cloud.chunks():
-        counts += np.bincount(chunk["object"], minlength=objects)
-    return counts
-
-
 def _fitting(column: Column, values: ArrayLike) -> NDArray[Any]:
     """`values` in the column's type; LidarpoolError where a plain cast would wrap around."""
     given, wanted = np.asarray(values), np.dtype(column.dtype)

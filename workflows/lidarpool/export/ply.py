@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import secrets
 import shutil
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,7 +15,8 @@ from numpy.typing import NDArray
 from ..base.choice import one_of_each_part
 from ..base.errors import LidarpoolError
 from ..base.interrupts import deferred_interrupts
-from ..columns.cloud import CHUNK_POINTS, Cloud, CloudLike
+from ..columns.cloud import Cloud, CloudLike
+from ..columns.storage import flush_folder
 from ..columns.table import AXES as POSITION
 from ..columns.table import TABLE, Column, check_names
 from .ply_format import AXES, as_held, header, layout, row_type
@@ -29,12 +29,12 @@ def save_cloud(path: str | Path, cloud: CloudLike, *, precision_m: float = 0.01)
     """Write a cloud, in memory or on disk, to a binary PLY file through Open3D.
 
     About a million points are in memory at a time: Open3D writes each such piece to a file of
-    its own, which is read back, compared and appended to the others below one header. The
-    bytes are those that Open3D would write at once.
+    its own, which is appended to the others below one header. The bytes are those that Open3D
+    would write at once.
 
-    The file is written under a temporary name in the same folder, read back, flushed to the
-    disk, and only then given its name: there is either the whole new file or what was there
-    before. The same points give the same bytes.
+    The file is written under a temporary name in the same folder, flushed to the disk, and only
+    then given its name: there is either the whole new file or what was there before. The same
+    points give the same bytes.
 
     Parameters
     ----------
@@ -60,13 +60,11 @@ def save_cloud(path: str | Path, cloud: CloudLike, *, precision_m: float = 0.01)
     # The ending stays, since Open3D picks the format by it.
     temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.tmp.ply")
     try:
-        _check_target(path, len(cloud), real, cloud.table)
+        _check_target(path, cloud.table)
         try:
-            checksum = _write(temporary, path, cloud, real)
-            size = _check_whole(temporary, path, len(cloud), checksum)
-            _flush(temporary)
+            size = _write(temporary, path, cloud, real)
             temporary.replace(path)
-            _flush(path.parent)
+            flush_folder(path.parent)
         finally:
             temporary.unlink(missing_ok=True)
     except OSError as error:
@@ -145,10 +143,7 @@ def real_type(bounds: NDArray[np.floating], precision_m: float) -> np.dtype[np.f
     return np.dtype(np.float32 if enough else np.float64)
 
 
-def _check_target(
-    path: Path, count: int, real: np.dtype[np.floating], table: Sequence[Column]
-) -> None:
-    """Ask before writing: names, the folder, the room on the disk; OSError if it cannot."""
+def _check_target(path: Path, table: Sequence[Column]) -> None:
     check_names((*POSITION, *table))
     if path.is_dir():
         raise LidarpoolError(f"{path} is a folder: give the name of a .ply file.")
@@ -156,38 +151,29 @@ def _check_target(
         raise LidarpoolError(f"{path} must end in .ply, the format that is written.")
     if not path.parent.is_dir():
         raise LidarpoolError(f"The folder {path.parent} does not exist: make it first.")
-    piece = min(count, CHUNK_POINTS)
-    row = row_type(real, table)
-    needed = sum(len(header(row, n)) + n * row.itemsize for n in (count, piece))
-    free = shutil.disk_usage(path.parent).free
-    if free < needed:
-        raise LidarpoolError(
-            f"{path} needs {needed:,} bytes and its disk has {free:,} free: make room, or write "
-            "to another folder."
-        )
 
 
 def _write(temporary: Path, path: Path, cloud: CloudLike, real: np.dtype[np.floating]) -> int:
-    """Write all pieces to `temporary`; returns the checksum of the rows."""
+    """Write all pieces to `temporary`; returns its size."""
     piece = temporary.with_name(temporary.name.replace(".tmp.", ".piece."))
-    checksum = written = 0
     with temporary.open("xb") as file:
         try:
             for chunk in cloud.chunks():
-                narrow = _as_held(chunk, real)
-                _write_open3d(piece, narrow)
-                head, rows = _read_back(piece, path, narrow)
-                if not written:
-                    own = b"element vertex %d\n" % len(chunk)
-                    file.write(head.replace(own, b"element vertex %d\n" % len(cloud)))
-                file.write(rows)
-                checksum = zlib.crc32(rows, checksum)
-                written += len(chunk)
+                _write_open3d(piece, _as_held(chunk, real))
+                start = _start_of_rows(piece, path, len(chunk))
+                with piece.open("rb") as written:
+                    head = written.read(start)
+                    if not file.tell():
+                        own = b"element vertex %d\n" % len(chunk)
+                        file.write(head.replace(own, b"element vertex %d\n" % len(cloud)))
+                    shutil.copyfileobj(written, file, 1 << 24)
         finally:
             piece.unlink(missing_ok=True)
-        if not written:  # which Open3D refuses to write
+        if not file.tell():  # which Open3D refuses to write
             file.write(header(row_type(real, cloud.table), 0))
-    return checksum
+        file.flush()
+        os.fsync(file.fileno())
+        return file.tell()
 
 
 class _Held(NamedTuple):
@@ -224,40 +210,10 @@ def _write_open3d(path: Path, cloud: _Held) -> None:
         raise LidarpoolError(f"Open3D cannot write to {path.parent}: check folder and disk.")
 
 
-def _read_back(piece: Path, path: Path, cloud: _Held) -> tuple[bytes, memoryview]:
-    """Read a piece of `path` back, compare it with `cloud` bit by bit; its header and rows.
-
-    Open3D says True also when the disk was full and the file is cut.
-    """
-    start, dtype = _layout_of(piece, path, len(cloud.positions))
-    rows = np.fromfile(piece, dtype=dtype, offset=start)
-    columns = {axis: cloud.positions[:, i] for i, axis in enumerate("xyz")}
-    columns |= cloud.columns
-    for name, column in columns.items():
-        if rows[name].tobytes() != column.tobytes():
-            raise LidarpoolError(f"{path} came back from the disk with another {name}: try again.")
-    with piece.open("rb") as file:
-        return file.read(start), rows.view(np.uint8).data
-
-
-def _check_whole(temporary: Path, path: Path, count: int, checksum: int) -> int:
-    """Read the whole file back and compare its checksum; returns its size."""
-    start, _ = _layout_of(temporary, path, count)
-    found = 0
-    with temporary.open("rb") as file:
-        file.seek(start)
-        while data := file.read(1 << 24):
-            found = zlib.crc32(data, found)
-        size = file.tell()
-    if found != checksum:
-        raise LidarpoolError(f"{path} came back from the disk with other bytes: try again.")
-    return size
-
-
-def _layout_of(file: Path, path: Path, count: int) -> tuple[int, np.dtype[np.void]]:
-    """Where the rows of a file begin and their type, if it holds so many points."""
+def _start_of_rows(piece: Path, path: Path, count: int) -> int:
+    """Where the rows of a piece begin: Open3D says True also when the disk was full."""
     try:
-        start, found, dtype = layout(file)
+        start, found, _ = layout(piece)
         if found != count:
             raise ValueError(f"{found:,} of {count:,} points")
     except ValueError as error:
@@ -266,15 +222,4 @@ def _layout_of(file: Path, path: Path, count: int) -> tuple[int, np.dtype[np.voi
             f"{path} could not be written whole ({error}); the disk has {free:,} bytes free. "
             "Make room, or write to another folder."
         ) from error
-    return start, dtype
-
-
-def _flush(path: Path) -> None:
-    """Wait until the file or folder is on the disk."""
-    if os.name == "nt" and path.is_dir():
-        return  # Windows has no handle of a folder to flush
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+    return start

@@ -28,8 +28,6 @@ class Job:
         Items that stage 1 may be ahead of stage 2.
     collectors
         Tasks of stage 4.
-    scans_per_second
-        How fast scans are made; None for as fast as they are cast.
     wait_s
         How long to wait for partitions that are still empty when the run begins, seconds.
     patience_s
@@ -47,7 +45,6 @@ class Job:
     backend: str = "auto"
     queue_capacity: int = 10
     collectors: int = 2
-    scans_per_second: float | None = None
     wait_s: float = WAIT_S
     patience_s: float = PATIENCE_S
 
@@ -57,11 +54,6 @@ class Job:
         for name in ("wait_s", "patience_s"):
             if not getattr(self, name) >= 0:
                 raise LidarpoolError(f"{name} is {getattr(self, name)}; it must be 0 or more.")
-        if self.scans_per_second is not None and not 0 < self.scans_per_second < float("inf"):
-            raise LidarpoolError(
-                f"scans_per_second is {self.scans_per_second}; it must be above 0, or None for "
-                "as many as are cast."
-            )
 
     @property
     def trials(self) -> int:

@@ -192,7 +192,7 @@ class Run:
             self.store.points_of_scan,
             take,
             on_parts,
-            SurveyOptions(job.queue_capacity, job.collectors, job.scans_per_second, job.patience_s),
+            SurveyOptions(job.queue_capacity, job.collectors, job.patience_s),
         )
 
     def _call(self, callback: Callable[[T], None], argument: T) -> None:

@@ -33,7 +33,6 @@ def simulate(
     on_progress: Callable[[Progress], None] | None = None,
     queue_capacity: int = 10,
     collectors: int = 2,
-    scans_per_second: float | None = None,
     gpu_workers: int | None = None,
     other_workers: int | None = None,
     tls: bool = False,
@@ -66,9 +65,6 @@ def simulate(
         Items that stage 1 may be ahead of stage 2.
     collectors
         Tasks of stage 4.
-    scans_per_second
-        How fast scans are made, as by a sensor that takes its time; by default as fast as
-        they are cast.
     gpu_workers, other_workers
         Workers of a local cluster; by default what suits the machine.
     tls
@@ -116,7 +112,6 @@ def simulate(
         backend,
         queue_capacity,
         collectors,
-        scans_per_second,
         wait_s,
         patience_s,
     )

@@ -97,16 +97,12 @@ class SurveyOptions:
         Items that stage 1 may be ahead.
     collectors
         Number of tasks of stage 4.
-    scans_per_second
-        How fast stage 1 describes scans, as a sensor that takes its time; None for as fast as
-        they are taken.
     patience_s
         How long to wait for workers that are gone, seconds.
     """
 
     queue_capacity: int = 10
     collectors: int = 2
-    scans_per_second: float | None = None
     patience_s: float = PATIENCE_S
 
 
@@ -202,7 +198,6 @@ class SurveyDriver:
             self.survey,
             self._scans,
             self.generated,
-            self._options.scans_per_second,
         )
 
     def _sort(self, number: int) -> Work:

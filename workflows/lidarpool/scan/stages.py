@@ -7,7 +7,6 @@ failed it knows why.
 
 from __future__ import annotations
 
-import time
 from itertools import chain
 from typing import Any
 
@@ -35,7 +34,6 @@ from .failures import OtherVersion, naming_scans
 from .messages import Receipt
 from .names import COLLECT, GENERATE, LIDAR, SORT
 
-LOOK_EVERY_S = 0.05  # at the clock, so that a pipe that fails is noticed
 FETCH_PATIENCE_S = 2.0  # for a sign of life of the worker that has a batch
 
 
@@ -62,28 +60,19 @@ def generate(
     survey: Survey,
     outlet: Pipe,
     first: int = 0,
-    pace: float | None = None,
 ) -> TaskRecord:
     """Stage 1: describe every scan from `first` on, as many in one item as is advised.
 
-    An item is a range of scans, all of which the survey says the same of everywhere. With a pace,
-    so many a second, each when its time has come.
+    An item is a range of scans, all of which the survey says the same of everywhere.
     """
     secede()
     check_version(version)
     recorder = Recorder(GENERATE, LIDAR)
-    sent, begun = first, time.monotonic()
+    sent = first
     trace("generate.start", **fields, scans=[])
     try:
         while sent < survey.scan_count:
             stop = min(sent + outlet.advice, survey.scan_count)
-            if pace is not None:
-                due = first + 1 + int((time.monotonic() - begun) * pace)
-                if due <= sent:
-                    outlet.advice  # noqa: B018 - raises where the pipe has failed
-                    time.sleep(min(LOOK_EVERY_S, 1 / pace))
-                    continue
-                stop = min(stop, due)
             with naming_scans(sent, stop - 1):
                 survey.scan(stop - 1)  # what cannot be described is told of here
             trace("generate.put", **fields, scans=list(range(sent, stop)))
