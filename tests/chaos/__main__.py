@@ -13,8 +13,9 @@ import sys
 import time
 from collections import Counter
 
+from tests.chaos.points import DRIVER_POINTS, STAGE_POINTS
+
 from lidarpool import Survey
-from lidarpool.scan.points import DRIVER_POINTS, STAGE_POINTS
 
 from .arena import Arena
 from .events import KILL, KINDS

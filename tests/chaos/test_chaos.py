@@ -7,9 +7,8 @@ from tests.chaos.__main__ import Campaign
 from tests.chaos.arena import Arena
 from tests.chaos.events import KINDS
 from tests.chaos.nemesis import RANDOM, Fault
+from tests.chaos.points import STAGE_POINTS
 from tests.chaos.survey import PAUSES, disturbed, reference, survey
-
-from lidarpool.scan.points import STAGE_POINTS
 
 SEED = 7
 FAULTS = 20

@@ -37,7 +37,7 @@ driver.replay      a batch is about to be offered or handed on once more; `reaso
 
 from __future__ import annotations
 
-from .names import COLLECT, GENERATE, INTERSECT, SORT
+from lidarpool.scan.names import COLLECT, GENERATE, INTERSECT, SORT
 
 # {stage: its points, in the order in which it passes them}
 STAGE_POINTS = {
