@@ -13,13 +13,12 @@ import sys
 import time
 from collections import Counter
 
-from tests.chaos.points import DRIVER_POINTS, STAGE_POINTS
-
 from lidarpool import Survey
 
 from .arena import Arena
 from .events import KILL, KINDS
 from .nemesis import Fault, make_plan
+from .points import DRIVER_POINTS, STAGE_POINTS
 from .survey import PAUSES, Outcome, Reference, disturbed, reference, survey
 
 FAULTS_PER_RUN = 8

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import sysconfig
 import types
 from collections.abc import Mapping, Set
 from fractions import Fraction
 from functools import cached_property, partial
-from pathlib import PurePath
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
@@ -116,6 +117,8 @@ class _Digest:
             self._mark("builtin", getattr(thing, "__module__", ""), thing.__name__)
         elif isinstance(thing, types.ModuleType):
             self._mark("module", thing.__name__)
+            if (source := _own_source(thing)) is not None:
+                self._mark(source.read_text("utf-8"))
         else:
             self._add_object(thing)
 
@@ -180,6 +183,22 @@ def _names(code: types.CodeType) -> list[str]:
     """Names that code looks up, with those of the code within it."""
     inner = [c for c in code.co_consts if isinstance(c, types.CodeType)]
     return sorted({*code.co_names, *(name for c in inner for name in _names(c))})
+
+
+def _own_source(module: types.ModuleType) -> Path | None:
+    """File of a module that is not installed, such as one beside a script.
+
+    Which attribute of it a function uses cannot be told, so all of its text counts. Those that
+    are installed change with their version only.
+    """
+    file = Path(getattr(module, "__file__", None) or "")
+    installed = {
+        sysconfig.get_path(kind) for kind in ("stdlib", "platstdlib", "purelib", "platlib")
+    }
+    ours = module.__name__.partition(".")[0] == _OURS
+    if ours or file.suffix != ".py" or any(file.is_relative_to(folder) for folder in installed):
+        return None
+    return file
 
 
 def _is_cached(kind: type, name: str) -> bool:
