@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 import dask
 from distributed import Client, SpecCluster
@@ -29,14 +30,10 @@ _CONFIG = {
 
 
 class Arena:
-    """A local cluster with two casting workers, several LIDAR workers, and a board.
+    """A local cluster with two casting workers, two for the LIDAR stages, one more, and a board.
 
     Parameters
     ----------
-    lidar
-        Number of LIDAR workers.
-    slots
-        Threads and slots of each.
     pauses
         Seconds a scan to hold at some points of the workers.
     time_to_live_s
@@ -44,15 +41,12 @@ class Arena:
     """
 
     def __init__(
-        self,
-        lidar: int = 2,
-        slots: int = 4,
-        pauses: Mapping[str, float] | None = None,
-        time_to_live_s: int = TIME_TO_LIVE_S,
+        self, pauses: Mapping[str, float] | None = None, time_to_live_s: int = TIME_TO_LIVE_S
     ) -> None:
         self._stack = ExitStack()
         self._config = {**_CONFIG, "distributed.scheduler.worker-ttl": f"{time_to_live_s}s"}
-        self._lidar, self._slots, self._pauses = lidar, slots, dict(pauses or {})
+        self._pauses = dict(pauses or {})
+        self._withdrawn: dict[str, Any] = {}  # {name: how to start it}
 
     def __enter__(self) -> Arena:
         with ExitStack() as stack:
@@ -60,13 +54,12 @@ class Arena:
             folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="chaos-"))
             self.board = Board(Path(folder))
             self.cluster: SpecCluster = stack.enter_context(
-                local_cluster(gpu_workers=2, lidar_slots=self._slots, other_workers=1)
+                local_cluster(gpu_workers=2, other_workers=1)
             )
             spec = self.cluster.worker_spec
-            for number in range(1, self._lidar):
-                spec[f"LIDAR-{number}"] = spec["LIDAR-0"]
+            spec["LIDAR-1"] = spec["LIDAR-0"]
             self.cluster.sync(self.cluster._correct_state)
-            self.client = stack.enter_context(Client(self.cluster))
+            self.client = stack.enter_context(Client(self.cluster, set_as_default=False))
             stack.callback(trace_to, None)
             self.client.register_plugin(ChaosPlugin(folder, self._pauses))
             self._stack = stack.pop_all()
@@ -100,6 +93,13 @@ class Arena:
         address = getattr(nanny, "worker_address", None)
         return address if address in self.cluster.scheduler.workers else None
 
+    def withdraw(self, partition: str) -> None:
+        """Have all workers of a partition leave until another one was given up."""
+        self.wait_until_whole()
+        for name in self.names(partition):
+            self._withdrawn[name] = self.cluster.worker_spec.pop(name)
+        self.cluster.sync(self.cluster._correct_state)
+
     def give_up(self, pid: int) -> None:
         """Have the scheduler do with the worker of a process as when it is not heard of."""
         scheduler = self.cluster.scheduler
@@ -110,6 +110,9 @@ class Arena:
             wait_for_workers=False,
             stimulus_id="chaos",
         )
+        self.cluster.worker_spec.update(self._withdrawn)
+        self._withdrawn.clear()
+        self.cluster.sync(self.cluster._correct_state)
 
     def revive(self, name: str) -> None:
         """Start a worker anew whose nanny has left with it."""

@@ -7,19 +7,15 @@ import traceback
 from collections.abc import Mapping
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
-from multiprocessing.synchronize import Barrier
 from pathlib import Path
 
 from distributed import Client
 
 from lidarpool import Planning, Survey, simulate
-from lidarpool.scan import driver
 from poolpart import placement_violations, trace_to
 
 from .events import Board, Sink
 from .survey import Reference, room
-
-START_S = 120.0  # for all drivers to be there
 
 
 @dataclass(frozen=True)
@@ -45,24 +41,13 @@ class Driver:
         The survey and what is planned meanwhile.
     folder
         Of the board to log to.
-    start
-        Where to wait for others before the survey starts, and once more when it has its first
-        scans: so these surveys run at a time. They are not disturbed, and nothing that is only
-        slow is taken for lost.
     """
 
-    def __init__(
-        self,
-        address: str,
-        what: Survey,
-        planning: Planning | None,
-        folder: Path,
-        start: Barrier | None = None,
-    ) -> None:
+    def __init__(self, address: str, what: Survey, planning: Planning | None, folder: Path) -> None:
         context = multiprocessing.get_context("spawn")
         self._answers, outlet = context.Pipe(duplex=False)
         self.process = context.Process(
-            target=_drive, args=(outlet, address, what, planning, folder, start), daemon=True
+            target=_drive, args=(outlet, address, what, planning, folder), daemon=True
         )
         self.process.start()
         outlet.close()
@@ -85,31 +70,19 @@ class Driver:
 
 
 def _drive(
-    outlet: Connection,
-    address: str,
-    what: Survey,
-    planning: Planning | None,
-    folder: Path,
-    start: Barrier | None,
+    outlet: Connection, address: str, what: Survey, planning: Planning | None, folder: Path
 ) -> None:
-    run, waited = "", start is None
+    run = ""
     log = Sink(Board(folder), "driver", lambda _: None)
 
     def note(point: str, fields: Mapping[str, object]) -> None:
-        nonlocal run, waited
+        nonlocal run
         run = str(fields.get("run", ""))
         log(point, fields)
-        if start is not None and not waited:
-            waited = True
-            start.wait(START_S)
 
-    if start is not None:
-        driver.STALL_S = driver.LATE_S = float("inf")
     trace_to(note)
     try:
         with Client(address) as client:
-            if start is not None:
-                start.wait(START_S)
             result = simulate(room(), what, planning, client=client, backend="numpy")
             outlet.send(
                 Delivered(

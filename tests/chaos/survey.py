@@ -101,7 +101,7 @@ def disturbed(
     known: Reference,
     faults: Sequence[Fault],
     planning: Planning | None = PLANNING,
-    **options: int,
+    **options: float,
 ) -> Outcome:
     """Run it while the nemesis does its worst, and judge what comes of it."""
     arena.wait_until_whole()

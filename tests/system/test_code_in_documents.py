@@ -8,24 +8,28 @@ from __future__ import annotations
 
 import importlib.util
 import re
+import runpy
 import shlex
 import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import partial
 from itertools import dropwhile
 from pathlib import Path
 from typing import Any
 
 import click
 import dask
-import distributed  # noqa: F401 - its defaults are part of Dask's configuration then
+import distributed
 import numpy as np
 import pytest
 import yaml
 from distributed.cli import dask_scheduler, dask_worker
 
+import lidarpool.run.simulation
 from lidarpool import Cloud, save_cloud
 from lidarpool.cli.commands import cli
 from lidarpool.scenario.scenario import Scenario
@@ -93,8 +97,17 @@ def test_all_code_is_of_a_kind_that_is_looked_at():
     assert len(PROGRAMS) > 10
 
 
-@pytest.mark.parametrize("block", PROGRAMS, ids=lambda block: block.where)
-def test_python_runs(tmp_path, block):
+@pytest.fixture
+def in_threads(monkeypatch, cluster_client):
+    """Give programs clusters of threads: the tests' own, or one that they describe."""
+    theirs = partial(distributed.LocalCluster, processes=False, protocol="tcp")
+    monkeypatch.setattr(distributed, "LocalCluster", theirs)
+    ours = nullcontext(cluster_client)
+    monkeypatch.setattr(lidarpool.run.simulation, "local_client", lambda **_: ours)
+
+
+@pytest.mark.parametrize("block", PROGRAMS[1:], ids=lambda block: block.where)
+def test_python_runs(tmp_path, block, in_threads, monkeypatch, capsys):
     compile(block.code, block.where, "exec")
     if block.reason:
         return
@@ -105,18 +118,24 @@ def test_python_runs(tmp_path, block):
     save_cloud(folder / "cloud.ply", Cloud(np.ones((1, 3), np.float32), columns))
     script = tmp_path / "example.py"
     script.write_text(block.code, encoding="utf-8")
-    done = subprocess.run(
-        [sys.executable, script],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=600,
-        check=False,
-    )
-    assert done.returncode == 0, f"{block.where}\n{done.stderr}"
+    monkeypatch.chdir(tmp_path)
+    runpy.run_path(str(script), run_name="__main__")
+    printed = capsys.readouterr().out.splitlines()
     # What a comment beside a print promises is what is printed.
     for promised in re.findall(r"print\(.*\)  # (.*)", block.code):
-        assert promised in done.stdout.splitlines()
+        assert promised in printed
+
+
+def test_the_first_program_of_the_readme_runs_as_a_script(tmp_path):
+    """It starts processes, each of which imports it."""
+    script = tmp_path / "example.py"
+    script.write_text(PROGRAMS[0].code, encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, script], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert re.fullmatch(r"\d+ points, a path of 71\.\d\d m\n", done.stdout)
+    assert (tmp_path / "cloud.ply").exists()
 
 
 @of(*_SHELL)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import threading
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import pytest
-from distributed import Client
+from distributed import Client, Queue
+from tests.chaos.traces import scheduler_state, settled_differences
 
-from lidarpool import Frame, LidarpoolError, Result, Scene, Sensor, Survey, simulate
+from lidarpool import Frame, LidarpoolError, Planning, Result, Scene, Sensor, Survey, simulate
 from lidarpool.run.progress import Progress
-from poolpart import Pool
+from poolpart import Pool, placement_violations
 
 SURVEY = Survey(Sensor.grid(rays_per_revolution=180, layers=4, step_deg=5), [(0, 0, 1)], steps=72)
 
@@ -63,3 +66,48 @@ def test_slots_that_are_gone_are_not_waited_for_forever(cluster, monkeypatch, le
         ):
             simulate(Scene.seed(), SURVEY, client=client, collectors=5, patience_s=0.5)
         assert left_over(client) == ([], [], [])
+
+
+def test_two_surveys_and_a_foreign_user_do_not_see_each_other(threads, same_cloud):
+    """Of what a run has used nothing stays either, but what is the cluster's own."""
+    planning = Planning((25, 25), (-30, -20), trials=3, particles=50, iterations=20)
+    all_there = threading.Barrier(3)
+
+    def run(survey: Survey) -> Result:
+        met: list[int] = []
+
+        def meet(_: Frame) -> None:
+            if not met:  # none is done before all have begun
+                met.append(all_there.wait(120))
+
+        with Client(address, set_as_default=False) as client:
+            return simulate(Scene.seed(), survey, planning, client=client, on_frame=meet)
+
+    def be_foreign() -> tuple[list[int], list[int]]:
+        """Know nothing of partitions: an own client, own tasks, an own queue."""
+        results, taken = [], []
+        with Client(address, set_as_default=False) as client:
+            queue = Queue("foreign", client=client)
+            for count in range(20):
+                if count == 10:
+                    all_there.wait(120)
+                queue.put(count)
+                results.append(client.submit(pow, count, 2, pure=False).result(120))
+                taken.append(queue.get(timeout=120))
+            queue.close()
+        return results, taken
+
+    surveys = [SURVEY, replace(SURVEY, keep_every=7)]
+    with threads(GPU=2, LIDAR=8, OTHER=1) as address, Client(address) as client:
+        alone = [simulate(Scene.seed(), survey, planning, client=client) for survey in surveys]
+        before = scheduler_state(client)
+        with ThreadPoolExecutor() as pool:
+            foreign = pool.submit(be_foreign)
+            together = list(pool.map(run, surveys))
+        assert foreign.result() == ([count**2 for count in range(20)], list(range(20)))
+        assert settled_differences(client, before) == []
+    for one, other in zip(together, alone, strict=True):
+        assert same_cloud(one.cloud, other.cloud)
+        assert (one.plan.path == other.plan.path).all()
+        assert placement_violations(one.records) == []
+        assert one.replayed == one.duplicates_dropped == 0

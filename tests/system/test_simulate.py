@@ -4,33 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from distributed import Client, Scheduler, SpecCluster, Worker
+from distributed import Client
 
 from lidarpool import LidarpoolError, Planning, Pose, ScanSpec, Scene, Sensor, Survey, simulate
 from lidarpool.scene.mesh import Mesh
 
 
-@pytest.fixture(scope="module")
-def client():
-    """A cluster in this process: LIDAR has one thread and four slots."""
-    kinds = {"GPU": (1, 1), "LIDAR": (1, 4), "OTHER": (1, 1)}
-    workers = {
-        name: {
-            "cls": Worker,
-            "options": {
-                "nthreads": threads,
-                "resources": {name: slots},
-                "dashboard_address": "127.0.0.1:0",
-            },
-        }
-        for name, (threads, slots) in kinds.items()
-    }
-    scheduler = {
-        "cls": Scheduler,
-        "options": {"host": "127.0.0.1", "port": 0, "dashboard_address": "127.0.0.1:0"},
-    }
-    with SpecCluster(workers=workers, scheduler=scheduler) as cluster, Client(cluster) as client:
-        yield client
+@pytest.fixture
+def client(cluster_client):
+    return cluster_client
 
 
 def room(offset=(0.0, 0.0, 0.0)) -> Scene:
