@@ -4,11 +4,10 @@ import logging
 import sys
 import warnings
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
-from lidarpool.cli.log_file import LogFile, log_to, logged_to
+from lidarpool.cli.log_file import logged_to
 
 
 @pytest.fixture
@@ -118,14 +117,9 @@ def test_many_messages_are_not_held_in_memory(tmp_path, library):
     assert (tmp_path / "log").read_text().count("\n") == 1000
 
 
-def test_a_worker_appends_to_what_is_there(tmp_path, monkeypatch):
+def test_names_that_cannot_be_encoded_are_written_too(tmp_path, library):
     (tmp_path / "log").write_text("before\n")
-    root = logging.Logger("root", logging.WARNING)
-    monkeypatch.setattr(logging, "root", root)
-    monkeypatch.setattr("lidarpool.cli.log_file._with_handlers", list)
-    monkeypatch.setattr(logging, "captureWarnings", lambda wanted: None)
-    log_to(tmp_path / "log")
-    root.warning("after \udcff")  # as names of files may be
-    assert [type(handler) for handler in root.handlers] == [LogFile]
-    lines = Path(tmp_path / "log").read_text().splitlines()
+    with logged_to(tmp_path / "log"):
+        library.warning("after \udcff")  # as names of files may be
+    lines = (tmp_path / "log").read_text().splitlines()
     assert lines[0] == "before" and lines[1].endswith(r"after \udcff")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ from tests.lidarpool.carts import Cart
 from lidarpool import Beams, Column, Pose, Scene, Sensor, Spin, Survey
 from lidarpool.scan.failures import naming_scans
 from lidarpool.scan.rig import Rig, RigPlan
-from lidarpool.scenario.sampling import sample_survey
 from lidarpool.scene.shapes import seed_objects
 from poolpart import WorkerLeft
 from raybeam import RayCaster
@@ -138,25 +136,6 @@ def test_however_scans_are_batched_their_columns_have_the_same_bits(name, scene)
     whole = columns([0, survey.scan_count])
     assert columns([0, 1, 5, 14, 17, 28]) == whole
     assert columns(list(range(29))) == whole
-
-
-@pytest.mark.parametrize("name", ["beams with offsets", "on the move"])
-def test_a_sample_of_all_rays_counts_what_a_survey_gives(name, scene):
-    survey = SURVEYS[name]
-    batches = list(Rig(RigPlan(scene, survey, "numpy")).cast(0, survey.scan_count))
-    sample = sample_survey(scene, survey, "numpy")
-    assert sample.rays == survey.ray_count and sample.behind == ()
-    assert sample.hits == sum(batch.found.hits.sum() for batch in batches)
-    assert sample.points == sum(map(len, batches))
-
-
-def test_of_a_moving_survey_that_is_long_some_rays_tell(scene):
-    """Stations differ in what they see, and so do the scans of a station."""
-    long = replace(SURVEYS["on the move"], steps=1800, keep_every=1)
-    sample = sample_survey(scene, long, "numpy")
-    assert sample.rays < long.ray_count / 5
-    batches = Rig(RigPlan(scene, long, "numpy")).cast(0, long.scan_count)
-    assert sample.hits == pytest.approx(sum(b.found.hits.sum() for b in batches), rel=0.1)
 
 
 class TestNamingScans:

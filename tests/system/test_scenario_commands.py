@@ -1,13 +1,9 @@
-"""What helps before the first run: init, schema, completion, help, words for mistakes."""
+"""What helps before the first run: init, schema, help, words for mistakes."""
 
 from __future__ import annotations
 
 import json
-import os
 import re
-import shutil
-import subprocess
-import sys
 
 import pytest
 import trimesh
@@ -101,38 +97,6 @@ def test_schema_prints_what_init_writes(tmp_path, lidarpool):
     assert lidarpool("schema").out == (tmp_path / "scenario.schema.json").read_text()
 
 
-# -- completion ----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_completion_is_a_script_that_the_shell_takes(shell, lidarpool):
-    outcome = lidarpool("completion", shell)
-    assert (outcome.code, outcome.err) == (0, "")
-    assert f"_LIDARPOOL_COMPLETE={shell}_complete" in outcome.out
-    if shutil.which(shell):
-        checked = subprocess.run([shell, "-n"], input=outcome.out, text=True, check=False)
-        assert checked.returncode == 0
-
-
-def test_bash_completes(tmp_path, lidarpool):
-    if not shutil.which("bash"):
-        pytest.skip("there is no bash here")
-    script = lidarpool("completion", "bash").out
-    command = tmp_path / "lidarpool"
-    command.write_text(f'#!/bin/sh\nexec {sys.executable} -m lidarpool "$@"\n')
-    command.chmod(0o755)
-    asked = "COMP_WORDS=(lidarpool run --no-pl)\nCOMP_CWORD=2\n_lidarpool_completion lidarpool\n"
-    path = os.pathsep.join([str(tmp_path), os.environ["PATH"]])
-    done = subprocess.run(
-        ["bash", "-c", f'{script}\n{asked}echo "${{COMPREPLY[@]}}"'],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "PATH": path, "PYTHONPATH": os.pathsep.join(sys.path)},
-        check=False,
-    )
-    assert done.stdout == "--no-plan\n", done.stderr
-
-
 # -- help and mistakes ---------------------------------------------------------------------------
 
 
@@ -151,27 +115,11 @@ def test_help_of_each_command_shows_two_examples(name, lidarpool):
     ("arguments", "meant"),
     [
         (["run", "--bakend", "numpy", "x.yaml"], "'--backend'"),
-        (["demo", "--ou", "x"], "'--out'"),
         (["scene", "ciyt", "x.ply"], "'city'"),
         (["scheme"], "'schema'"),
-        (["run", "x.glb", "--backend", "cuad"], "'cuda'"),
     ],
 )
 def test_what_is_misspelt_is_answered_with_what_was_meant(arguments, meant, lidarpool):
     outcome = lidarpool(*arguments)
     assert outcome.code == 2 and outcome.out == ""
     assert re.search(rf"Did you mean (one of: )?.*{meant}", outcome.err), outcome.err
-
-
-@pytest.mark.parametrize(
-    ("text", "meant"),
-    [
-        ("pool: {backend: embre}", "'embree'"),
-        ("scene: {preset: sead}", "'seed'"),
-        ("scene: {files: [{file: a.stl, up_axis: Z}]}", "'z'"),
-    ],
-)
-def test_a_misspelt_choice_in_a_scenario_is_answered_too(text, meant, tmp_path, lidarpool):
-    (tmp_path / "s.yaml").write_text(text)
-    outcome = lidarpool("check", tmp_path / "s.yaml")
-    assert outcome.code == 2 and outcome.err.endswith(f"Did you mean {meant}?\n"), outcome.err

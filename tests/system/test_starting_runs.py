@@ -103,8 +103,7 @@ def lost(outside) -> Iterator[tuple[Any, Client]]:
         yield cluster, client
 
 
-def test_workers_that_do_not_come_back_are_named(lost, lose_gpu, monkeypatch):
-    monkeypatch.setattr(lidarpool.run.checks, "RETURN_S", 0.5)
+def test_workers_that_do_not_come_back_are_named(lost, lose_gpu):
     cluster, client = lost
     name = next(name for name in cluster.processes if name.startswith("GPU"))
     lose_gpu(lambda: cluster.kill(name))

@@ -4,43 +4,34 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import Any, NoReturn
 
 import click
 
-from poolpart import Pool, PoolError, WorkerInfo
+from poolpart import Pool, PoolError
 from poolpart.probe import visible_gpus
+from poolpart.wording import counted
 from raybeam import available_backends
 
 from .._version import __version__
 from ..base.errors import LidarpoolError
 from ..base.interrupts import INTERRUPTED, STOPPED, UNTOUCHED, interrupt_on_signals
 from ..report.report import versions
-from ..run.connection import connected
+from ..run.connection import TlsFiles, connected
 from ..scan import PATIENCE_S, WAIT_S
 from ..scenario.scenario import Scenario
+from . import options
 from .check_command import check
-from .command_group import CommandGroup
-from .completion import PROGRAM, complete_backend, completion
-from .listeners import leaving_listeners
-from .log_file import LOG
+from .log_file import LOG, silence_logs
 from .plot_command import plot
-from .quiet import silence_logs
 from .run_command import RunOptions, run_scenario
 from .scenario_commands import init, schema
 from .scene_commands import scene
-from .tls_options import tls_file_options, tls_files_for
 from .view_command import view
 
-_out = click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    default=Path("lidarpool-out"),
-    show_default=True,
-    help="Folder for the results; made if it is not there.",
-)
+PROGRAM = "lidarpool"
+
 # What `demo` and `run` have in common; each is a field of RunOptions.
 _SHOWN = (
     click.option("--tls", is_flag=True, help="Encrypt the traffic of the local cluster."),
@@ -86,28 +77,25 @@ class Duration(click.ParamType[float]):
         return float(found[1]) * {"": 1, "s": 1, "m": 60, "h": 3600}[found[2]]
 
 
-Command = TypeVar("Command", bound=Callable[..., None])
-
-
-def _shown(command: Command) -> Command:
+def _shown(command: options.Command) -> options.Command:
     """Give a command the options of `_SHOWN`, in their order."""
     for option in reversed(_SHOWN):
         command = option(command)
     return command
 
 
-@click.group(cls=CommandGroup, context_settings={"max_content_width": 100})
+@click.group(context_settings={"max_content_width": 100})
 @click.version_option(__version__, prog_name=PROGRAM)
 def cli() -> None:
     """Simulate lidar surveys on a partitioned Dask cluster."""
 
 
-for _command in (init, check, schema, scene, completion, view, plot):
+for _command in (init, check, schema, scene, view, plot):
     cli.add_command(_command)
 
 
 @cli.command()
-@_out
+@options.out
 @_shown
 def demo(out: Path, **shown: Any) -> None:
     """Run the default survey and path planning on a cluster on this machine.
@@ -122,16 +110,10 @@ def demo(out: Path, **shown: Any) -> None:
 
 @cli.command()
 @click.argument("scenario", type=click.Path(path_type=Path))
-@_out
-@click.option("--scheduler", metavar="ADDRESS", help="Use this Dask cluster, tcp://host:8786.")
-@tls_file_options
-@click.option(
-    "--backend",
-    metavar="[auto|cuda|embree|numpy]",
-    shell_complete=complete_backend,
-    help="Ray caster of stage 2; by default the scenario's, else the fastest there is.",
-)
-@click.option("--no-plan", is_flag=True, help="Leave the path planning out.")
+@options.out
+@options.scheduler
+@options.backend
+@options.no_plan
 @click.option("--resume", is_flag=True, help="Go on with an unfinished run, if there is one.")
 @click.option("--fresh", is_flag=True, help="Drop an unfinished run.")
 @click.option(
@@ -156,22 +138,7 @@ def demo(out: Path, **shown: Any) -> None:
     help=f"Wait so long for partitions that become empty.  [default: {PATIENCE_S:g}s]",
 )
 @_shown
-def run(
-    scenario: Path,
-    out: Path,
-    scheduler: str | None,
-    backend: str | None,
-    no_plan: bool,
-    resume: bool,
-    fresh: bool,
-    parts: str | None,
-    wait_s: float,
-    patience_s: float,
-    tls_ca: Path | None,
-    tls_cert: Path | None,
-    tls_key: Path | None,
-    **shown: Any,
-) -> None:
+def run(scenario: Path, **given: Any) -> None:
     """Run a survey from a scenario file, or of a mesh file from its middle.
 
     \b
@@ -179,36 +146,19 @@ def run(
       lidarpool run examples/seed.yaml --out seed
       lidarpool run hall.glb --no-plan --resume --scheduler tcp://127.0.0.1:8786
     """  # noqa: D301 - click wants the character, not its name
-    files = tls_files_for(scheduler, tls_ca, tls_cert, tls_key)
-    if shown["tls"] and scheduler is not None:
+    if given["tls"] and given["scheduler"] is not None:
         raise click.UsageError(
             "--tls is for a cluster of this machine; that of --scheduler is encrypted if its "
             "address begins with tls://."
         )
-    if resume and fresh:
+    if given["resume"] and given["fresh"]:
         raise click.UsageError("--resume goes on with what --fresh drops: give one of them.")
-    options = RunOptions(
-        out,
-        scheduler,
-        files,
-        backend=backend,
-        no_plan=no_plan,
-        resume=resume,
-        fresh=fresh,
-        parts=parts,
-        wait_s=wait_s,
-        patience_s=patience_s,
-        **shown,
-    )
-    run_scenario(Scenario.load(scenario), options)
+    run_scenario(Scenario.load(scenario), RunOptions(**given))
 
 
 @cli.command()
-@click.option("--scheduler", metavar="ADDRESS", help="Also show the workers of this cluster.")
-@tls_file_options
-def info(
-    scheduler: str | None, tls_ca: Path | None, tls_cert: Path | None, tls_key: Path | None
-) -> None:
+@options.scheduler
+def info(scheduler: str | None, files: TlsFiles) -> None:
     """Show versions, ray-casting backends, GPUs and the workers by partition.
 
     \b
@@ -217,7 +167,6 @@ def info(
       lidarpool info --scheduler tcp://127.0.0.1:8786
     """  # noqa: D301 - click wants the character, not its name
     pool = None
-    files = tls_files_for(scheduler, tls_ca, tls_cert, tls_key)
     if scheduler is not None:
         with connected(scheduler, files) as client:
             pool = Pool.from_client(client)
@@ -233,35 +182,22 @@ def info(
 
 
 def _tell_workers(pool: Pool) -> None:
-    hosts = len({worker.host for worker in pool})
-    click.echo(
-        f"cluster: {len(pool)} worker{'s' * (len(pool) != 1)} on {hosts} host{'s' * (hosts != 1)}"
-    )
+    hosts = {worker.host for worker in pool}
+    click.echo(f"cluster: {counted(len(pool), 'worker')} on {counted(len(hosts), 'host')}")
     for worker in sorted(pool, key=lambda worker: (sorted(worker.resources), worker.name)):
         held = ", ".join(f"{name}={slots:g}" for name, slots in sorted(worker.resources.items()))
+        name = f"{worker.name}  " if worker.name != worker.address else ""
         click.echo(
-            f"  {held or 'no partition':<12} {_called(worker)}  {worker.nthreads} "
-            f"thread{'s' * (worker.nthreads != 1)}  {worker.memory / 2**30:.1f} GiB  "
-            f"{len(worker.gpus) or 'no'} GPU{'s' * (len(worker.gpus) > 1)}"
+            f"  {held or 'no partition':<12} {name}{worker.address}  "
+            f"{counted(worker.nthreads, 'thread')}  {worker.memory / 2**30:.1f} GiB  "
+            f"{counted(len(worker.gpus), 'GPU')}"
         )
-
-
-def _called(worker: WorkerInfo) -> str:
-    """Address of a worker, after its name if it was given one."""
-    named = worker.name != worker.address
-    return f"{worker.name}  {worker.address}" if named else worker.address
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:
     """Run the command and exit: 0 done, 2 for what the user can put right, 130 interrupted."""
     interrupt_on_signals()
     silence_logs()
-    with leaving_listeners():
-        _run(arguments)
-    sys.exit(0)
-
-
-def _run(arguments: list[str] | None) -> None:
     try:
         cli.main(args=arguments, prog_name=PROGRAM, standalone_mode=False)
     except (LidarpoolError, PoolError) as error:
@@ -269,10 +205,8 @@ def _run(arguments: list[str] | None) -> None:
     except click.UsageError as error:
         _die(error.format_message(), 2)
     except (KeyboardInterrupt, click.Abort) as error:
-        _die(
-            " ".join([f"{STOPPED}.", *notes]) if (notes := _notes(error)) else UNTOUCHED,
-            INTERRUPTED,
-        )
+        notes = _notes(error)
+        _die(" ".join([f"{STOPPED}.", *notes]) if notes else UNTOUCHED, INTERRUPTED)
     except OSError as error:
         # Of a name that no file can have, or that lies in a folder which may not be looked into;
         # anything else is a defect, and shown whole.
@@ -283,6 +217,7 @@ def _run(arguments: list[str] | None) -> None:
     except MemoryError as error:
         advice = "not enough memory: take a smaller scene, fewer scans or a larger keep_every."
         _die(" ".join([advice, *_notes(error)]), 2)
+    sys.exit(0)
 
 
 def _notes(error: BaseException) -> list[str]:

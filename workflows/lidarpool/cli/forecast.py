@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from dask.utils import format_bytes
 from distributed import Client
 from distributed.system import MEMORY_LIMIT
 
@@ -18,18 +19,52 @@ from poolpart.local import usable_cores
 from poolpart.probe import visible_gpus
 from raybeam import available_backends
 
+from ..base.choice import one_of_each_part
 from ..base.errors import LidarpoolError
-from ..report.output import folder_in_the_way
-from ..run.checks import check_backend_here, find_workers
+from ..columns.cloud import CHUNK_POINTS
+from ..report.output import ROOM_BYTES, folder_in_the_way
+from ..run.checks import check_backend_here, find_workers, slots_needed
 from ..run.database import FILE
 from ..run.job import Job
 from ..run.local import default_workers
 from ..scan import GPU, LIDAR, OTHER
-from ..scenario.advice import advice
-from ..scenario.sampling import Sample, sample_survey
+from ..scan.driver import BATCH_RAYS
+from ..scan.rig import PATTERN_RAYS, Rig, RigPlan
 from ..scenario.sections import PoolSection
-from .needs import Needs, needs_of
+from ..scene.scene import Scene
+from ..sensor import Survey
 from .run_command import RUN_FOLDER
+
+# Measured on Linux: a process of ours with Dask and Open3D loaded, and what a triangle takes at
+# most while a caster is built (Embree 300, NumPy 320, CUDA up to 400, there on the device).
+PROCESS_BYTES = 200 << 20
+TRIANGLE_BYTES = 360
+SCENE_BYTES = 80  # of a triangle, in every process that knows the scene
+RAY_BYTES = 48  # of a turn, and of the pattern made of it
+PARTICLE_BYTES = 140  # of a swarm, for each corner of its path
+PART_BYTES = 2500  # its head, and its row in the database
+SCAN_BYTES = 64  # in the driver
+SUMMARY_BYTES = 28  # of a scan, in the database
+
+# Rays that are cast at most, whole scans of them, and the least and most scans.
+SAMPLE_RAYS, SAMPLE_SCANS = 500_000, (16, 500)
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What some scans of a survey, cast here, say of all.
+
+    Parameters
+    ----------
+    rays
+        Rays that were cast.
+    hits, points
+        Of the whole survey, estimated; counted if all of its rays were cast.
+    """
+
+    rays: int
+    hits: int
+    points: int
 
 
 @dataclass
@@ -46,13 +81,11 @@ class Forecast:
         Slots of each partition: those needed, and those there.
     sample
         Estimate of hits and points; None where no ray could be cast.
-    needs
-        Memory and disk.
     memory, memory_needed
         Bytes that there are and that are needed: of this machine and by all processes, or, on
         another cluster, those of a GPU worker. 0 where there is no limit.
-    disk_free
-        Bytes that the disk of `out` has free.
+    parts, result, free
+        Bytes on the disk of `out`: of the run, about, of its result, and those that are free.
     reasons
         Why it cannot run, each with what to do.
     notes
@@ -64,16 +97,17 @@ class Forecast:
     backend: str = ""
     slots: dict[str, tuple[int, int]] = field(default_factory=dict)
     sample: Sample | None = None
-    needs: Needs | None = None
     memory: int = 0
     memory_needed: int = 0
-    disk_free: int = 0
+    parts: int = 0
+    result: int = 0
+    free: int = 0
     reasons: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
     def as_data(self) -> dict[str, Any]:
         """Return it as plain data for JSON; sizes in bytes."""
-        scene, survey, planning = self.job.scene, self.job.survey, self.job.planning
+        scene, survey = self.job.scene, self.job.survey
         return {
             "can_run": not self.reasons,
             "reasons": self.reasons,
@@ -85,34 +119,20 @@ class Forecast:
             "scans": survey.scan_count,
             "rays": survey.ray_count,
             "estimate": asdict(self.sample) if self.sample else None,
-            "trials": planning.trials if planning else 0,
+            "trials": self.job.trials,
             "backend": self.backend or None,
-            "slots": {
-                name: {"needed": needed, "there": there}
-                for name, (needed, there) in self.slots.items()
-            },
-            "memory": {
-                "gpu_worker": self.needs.gpu_worker if self.needs else None,
-                "driver": self.needs.driver if self.needs else None,
-                "needed": self.memory_needed,
-                "there": self.memory or None,
-            },
+            "slots": {n: {"needed": needed, "there": t} for n, (needed, t) in self.slots.items()},
+            "memory": {"needed": self.memory_needed, "there": self.memory or None},
             "disk": {
-                "parts": self.needs.parts if self.needs else None,
-                "result": self.needs.cloud + self.needs.pictures if self.needs else None,
-                "free": self.disk_free,
+                "parts": self.parts,
+                "result": self.result,
+                "free": self.free,
                 "folder": str(self.out),
             },
         }
 
 
-def forecast(
-    job: Job,
-    pool: PoolSection,
-    out: Path,
-    client: Client | None = None,
-    unitless: Sequence[str] = (),
-) -> Forecast:
+def forecast(job: Job, pool: PoolSection, out: Path, client: Client | None = None) -> Forecast:
     """Find out what a run would do and take, and whether it can.
 
     Parameters
@@ -123,75 +143,60 @@ def forecast(
         Sizes of a cluster on this machine, which is not started.
     client
         Client of the cluster to run on instead.
-    unitless
-        Names of mesh files whose unit is neither stated nor given.
     """
     made = Forecast(job, out)
-    with _taken_for_reason(made):
+    try:
         if client is None:
             _look_here(made, pool)
         else:
             _look_there(made, client)
+    except (LidarpoolError, PoolError) as error:
+        made.reasons.append(str(error))
     _look_at_folder(made)
     # Casting here takes what it takes on a worker: it would be refused, or killed.
-    if needs_of(job, 0).gpu_worker <= MEMORY_LIMIT:
+    if _worker_bytes(job) <= MEMORY_LIMIT:
         made.sample = sample_survey(job.scene, job.survey)
-    made.notes += advice(job.scene, job.survey, unitless, made.sample)
-    # Without a sample every ray may hit.
-    points = made.sample.points if made.sample else job.survey.ray_count // job.survey.keep_every
-    made.needs = needs_of(job, points)
-    made.memory_needed = (
-        made.needs.on_one_machine(made.slots[GPU][1], made.slots.get(OTHER, (0, 0))[1])
-        if client is None
-        else made.needs.gpu_worker
-    )
-    _compare(made, made.needs)
+        if not made.sample.hits:
+            made.notes.append("no ray cast here hit anything: look at poses, ranges and units")
+    _reckon(made, alone=client is None)
     return made
 
 
-@contextmanager
-def _taken_for_reason(made: Forecast) -> Iterator[None]:
-    """Record errors as reasons why it cannot run."""
-    try:
-        yield
-    except (LidarpoolError, PoolError) as error:
-        made.reasons.append(str(error))
-
-
-def _slots_needed(job: Job) -> dict[str, int]:
-    needed = {GPU: 1, LIDAR: 2 + job.collectors}
-    return needed | ({OTHER: 1} if job.planning else {})
+def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> Sample:
+    """Estimate hits and points of a survey by casting some of its scans, all if they are few."""
+    rig = Rig(RigPlan(scene, survey, backend))
+    count = np.clip(SAMPLE_RAYS * survey.scan_count // survey.ray_count, *SAMPLE_SCANS)
+    rays = hits = points = 0
+    for scan in one_of_each_part(survey.scan_count, int(count)).tolist():
+        rays += survey.scan(scan).ray_count(survey.sensor)
+        for found in rig.cast(scan, scan + 1):
+            hits += int(found.found.hits.sum())
+            points += len(found)
+    share = survey.ray_count / rays
+    return Sample(rays, round(hits * share), round(points * share))
 
 
 def _look_here(made: Forecast, pool: PoolSection) -> None:
     """Find out what a cluster of this machine would have."""
-    needed = _slots_needed(made.job)
+    needed = slots_needed(made.job.collectors, made.job.planning is not None)
     workers = default_workers(usable_cores(), len(visible_gpus()))
-    there = {
-        GPU: pool.gpu or workers[GPU],
-        LIDAR: needed[LIDAR],  # one worker with as many threads
-        OTHER: pool.other or workers[OTHER],
-    }
+    there = {GPU: pool.gpu or workers[GPU], OTHER: pool.other or workers[OTHER]}
+    there[LIDAR] = needed[LIDAR]  # one worker with as many threads
     made.slots = {name: (needed[name], there[name]) for name in needed}
     made.memory = MEMORY_LIMIT
-    check_backend_here(made.job.backend)
-    made.backend = _settled(made.job.backend)
-
-
-def _settled(wanted: str) -> str:
-    """Backend that is taken here."""
+    wanted = made.job.backend
+    check_backend_here(wanted)
     usable = (name for name, reason in available_backends().items() if not reason)
-    return next(usable) if wanted == "auto" else wanted
+    made.backend = next(usable) if wanted == "auto" else wanted
 
 
 def _look_there(made: Forecast, client: Client) -> None:
     """Find out what a cluster has that is running already."""
-    needed = _slots_needed(made.job)
+    job, planning = made.job, made.job.planning is not None
     everybody = Pool.from_client(client)
-    there = {name: sum(w.resources.get(name, 0) for w in everybody) for name in needed}
-    made.slots = {name: (needed[name], int(there[name])) for name in needed}
-    planning = made.job.planning is not None
-    _, casting, made.backend = find_workers(client, made.job.collectors, planning, made.job.backend)
+    for name, needed in slots_needed(job.collectors, planning).items():
+        made.slots[name] = needed, int(sum(w.resources.get(name, 0) for w in everybody))
+    _, casting, made.backend = find_workers(client, job.collectors, planning, job.backend)
     made.memory = min((worker.memory for worker in casting if worker.memory), default=0)
     if not any(worker.gpus for worker in casting):
         made.notes.append(f"no GPU in partition GPU: CPU workers cast the rays with {made.backend}")
@@ -200,7 +205,7 @@ def _look_there(made: Forecast, client: Client) -> None:
 def _look_at_folder(made: Forecast) -> None:
     """See whether the result can go there; nothing is made or changed."""
     there = next(path for path in (made.out, *made.out.absolute().parents) if path.exists())
-    made.disk_free = shutil.disk_usage(there).free
+    made.free = shutil.disk_usage(there).free
     if not there.is_dir():
         made.reasons.append(f"{there} is a file: give a folder for the results with --out.")
     elif not os.access(there, os.W_OK | os.X_OK):
@@ -216,32 +221,45 @@ def _look_at_folder(made: Forecast) -> None:
         )
 
 
-def _compare(made: Forecast, needs: Needs) -> None:
-    """Compare what it takes with what there is."""
-    if made.disk_free < needs.disk:
+def _worker_bytes(job: Job) -> int:
+    """Memory of a GPU worker."""
+    rays = min((job.survey.sensor.period or 0) * job.survey.sensor.channels, PATTERN_RAYS)
+    triangles = (SCENE_BYTES + TRIANGLE_BYTES) * len(job.scene.faces)
+    return PROCESS_BYTES + triangles + RAY_BYTES * rays
+
+
+def _reckon(made: Forecast, alone: bool) -> None:
+    """Compare what a run takes of memory and disk, about, with what there is.
+
+    `alone` says that workers and driver share this machine.
+    """
+    job, survey, faces = made.job, made.job.survey, len(made.job.scene.faces)
+    # Without a sample every ray may hit.
+    points = made.sample.points if made.sample else survey.ray_count // survey.keep_every
+    point = sum(np.dtype(column.dtype).itemsize for column in survey.stored_columns)
+    parts = min(survey.scan_count, max(16, survey.ray_count // BATCH_RAYS + 1))
+    tally = 12 * min(faces, BATCH_RAYS // 10)  # names each triangle that the rays of a part hit
+    made.parts = point * points + (PART_BYTES + tally) * parts + SUMMARY_BYTES * survey.scan_count
+    # A row of the PLY has doubles for the coordinates at most; a piece of it is there twice.
+    made.result = (point + 16) * (points + min(points, CHUNK_POINTS)) + ROOM_BYTES + 36 * faces
+    made.memory_needed = _worker_bytes(job)
+    if alone:
+        swarm = job.planning.particles * job.planning.waypoints if job.planning else 0
+        other = PROCESS_BYTES + PARTICLE_BYTES * swarm
+        piece = 6 * (point + 24) * min(points, CHUNK_POINTS)  # merged, written and read back
+        driver = 2 * SCENE_BYTES * faces + SCAN_BYTES * survey.scan_count + piece
+        made.memory_needed *= made.slots[GPU][1]
+        made.memory_needed += other * made.slots.get(OTHER, (0, 0))[1] + driver
+        made.memory_needed += 2 * PROCESS_BYTES  # of LIDAR and the driver
+    if made.free < made.parts + made.result:
         made.reasons.append(
-            f"The disk of {made.out} has {in_bytes(made.disk_free)} free and the run needs about "
-            f"{in_bytes(needs.disk)}: make room, name another folder with --out, or take a "
-            "larger keep_every."
+            f"The disk of {made.out} has {format_bytes(made.free)} free and the run needs about "
+            f"{format_bytes(made.parts + made.result)}: make room, name another folder with "
+            "--out, or take a larger keep_every."
         )
     if made.memory and made.memory < made.memory_needed:
         made.reasons.append(
-            f"There are {in_bytes(made.memory)} of memory and the run needs about "
-            f"{in_bytes(made.memory_needed)}: take a smaller scene, fewer workers (pool.gpu), "
+            f"There are {format_bytes(made.memory)} of memory and the run needs about "
+            f"{format_bytes(made.memory_needed)}: take a smaller scene, fewer workers (pool.gpu), "
             "rays_per_revolution or planning.particles, or a machine with more."
         )
-
-
-def in_bytes(count: int) -> str:
-    """Size with three digits: 950 bytes, 2.35 MB, 104 GB.
-
-    Examples
-    --------
-    >>> in_bytes(950), in_bytes(2_345_678), in_bytes(103_900_000_000)
-    ('950 bytes', '2.35 MB', '104 GB')
-    """
-    for factor, unit in ((1e12, "TB"), (1e9, "GB"), (1e6, "MB"), (1e3, "kB")):
-        if count >= factor * 0.9995:
-            digits = 2 if count < 9.995 * factor else 1 if count < 99.95 * factor else 0
-            return f"{count / factor:,.{digits}f} {unit}"
-    return f"{count} bytes"

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import logging
-import os
+import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from logging.handlers import MemoryHandler
 from pathlib import Path
+from typing import Any
+
+from distributed.diagnostics.plugin import WorkerPlugin
 
 LOG = "lidarpool.log"
 
@@ -15,109 +18,101 @@ _FORMAT = "%(asctime)s %(levelname)-7s %(process)d %(name)s: %(message)s"
 _HELD = 200  # messages held back; a run that has more of them has the file before its end
 
 
-class LogFile(logging.Handler):
-    """Appends messages to a file that is made with the first of them; for several processes.
+def silence_logs() -> None:
+    """Drop all log messages of this process: what its user has to know, the command says."""
+    logging.disable(logging.CRITICAL)
+    # Nor one of a log on a full disk: the run tells of it where its own files cannot be written.
+    logging.raiseExceptions = False
+    # An interrupt may come between the making of one of Dask's coroutines and its first step.
+    warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)
 
-    It is no StreamHandler, whose levels Dask changes as it starts a cluster.
+
+class QuietWorkers(WorkerPlugin):
+    """Silences workers that share a terminal with the command, or has them log to a file.
+
+    A task that fails is told of once, by the driver; Dask's worker would log it as well, with
+    a traceback.
 
     Parameters
     ----------
-    path
-        The file.
-
-    Attributes
-    ----------
-    written
-        Whether anything was written, by this process.
+    log
+        A file for what they log; None for none.
     """
 
+    name = "lidarpool-quiet"
+
+    def __init__(self, log: Path | None = None) -> None:
+        self.log = log
+
+    def setup(self, worker: Any) -> None:
+        """Silence a worker, also one that is started again."""
+        silence_logs()
+        if self.log is not None:
+            _handle_all(LogFile(self.log), logging.INFO)
+
+
+class LogFile(logging.FileHandler):
+    """Appends to a file that is made with the first message; `written` is whether one came."""
+
     def __init__(self, path: Path) -> None:
-        super().__init__()
-        self.path, self.written = path, False
+        super().__init__(path, delay=True, encoding="utf-8", errors="backslashreplace")
         self.setFormatter(logging.Formatter(_FORMAT))
+        self.written = False
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Append one message, whole: several workers write to the file."""
-        text = f"{self.format(record)}\n".encode(errors="backslashreplace")
-        try:
-            handle = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
-            try:
-                os.write(handle, text)
-                self.written = True
-            finally:
-                os.close(handle)
-        except OSError:
-            # On a full disk, say. The run has more important things to write there, and tells
-            # of it where those fail; a message about a message would only break the display.
-            return
+        """Append one message, unless the disk is full: the run has more to say of that."""
+        with suppress(OSError):
+            super().emit(record)
+            self.written = True
 
 
 @contextmanager
 def logged_to(path: Path, verbose: bool = False) -> Iterator[LogFile]:
     """Keep messages of all loggers, and Python's warnings, in a file while the body runs.
 
-    Warnings and errors are held back and written in the end, so that a run that is interrupted
-    leaves the folder as it was; there is no file where there was nothing to say. With `verbose`
-    there is more, at once, with the traceback of an error.
+    There is no file where there was nothing to say. Without `verbose` only warnings and errors
+    are kept, and written in the end, so that an interrupt leaves the folder as it was.
 
     Parameters
     ----------
     path
         The file; it is appended to.
     verbose
-        Also keep what is merely of interest.
+        Also keep what is merely of interest, and the traceback of an error.
     """
     file = LogFile(path)
-    handler: logging.Handler = file
-    if not verbose:
-        handler = MemoryHandler(_HELD, flushLevel=logging.CRITICAL + 1, target=file)
-    handler.setLevel(logging.INFO if verbose else logging.WARNING)
-    interrupted = False
+    held = MemoryHandler(1 if verbose else _HELD, logging.CRITICAL + 1, file)
+    loggers = [*_with_handlers(), logging.root]
+    before = [(logger, logger.handlers, logger.propagate) for logger in loggers]
+    level, disabled = logging.root.level, logging.root.manager.disable
+    _handle_all(held, logging.INFO if verbose else logging.WARNING)
     try:
-        with _handling_all(handler, logging.INFO if verbose else logging.WARNING):
-            try:
-                yield file
-            except Exception:
-                logging.getLogger(__name__).info("the run has ended with an error", exc_info=True)
-                raise
+        yield file
     except KeyboardInterrupt:
-        interrupted = True
+        held.buffer.clear()
+        raise
+    except Exception:
+        logging.getLogger(__name__).info("the run has ended with an error", exc_info=True)
         raise
     finally:
-        if isinstance(handler, MemoryHandler) and interrupted:
-            handler.buffer.clear()
-        handler.close()  # which writes what was held back
-
-
-def log_to(path: Path) -> None:
-    """Keep messages of all loggers in a file, from now on; for the workers of a cluster."""
-    handler = LogFile(path)
-    handler.setLevel(logging.INFO)
-    for logger in _with_handlers():
-        logger.handlers[:] = [] if logger.propagate else [handler]
-    logging.root.handlers[:] = [handler]
-    logging.captureWarnings(True)
-
-
-@contextmanager
-def _handling_all(handler: logging.Handler, level: int) -> Iterator[None]:
-    """Let one handler have all messages, whatever other handlers and levels there are."""
-    root, disabled = logging.root, logging.root.manager.disable
-    before = {logger: list(logger.handlers) for logger in (*_with_handlers(), root)}
-    root_level = root.level
-    try:
-        for logger in before:
-            logger.handlers[:] = [] if logger.propagate and logger is not root else [handler]
-        root.setLevel(level)
-        logging.captureWarnings(True)
-        logging.disable(logging.NOTSET)
-        yield
-    finally:
+        for logger, handlers, propagate in before:
+            logger.handlers, logger.propagate = handlers, propagate
+        logging.root.setLevel(level)
         logging.disable(disabled)
         logging.captureWarnings(False)
-        root.setLevel(root_level)
-        for logger, handlers in before.items():
-            logger.handlers[:] = handlers
+        held.close()  # which writes what was held back
+        file.close()
+
+
+def _handle_all(handler: logging.Handler, level: int) -> None:
+    """Let one handler have all messages; Dask changes levels of loggers' own handlers."""
+    for logger in _with_handlers():
+        logger.handlers, logger.propagate = [], True
+    logging.root.handlers = [handler]
+    logging.root.setLevel(level)
+    handler.setLevel(level)
+    logging.captureWarnings(True)
+    logging.disable(logging.NOTSET)
 
 
 def _with_handlers() -> list[logging.Logger]:

@@ -17,18 +17,15 @@ from poolpart.wording import counted
 
 from ..live import shown_on_page
 from ..report.summary import summary
-from ..run.checks import check_backend_here, check_backend_name
-from ..run.connection import connected, local_client
+from ..run.checks import check_backend_here
+from ..run.connection import TlsFiles, connected, local_client
 from ..run.job import Job, make_job
 from ..run.result import Result
 from ..run.run import Run, make_result
 from ..run.store import COMMAND_TERMS, RunStore, remove_run
-from ..run.tls import NO_FILES, TlsFiles
 from ..scan import PATIENCE_S, WAIT_S
-from ..scenario.advice import advice
 from ..scenario.scenario import Scenario
-from .log_file import LOG, logged_to
-from .quiet import QuietWorkers
+from .log_file import LOG, QuietWorkers, logged_to
 from .terminal import shown_progress, shown_status
 
 if TYPE_CHECKING:
@@ -48,7 +45,7 @@ class RunOptions:
 
     out: Path
     scheduler: str | None = None
-    files: TlsFiles = NO_FILES
+    files: TlsFiles | None = None
     tls: bool = False
     backend: str | None = None
     no_plan: bool = False
@@ -80,7 +77,8 @@ def run_scenario(scenario: Scenario, options: RunOptions) -> None:
     from ..report.page import make_recipe
 
     recipe = make_recipe(scenario, click.get_current_context(silent=True))
-    _check_backend(options.backend or scenario.pool.backend, options)
+    if options.scheduler is None:  # before the scene is read, which may take long
+        check_backend_here(options.backend or scenario.pool.backend)
     job = make_job(
         scenario,
         options.backend,
@@ -89,7 +87,7 @@ def run_scenario(scenario: Scenario, options: RunOptions) -> None:
         patience_s=options.patience_s,
     )
     if not options.quiet:
-        for note in advice(job.scene, job.survey, scenario.unitless_files):
+        for note in scenario.advice(job.scene):
             click.echo(f"note: {note}", err=True)
     with _told_when_whole(options.out) as whole, _shown_live(job, options) as live:
 
@@ -113,7 +111,7 @@ def run_scenario(scenario: Scenario, options: RunOptions) -> None:
                         only_cloud=options.only == "cloud",
                     )
         if options.as_json:
-            figures = summary(options.out, report, log.path if log.written else None)
+            figures = summary(options.out, report, _log(options) if log.written else None)
             click.echo(json.dumps(figures, indent=1, allow_nan=False))
         else:
             _tell(options.out, result, job, report["files"])
@@ -157,14 +155,6 @@ def _log(options: RunOptions) -> Path:
     return options.out.absolute() / LOG
 
 
-def _check_backend(backend: str, options: RunOptions, *advice: str) -> None:
-    """Refuse a backend that is not to be had, as far as that can be seen from here."""
-    if options.scheduler is None:
-        check_backend_here(backend, *advice)
-    else:
-        check_backend_name(backend)
-
-
 def _store(job: Job, options: RunOptions) -> RunStore:
     """Where the run is kept, with what an earlier one has left if that is to be resumed."""
     if not options.resumable:
@@ -193,9 +183,8 @@ def _conduct(
 def _drive(
     scenario: Scenario, store: RunStore, options: RunOptions, live: LiveRun | None
 ) -> Result:
-    if store.backend:
-        _check_backend(store.backend, options, store.advice)
     if options.scheduler is None:
+        check_backend_here(store.backend or store.job.backend, store.advice)
         cluster = _local_client(scenario, options, store.job.planning is not None)
     else:
         cluster = connected(options.scheduler, options.files)

@@ -11,7 +11,6 @@ import click
 from poolpart.wording import counted
 
 from ..scene.scene import Scene
-from .command_group import CommandGroup
 
 _out = click.argument("out", type=click.Path(path_type=Path), metavar="OUT.ply|.glb|.obj")
 
@@ -27,7 +26,7 @@ _seed = click.option(
 )
 
 
-@click.group(name="scene", cls=CommandGroup)
+@click.group(name="scene")
 def scene() -> None:
     """Make scenes to survey, as mesh files."""
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import NamedTuple
 
 from distributed import Client, Security
 from distributed.comm import connect
@@ -12,38 +14,16 @@ from distributed.comm import connect
 from ..base.errors import LidarpoolError
 from ..base.interrupts import children_spared, deferred_interrupts
 from .local import local_cluster
-from .tls import NO_FILES, TlsFiles, security_for
 
 CONNECT_TIMEOUT_S = 10
 
-# What Dask, tornado and OpenSSL say of a connection that did not come about, and what it means.
-_SIGNS = (
-    (
-        "tls://",
-        ["CERTIFICATE_VERIFY_FAILED"],
-        "shows a certificate that is not signed by the authority given here: give the cluster's "
-        "own as --tls-ca.",
-    ),
-    (
-        "tls://",
-        # The second: it has sent its greeting already when the encryption is to begin.
-        ["WRONG_VERSION_NUMBER", "IOStream is not idle"],
-        "does not encrypt: give its address as tcp://host:8786, without certificates.",
-    ),
-    (
-        "tls://",
-        # It says so, or it has hung up before that was heard.
-        ["_ALERT_", "SSLEOFError", "ConnectionResetError", "StreamClosedError"],
-        "refuses the certificate given here: give one that the cluster's authority has signed, "
-        "as --tls-cert and --tls-key.",
-    ),
-    (
-        "tcp://",
-        ["ConnectionResetError"],
-        "hangs up, as an encrypted one does, and others that are no Dask scheduler: give its "
-        "address as tls://host:8786, and its certificates.",
-    ),
-)
+
+class TlsFiles(NamedTuple):
+    """PEM files for an encrypted cluster: its authority's certificates, ours, and our key."""
+
+    ca: Path | None = None
+    cert: Path | None = None
+    key: Path | None = None
 
 
 @contextmanager
@@ -94,7 +74,7 @@ def local_client(
 
 
 @contextmanager
-def connected(scheduler: str, files: TlsFiles = NO_FILES) -> Iterator[Client]:
+def connected(scheduler: str, files: TlsFiles | None = None) -> Iterator[Client]:
     """Client of a cluster that is running already.
 
     Parameters
@@ -109,17 +89,32 @@ def connected(scheduler: str, files: TlsFiles = NO_FILES) -> Iterator[Client]:
     LidarpoolError
         If no scheduler answers at this address, or the certificates do not do.
     """
-    security = security_for(scheduler, files)
     try:
+        security = _security(files) if files and any(files) else Security()
         asyncio.run(asyncio.wait_for(_knock(scheduler, security), CONNECT_TIMEOUT_S))
         client = Client(
             scheduler, security=security, timeout=CONNECT_TIMEOUT_S, set_as_default=False
         )
     except Exception as error:
         # What is there may be no scheduler, and what it answers may make any error.
-        raise LidarpoolError(_no_answer(scheduler, error)) from error
+        cause: BaseException = error
+        while cause.__cause__ or cause.__context__:
+            cause = cause.__cause__ or cause.__context__  # type: ignore[assignment]
+        reason = " ".join(f"{type(cause).__name__}: {cause}".split())[:200].rstrip(": ")
+        raise LidarpoolError(
+            f"No Dask scheduler answers at {scheduler!r} ({reason}): start one with dask "
+            "scheduler, and give its address as tcp://host:8786; of an encrypted one as "
+            "tls://host:8786, with --tls-ca, --tls-cert and --tls-key."
+        ) from error
     with client:
         yield client
+
+
+def _security(files: TlsFiles) -> Security:
+    ca, cert, key = (None if path is None else str(path) for path in files)
+    return Security(
+        require_encryption=True, tls_ca_file=ca, tls_client_cert=cert, tls_client_key=key
+    )
 
 
 async def _knock(address: str, security: Security) -> None:
@@ -128,22 +123,3 @@ async def _knock(address: str, security: Security) -> None:
         address, timeout=CONNECT_TIMEOUT_S, **security.get_connection_args("client")
     )
     comm.abort()
-
-
-def _no_answer(scheduler: str, error: BaseException) -> str:
-    """Say what is known of a connection that did not come about."""
-    said = " ".join(f"{type(link).__name__} {link}" for link in _chain(error))
-    for protocol, signs, meaning in _SIGNS:
-        if scheduler.startswith(protocol) and any(sign in said for sign in signs):
-            return f"The scheduler at {scheduler!r} {meaning}"
-    return (
-        f"No Dask scheduler answers at {scheduler!r} ({type(error).__name__}): start one with "
-        "dask scheduler, and give its address as tcp://host:8786."
-    )
-
-
-def _chain(error: BaseException | None) -> Iterator[BaseException]:
-    """Yield an error and what caused it."""
-    while error is not None:
-        yield error
-        error = error.__cause__ or error.__context__

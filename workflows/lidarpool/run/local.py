@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from typing import Any
 
-from distributed import Security, SpecCluster
+from distributed import SpecCluster
 
 import poolpart
-from poolpart.local import LOOPBACK, check_count, usable_cores
+from poolpart.local import check_count, usable_cores
 from poolpart.probe import visible_gpus
 
 from ..scan import GPU, LIDAR, OTHER
@@ -34,10 +34,7 @@ def local_cluster(
     gpu_workers: int | None = None,
     lidar_slots: int = 4,
     other_workers: int | None = None,
-    host: str = LOOPBACK,
-    dashboard_port: int | None = 0,
-    environment: Mapping[str, str] | None = None,
-    security: Security | bool = False,
+    **options: Any,
 ) -> SpecCluster:
     """Start a Dask cluster on this machine, divided into GPU, LIDAR and OTHER.
 
@@ -50,8 +47,8 @@ def local_cluster(
         Threads, and slots, of the one LIDAR worker.
     other_workers
         Workers of the OTHER partition, one thread each; by default what is left. 0 for none.
-    host, dashboard_port, environment, security
-        As `poolpart.local_cluster` has them.
+    **options
+        What `poolpart.local_cluster` takes besides.
 
     Raises
     ------
@@ -62,12 +59,6 @@ def local_cluster(
     gpu_workers = defaults[GPU] if gpu_workers is None else gpu_workers
     other_workers = defaults[OTHER] if other_workers is None else other_workers
     check_count("gpu_workers", gpu_workers)
-    check_count("lidar_slots", lidar_slots)
-    check_count("other_workers", other_workers, least=0)
     return poolpart.local_cluster(
-        {GPU: (gpu_workers, 1), LIDAR: (1, lidar_slots), OTHER: (other_workers, 1)},
-        host=host,
-        dashboard_port=dashboard_port,
-        environment=environment,
-        security=security,
+        {GPU: (gpu_workers, 1), LIDAR: (1, lidar_slots), OTHER: (other_workers, 1)}, **options
     )

@@ -31,12 +31,15 @@ from .sections import (
     Section,
     SensorSection,
 )
-from .validation_errors import validation_errors
+from .validation_errors import validation_error
 from .yamlfile import read_yaml
 
 SCAN_LIMIT = 10_000_000
 # Of the objects, those lower than this are floors and markings, which a path may cross.
 FLAT_M = 0.2
+
+# Halls and parts are smaller than the one and larger than the other in metres.
+LARGE_M, SMALL_M = 500.0, 0.2
 
 SEED_START = (25.0, 25.0)
 SEED_TARGET = (-30.0, -20.0)
@@ -162,20 +165,26 @@ class Scenario(Section):
         try:
             scenario = cls.model_validate(data)
         except ValidationError as error:
-            raise LidarpoolError(validation_errors(error, cls, source)) from error
+            raise LidarpoolError(validation_error(error, _field_names(), source)) from error
         scenario._folder, scenario._source = Path(folder), source
         with scenario._named():
             scenario.sensor.sensor()
         return scenario
 
-    @property
-    def unitless_files(self) -> tuple[str, ...]:
-        """Mesh files of which neither their format nor the scenario says the unit."""
-        return tuple(
+    def advice(self, scene: Scene) -> list[str]:
+        """Return notes on what looks like a mistake: a size that speaks of another unit."""
+        unitless = [
             entry.file
             for entry in self.scene.files
             if entry.unit is None and Path(entry.file).suffix.lower() in UNITLESS
-        )
+        ]
+        side = float(np.ptp(scene.bounds, axis=0).max())
+        if not unitless or SMALL_M <= side <= LARGE_M:
+            return []
+        return [
+            f"{unitless[0]} states no unit, and in metres the scene is {side:,.5g} m long: if that "
+            f"is wrong, give the file's unit ({'mm' if side > LARGE_M else 'km'}?) in scene.files"
+        ]
 
     def build_scene(self) -> Scene:
         """Read the mesh files and put the scene together.
@@ -306,6 +315,11 @@ class Scenario(Section):
             yield
         except LidarpoolError as error:
             raise LidarpoolError(f"{self._source}: {error}") from error
+
+
+def _field_names() -> set[str]:
+    """Names of the fields of all sections."""
+    return {name for section in Section.__subclasses__() for name in section.model_fields}
 
 
 def _ground(section: Ground, scene: Scene) -> Mesh:

@@ -13,6 +13,7 @@ from ..sensor import Sensor
 # Their directions take 2.4 GB; real lidars have five million.
 RAY_LIMIT = 100_000_000
 
+BACKENDS = ("auto", "cuda", "embree", "numpy")
 COLUMN_NAMES = tuple(column.in_files for column in OPTIONAL)
 
 # Nothing on Earth is farther from the origin of its map.
@@ -327,6 +328,6 @@ class PoolSection(Section):
         int, Field(ge=1, le=100_000, description="items that stage 1 may be ahead of stage 2")
     ] = 10
     backend: Annotated[
-        Literal["auto", "cuda", "embree", "numpy"],
+        Literal[BACKENDS],  # type: ignore[valid-type]
         Field(description="cuda, embree or numpy; auto takes the fastest that is there"),
     ] = "auto"

@@ -1,4 +1,4 @@
-"""What is below and above a place: the floor, on which a sensor stands, and ceilings."""
+"""What is below a place: the floor, on which a sensor stands."""
 
 from __future__ import annotations
 
@@ -30,13 +30,6 @@ def floor_under(scene: Scene, x: float, y: float) -> float:
     if up.any() and heights[up].min() <= heights.min() + SLAB_M:
         return float(heights[up].min() + scene.origin[2])
     return float(scene.bounds[0, 2] + scene.origin[2])
-
-
-def between(scene: Scene, x: float, y: float, low: float, high: float) -> bool:
-    """Whether something is between two heights at a place, such as a ceiling; world metres."""
-    heights, _ = _crossings(scene, np.array([x, y]) - scene.origin[:2])
-    heights = heights + scene.origin[2]
-    return bool(((low < heights) & (heights < high)).any())
 
 
 def _crossings(

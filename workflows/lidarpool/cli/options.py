@@ -1,0 +1,54 @@
+"""Options that several commands have."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import wraps
+from pathlib import Path
+from typing import Any
+
+import click
+
+from ..run.connection import TlsFiles
+from ..scenario.sections import BACKENDS
+
+Command = Callable[..., None]
+
+out = click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    default=Path("lidarpool-out"),
+    show_default=True,
+    help="Folder for the results; made if it is not there.",
+)
+backend = click.option(
+    "--backend",
+    type=click.Choice(BACKENDS),
+    help="Ray caster of stage 2; by default the scenario's, else the fastest there is.",
+)
+no_plan = click.option("--no-plan", is_flag=True, help="Leave the path planning out.")
+
+
+def scheduler(command: Command) -> Command:
+    """Add --scheduler and its certificates, which the command gets as `scheduler` and `files`."""
+
+    @wraps(command)
+    def with_files(*arguments: Any, **given: Any) -> None:
+        files = TlsFiles(*(given.pop(f"tls_{part}") for part in ("ca", "cert", "key")))
+        if any(files) and given["scheduler"] is None:
+            raise click.UsageError(
+                "--tls-ca, --tls-cert and --tls-key are for the cluster of --scheduler: give its "
+                "address, tls://host:8786."
+            )
+        command(*arguments, files=files, **given)
+
+    file = click.Path(exists=True, dir_okay=False, path_type=Path)
+    for name, what in (
+        ("key", "Private key of that certificate, if its file does not hold it."),
+        ("cert", "Certificate to show to an encrypted cluster, a PEM file."),
+        ("ca", "Certificates of the authority of an encrypted cluster, a PEM file."),
+    ):
+        click.option(f"--tls-{name}", type=file, help=what)(with_files)
+    return click.option(
+        "--scheduler", metavar="ADDRESS", help="Use this Dask cluster, tcp://host:8786."
+    )(with_files)
