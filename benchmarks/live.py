@@ -65,9 +65,9 @@ def watched(client: Client, work: Job) -> tuple[float, int]:
         live.follow(store)
         run = Run(client, store)
         show = live.with_progress(lambda progress: None, run.partitions)
-        seconds = run.drive(live.on_frame, show).survey_seconds
-        live.finish()
-    return seconds, sum(taken)
+        result = run.drive(live.on_frame, show)
+        live.finish(result)
+    return result.survey_seconds, sum(taken)
 
 
 @contextmanager
@@ -75,7 +75,7 @@ def _looking(live: Any) -> Iterator[list[int]]:
     """Take what the page sends, as a browser would; gives the sizes of the messages."""
     taken: list[int] = []
     version = Subprotocol(f"viser-v{viser.__version__}")
-    address = live.url.replace("http", "ws")
+    address = live.page.url.replace("http", "ws")
     with connect(address, subprotocols=[version], max_size=None, compression=None) as socket:
         socket.send(msgspec.msgpack.encode(CAMERA))  # or nobody looks yet
 

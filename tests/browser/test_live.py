@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 
-from lidarpool import Planning, Scene, Survey
+from lidarpool import Scene, Survey
 from lidarpool.live import live_run
 from lidarpool.run.connection import local_client
 from lidarpool.run.job import Job
@@ -31,7 +31,7 @@ def client():
 def live():
     """Return a page, and the store that it follows, of a survey that takes its time."""
     survey = Survey(poses=[(0, 0, 1 + step / 20) for step in range(SCANS // 36)])
-    job = Job(Scene.seed(), survey, scans_per_second=60)
+    job = Job(Scene.seed(), survey)
     store = RunStore(job)
     with live_run(job, port=0, browser=False) as live:
         live.follow(store)
@@ -56,8 +56,7 @@ class Driven:
 
         def drive():
             try:
-                run.drive(live.on_frame, show)
-                live.finish()
+                live.finish(run.drive(live.on_frame, show))
             except BaseException as error:
                 self.error = error
 
@@ -67,7 +66,7 @@ class Driven:
 
 def opened(new_tab, live):
     """Open the page of a run that has not begun."""
-    tab = new_tab(live._page.url)
+    tab = new_tab(live.page.url)
     tab.wait_for(lambda text: "starting" in text)
     return tab
 
@@ -99,8 +98,7 @@ def test_points_grow_stand_still_and_grow_again(client, live, new_tab, tmp_path)
         tab.wait_for(lambda text: points_in(text) > still)
     finally:
         run.most = ALL
-        if live.control.paused:
-            live.control.go_on()
+        live.paused.clear()
         run.thread.join(120)
     assert run.error is None
     assert store.complete  # nothing was lost by the pause
@@ -109,7 +107,7 @@ def test_points_grow_stand_still_and_grow_again(client, live, new_tab, tmp_path)
     other.wait_for(lambda text: "done" in text and total in text)
     tab.wait_for(lambda _: len(colours(tab.picture(tmp_path / "live.png"))) > 200)
     assert tab.errors == []
-    own = (live._page.url, live._page.url.replace("http", "ws", 1), "data:", "blob:")
+    own = (live.page.url, live.page.url.replace("http", "ws", 1), "data:", "blob:")
     assert [request for request in tab.requests if not request.startswith(own)] == []
 
 
@@ -122,7 +120,7 @@ def test_stop_ends_the_run_as_an_interrupt_does(client, live, new_tab):
         tab.click("Stop")
     finally:
         run.thread.join(120)
-        live.control.stop()
+        live.stopped.set()
     assert isinstance(run.error, KeyboardInterrupt)
     assert not store.complete
 
@@ -137,25 +135,6 @@ def test_a_closed_tab_is_not_waited_for(client, live, new_tab):
     run.thread.join(120)
     assert run.error is None
     assert store.complete
-    frames = live._scene.frames
-    frames.take()
-    assert frames.dropped > frames.taken
-    assert frames.dropped + frames.taken == SCANS
-
-
-def test_the_path_is_shown_when_it_is_planned(client, new_tab):
-    planning = Planning((25, 25), (-30, -20), [(0, 0)], 2.0, trials=2, iterations=20)
-    job = Job(Scene.seed(), Survey(poses=[(0, 0, 1)]), planning)
-    store = RunStore(job)
-    with live_run(job, port=0, browser=False) as live:
-        live.follow(store)
-        tab = opened(new_tab, live)
-        run = Driven(client, live, store, ALL)
-        run.thread.join(120)
-        tab.wait_for(lambda text: "done" in text and "2 / 2" in text)
-        for name in ("/path", "/path/start", "/path/target", "/discs/0"):
-            assert live._page.scene.get_handle_by_name(name) is not None
-        assert tab.errors == []
 
 
 def colours(picture):

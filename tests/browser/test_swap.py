@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from lidarpool.live.mesh_node import MeshNode, coloured_triangles
 from lidarpool.live.page import live_page
+from lidarpool.live.surface import MeshNode
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -38,34 +38,12 @@ SAMPLE = """(() => {
 })()"""
 
 
-def ball(colour):
-    """Return a ball of 20,480 triangles as binary glTF."""
-    made = trimesh.creation.icosphere(subdivisions=5)
-    corners = made.triangles.astype(np.float32)
-    return coloured_triangles(corners, np.tile(np.uint8(colour), (len(corners), 1)))
-
-
 @pytest.fixture
 def page():
     """Return a page that looks at a ball."""
     with live_page("a ball", port=0) as page:
         page.frame_scene([[-1, -1, -1], [1, 1, 1]])
         yield page
-
-
-def swapped(tab, show):
-    """Show a red ball and a blue one in turn, each when the other is seen; return what was seen.
-
-    (n, 2): pixels of each colour in each frame, from the first on that had a ball.
-    """
-    colours = [RED, BLUE]
-    show(ball(RED))
-    wait_for_colour(tab, 0)
-    tab.value("window.seen.length = 0")
-    for number in range(1, SWAPS + 1):
-        show(ball(colours[number % 2]))
-        wait_for_colour(tab, number % 2)
-    return np.array(tab.value("window.seen"))
 
 
 def wait_for_colour(tab, which):
@@ -90,24 +68,20 @@ def opened(new_tab, page):
 def test_a_mesh_is_seen_in_every_frame_while_it_is_exchanged(page, new_tab):
     tab = opened(new_tab, page)
     node = MeshNode(page, "/ball")
-
-    def show(data):
-        node.show(data, "same")
+    corners = trimesh.creation.icosphere(subdivisions=5).triangles.astype(np.float32)
+    for number in range(SWAPS + 1):
+        which = number % 2  # red and blue in turn, each when the other is seen
+        node.show(corners, np.tile(np.uint8((RED, BLUE)[which]), (len(corners), 1)), True)
+        wait_for_colour(tab, which)
         node.settle()
-
-    seen = swapped(tab, show)
+        if not number:
+            tab.value("window.seen.length = 0")
+    seen = np.array(tab.value("window.seen"))
     assert len(seen) > SWAPS
     assert seen.sum(axis=1).min() > 5 * GONE
-    assert tab.errors == []
-
-
-def test_the_sampler_sees_a_mesh_vanish(page, new_tab):
-    tab = opened(new_tab, page)
-    node = MeshNode(page, "/ball")
-    node.show(ball(RED), "same")
-    wait_for_colour(tab, 0)
-    node.visible = False
+    node.set_visible(False)  # which the sampler sees
     deadline = time.monotonic() + 120
     while np.array(tab.value("window.seen")).sum(axis=1)[-1] > GONE:
         assert time.monotonic() < deadline, "the ball is still there"
         time.sleep(0.02)
+    assert tab.errors == []

@@ -16,7 +16,6 @@ import pytest
 from distributed import Client
 
 from lidarpool import LidarpoolError, Planning, ScanSpec, Scene, Sensor, Survey, simulate
-from lidarpool.live.run_panel import RunControl
 from lidarpool.run.database import FILE, RunDatabase
 from lidarpool.run.job import Job
 from lidarpool.run.progress import Progress
@@ -25,13 +24,13 @@ from lidarpool.run.store import RunStore
 
 LONG_S = 120.0
 SENSOR = Sensor.grid(rays_per_revolution=720, layers=8)
-POSES = [(0, 0, 1 + step / 40) for step in range(20)]
 
 
-def make_job(pace: float = 300.0) -> Job:
+def make_job(stations: int = 20) -> Job:
     """Make a survey that takes some seconds, and a planning beside it."""
     planning = Planning((25, 25), (-30, -20), [(0, 0)], 2.0, trials=30, iterations=40)
-    return Job(Scene.seed(), Survey(SENSOR, POSES), planning, "numpy", scans_per_second=pace)
+    poses = [(0, 0, 1 + step / 40) for step in range(stations)]
+    return Job(Scene.seed(), Survey(SENSOR, poses), planning, "numpy")
 
 
 class Clock:
@@ -78,18 +77,19 @@ class Driven:
 
     def __init__(self, client: Client, folder: Path, job: Job | None = None) -> None:
         self.kept = RunStore(job or make_job(), folder / "run", resume=True)
-        self.control = RunControl()
-        self.run = Run(client, self.kept, lambda: self.control.paused)
+        self.paused, self.stopped = threading.Event(), threading.Event()
+        self.run = Run(client, self.kept, self.paused.is_set)
         self.seen: list[Progress] = []
         self.still = threading.Event()
 
     def on_progress(self, progress: Progress) -> None:
         self.seen.append(progress)
         if not self.seen[0].paused and progress.points and not self.still.is_set():
-            self.control.pause()
+            self.paused.set()
         if progress.paused:
             self.still.set()
-        self.control.check()
+        if self.stopped.is_set():
+            raise KeyboardInterrupt
 
     def drive(self, then: Callable[[], object]) -> None:
         """Drive the run here; `then` is called in another thread when it stands still."""
@@ -144,7 +144,7 @@ def test_a_paused_run_stands_still_for_long_and_then_goes_on(client, tmp_path, c
         clock.ahead_s = 1000.0
         wait_for_looks(10)  # of which each takes a tenth of a second
         found["stood"] = (driven.kept.db.scans_done, driven.kept.db.frames) == before
-        driven.control.go_on()
+        driven.paused.clear()
 
     driven.drive(look_and_go_on)
     assert found == {"busy": [], "stood": True}
@@ -169,7 +169,7 @@ def test_a_paused_run_stands_still_for_long_and_then_goes_on(client, tmp_path, c
 @pytest.mark.parametrize("how", ["stop", "interrupt"])
 def test_a_paused_run_can_be_ended_and_resumed(client, tmp_path, how, left_over, all_due):
     driven = Driven(client, tmp_path)
-    stop = driven.control.stop if how == "stop" else lambda: os.kill(os.getpid(), signal.SIGINT)
+    stop = driven.stopped.set if how == "stop" else lambda: os.kill(os.getpid(), signal.SIGINT)
 
     def end() -> None:
         all_due.set()
@@ -182,7 +182,7 @@ def test_a_paused_run_can_be_ended_and_resumed(client, tmp_path, how, left_over,
     assert left_over(client) == ([], [], [])
     again = Driven(client, tmp_path)
     assert again.kept.resumed == delivered > 0
-    again.drive(again.control.go_on)
+    again.drive(again.paused.clear)
     assert again.result.resumed == delivered
     again.kept.remove()
 
@@ -195,10 +195,10 @@ def test_a_cluster_that_is_lost_during_a_pause_ends_the_run(outside, tmp_path):
     cluster.add("OTHER")
     cluster.wait()
     with Client(cluster.address, set_as_default=False) as client:
-        driven = Driven(client, tmp_path, make_job(pace=20.0))  # not to be over before the pause
+        driven = Driven(client, tmp_path, make_job(400))  # not to be over before the pause
         with pytest.raises(LidarpoolError, match="cannot be reached any more") as ended:
             driven.drive(lambda: cluster.kill("scheduler"))
     assert "continue with" in "".join(ended.value.__notes__)
-    kept = RunStore(make_job(), tmp_path / "run", resume=True)
+    kept = RunStore(make_job(400), tmp_path / "run", resume=True)
     assert kept.resumed == driven.seen[-1].collected > 0
     kept.remove()

@@ -176,7 +176,7 @@ def _conduct(
         live.follow(store)
     result = make_result(store) if store.complete else _drive(scenario, store, options, live)
     if live is not None:
-        live.finish()
+        live.finish(result)
     return result
 
 

@@ -114,8 +114,8 @@ class Cloud:
             return np.zeros((2, 3), self.positions.dtype)
         return np.stack([self.positions.min(axis=0), self.positions.max(axis=0)])
 
-    def part(self, rows: slice) -> Cloud:
-        """Return some consecutive points, as views."""
+    def part(self, rows: slice | NDArray[np.integer]) -> Cloud:
+        """Return some of the points; consecutive ones as views."""
         columns = {name: array[rows] for name, array in self.columns.items()}
         return Cloud(self.positions[rows], columns, self.own)
 

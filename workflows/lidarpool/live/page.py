@@ -1,25 +1,35 @@
-"""The page: a viser server on the loopback interface, its camera, ground and theme."""
+"""The page: a viser server for this machine alone, its camera, ground and light."""
 
 from __future__ import annotations
 
+import asyncio
 import itertools
+import logging
 import math
 import os
 import sys
+import threading
+import time
 import webbrowser
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from urllib.parse import urlsplit
 
 import numpy as np
 import rich
 import viser
 from numpy.typing import ArrayLike, NDArray
-
-from .visitors import refuse_strangers
+from viser.infra import WebsockClientConnection
 
 HOST = "127.0.0.1"
 PORT = 8080  # or the next that is free
+LAST_S = 30.0  # that the last drawing is waited for
 
+# By these names a browser reaches this machine, also through a port forwarded by SSH, which
+# may have any number. A name that somebody else's DNS server lets point here is none of them.
+OWN_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
+
+_POLICY_VIOLATION = 1008  # RFC 6455, 7.4.1
 _FOV = math.radians(45)
 _AWAY = np.array([0.55, -1.0, 0.62])  # from the scene's middle to the camera
 _AWAY /= np.linalg.norm(_AWAY)
@@ -33,7 +43,9 @@ _WIDE, _HIGH, _ASIDE = 1.15, 0.88, 0.42
 # floor of any colour nearly white.
 _AROUND, _SUN = 1.3, 2.0
 _FROM = (0.15, -0.75, 1.2)  # left of the camera's first place, so that no two sides look alike
-_GRID = (128, 134, 142)  # lines that are seen on a light page and on a dark one
+_GRID = (128, 134, 142)
+
+_LOGGER = logging.getLogger(__name__)
 
 
 class LivePage(viser.ViserServer):
@@ -50,6 +62,11 @@ class LivePage(viser.ViserServer):
     def __init__(self, title: str, port: int) -> None:
         super().__init__(host=HOST, port=port, label=title, verbose=False)
         refuse_strangers(self)
+        self.gui.configure_theme(show_logo=False, show_share_button=False)
+        self.scene.configure_environment_map(None)
+        self.scene.configure_default_lights(enabled=False, cast_shadow=False)
+        self.scene.add_light_ambient("/light/around", intensity=_AROUND)
+        self.scene.add_light_directional("/light/sun", intensity=_SUN, position=_FROM)
 
     def request_share_url(self, verbose: bool = True) -> None:
         """Do nothing: viser would open a way to this page from the whole internet."""
@@ -58,10 +75,6 @@ class LivePage(viser.ViserServer):
     def url(self) -> str:
         """Where it is."""
         return f"http://{HOST}:{self.get_port()}"
-
-    def show_theme(self, dark: bool) -> None:
-        """Show the page light or dark."""
-        self.gui.configure_theme(dark_mode=dark, show_logo=False, show_share_button=False)
 
     def frame_scene(self, bounds: ArrayLike) -> None:
         """Put the camera where it sees all of a box, (2, 3) in metres, with Z up, and a grid below.
@@ -77,10 +90,7 @@ class LivePage(viser.ViserServer):
         camera.position = middle + distance * _AWAY
         camera.up = np.array([0.0, 0.0, 1.0])
         camera.near, camera.far = size / 500, size * 50
-        self._add_grid(low, high, size)
-
-    def _add_grid(self, low: NDArray[np.float64], high: NDArray[np.float64], size: float) -> None:
-        step = grid_step(size)
+        step = 10.0 ** math.floor(math.log10(size / 4))
         centre = step * np.round((low + high) / (2 * step))
         self.scene.add_grid(
             "/ground",
@@ -96,20 +106,6 @@ class LivePage(viser.ViserServer):
             position=(float(centre[0]), float(centre[1]), float(low[2]) - 0.002 * size),
         )
 
-    def light_evenly(self) -> None:
-        """Replace the lights, so that the colours of a surface are those of its bar."""
-        self.scene.configure_environment_map(None)
-        self.scene.configure_default_lights(enabled=False, cast_shadow=False)
-        self.scene.add_light_ambient("/light/around", intensity=_AROUND)
-        self.scene.add_light_directional("/light/sun", intensity=_SUN, position=_FROM)
-
-    def add_page_controls(self, step_m: float) -> None:
-        """Add what every page has at the end of its panel."""
-        with self.gui.add_folder("page", expand_by_default=False):
-            dark = self.gui.add_checkbox("dark", initial_value=False)
-            self.gui.add_markdown(f"Metres, Z up; the grid's lines are {step_m:g} m apart.")
-        dark.on_update(lambda _: self.show_theme(dark.value))
-
 
 def place_camera(
     low: NDArray[np.float64], high: NDArray[np.float64]
@@ -123,33 +119,108 @@ def place_camera(
     return middle + _ASIDE * math.tan(_FOV / 2) * distance * _RIGHT, distance
 
 
-def grid_step(size: float) -> float:
-    """Metres between lines of a grid under a scene of this diagonal."""
-    return float(10.0 ** math.floor(math.log10(size / 4)))
+def may_connect(origins: Iterable[str]) -> bool:
+    """Whether a connection with these ``Origin`` headers is from this machine.
+
+    A browser lets any page connect to any server, and tells the server which page it was
+    (RFC 6454). A connection without the header is none of a browser's.
+
+    Examples
+    --------
+    >>> may_connect(["http://localhost:8080"]), may_connect([])
+    (True, True)
+    >>> may_connect(["https://localhost.example.com"]), may_connect(["null"])
+    (False, False)
+    """
+    return all(map(_is_own, origins))
+
+
+def _is_own(origin: str) -> bool:
+    try:
+        parts = urlsplit(origin)
+        return parts.scheme in ("http", "https") and parts.hostname in OWN_NAMES
+    except ValueError:  # no address at all
+        return False
+
+
+def refuse_strangers(server: viser.ViserServer) -> None:
+    """Let no page from elsewhere see what a server shows, nor press its buttons.
+
+    viser itself lets everybody in. That its port is on the loopback interface does not help:
+    the browser that opens the stranger's page is on this machine.
+    """
+    sockets = server._websock_server
+
+    async def admit(client: WebsockClientConnection) -> None:
+        connection = sockets._live_connections[client.client_id]
+        request = connection.request
+        origins = request.headers.get_all("Origin") if request else []
+        if may_connect(origins):
+            return
+        _LOGGER.warning("a page of %r wanted to connect to the live page: refused", origins)
+        await connection.close(_POLICY_VIOLATION, "only pages of this machine may connect")
+        # What it sent meanwhile would still be taken, so that closing is not enough. The next
+        # that the handler of this connection does is to wait for what sends and takes messages:
+        # cancelled by then, it starts neither, and takes the client off its tables.
+        task = asyncio.current_task()
+        assert task is not None
+        task.cancel()
+
+    sockets.on_client_connect(admit)
+    # Whoever was quicker comes again: viser listens before anybody can be kept out.
+    sockets.disconnect_all_clients()
 
 
 @contextmanager
 def live_page(title: str, port: int = PORT) -> Iterator[LivePage]:
-    """Serve a page while the body runs.
-
-    Parameters
-    ----------
-    title
-        Title of its panel.
-    port
-        Port to listen on, or the next that is free; 0 for any.
-    """
+    """Serve a page while the body runs; see `LivePage`."""
     console = rich.get_console()  # viser tells there what is going on, as it runs and as it ends
     before, console.quiet = console.quiet, True
     try:
         page = LivePage(title, port)
         try:
-            page.show_theme(dark=False)
             yield page
         finally:
             page.stop()
     finally:
         console.quiet = before
+
+
+@contextmanager
+def redrawn(draw: Callable[[], None], every_s: float, busy_share: float) -> Iterator[None]:
+    """Call a function again and again in a thread while the body runs, and once at its end.
+
+    The function looks for what is new and draws that. An error is logged, and ends the drawing
+    but not the body.
+
+    Parameters
+    ----------
+    every_s
+        Seconds between calls, at least.
+    busy_share
+        Share of the time that may go into calls, at most.
+    """
+    ended = threading.Event()
+
+    def run() -> None:
+        try:
+            while True:
+                last, started = ended.is_set(), time.monotonic()
+                draw()
+                if last:
+                    return
+                took = time.monotonic() - started
+                ended.wait(max(every_s, took / busy_share - took))
+        except Exception:
+            _LOGGER.exception("the page cannot be drawn any more")
+
+    thread = threading.Thread(target=run, name="lidarpool-live", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join(LAST_S)
 
 
 def open_browser(url: str) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from bisect import bisect_left, bisect_right
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -10,19 +12,86 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from ..run.picture_file import Pictured
-from .cloud_layer import CloudLayer
-from .display import POSITION
-from .height_cut import HeightCut
-from .markers import SensorLayer, add_discs, add_route
-from .page import LivePage, grid_step, live_page, open_browser
-from .painter import Drawing, Painter, Throttle
-from .result_file import ResultFile
-from .run_scene import scene_bounds
-from .scene_layer import SceneLayer
+from ..base.choice import one_of_each_part
+from ..base.errors import LidarpoolError
+from ..columns.cloud import Cloud
+from ..columns.table import TABLE, Column
+from ..export.ply_format import AXES, layout
+from ..run.picture_file import PICTURE_FILE, Pictured
+from .page import LivePage, live_page, open_browser, redrawn
+from .view import View, bounds_of
 
+CLOUD = "cloud.ply"
 VIEW_POINTS = 500_000  # in the browser at a time
 DRAW_EVERY_S, BUSY_SHARE = 0.1, 0.7  # nothing else is to be done
+
+
+class ResultFile:
+    """A cloud in PLY format, whose points stay on disk until they are chosen.
+
+    Parameters
+    ----------
+    path
+        The file.
+
+    Raises
+    ------
+    LidarpoolError
+        If it cannot be read, or is no point cloud of ours.
+    """
+
+    def __init__(self, path: Path) -> None:
+        try:
+            start, count, dtype = layout(path)
+            # Nothing cannot be mapped.
+            self._rows: NDArray[np.void] = (
+                np.memmap(path, dtype, "r", start, (count,)) if count else np.empty(0, dtype)
+            )
+        except OSError as error:
+            raise LidarpoolError(f"{path} cannot be read: {error.strerror or error}.") from error
+        except ValueError as error:
+            raise LidarpoolError(f"{path} is not a point cloud of lidarpool: {error}.") from error
+        self.table = _table(dtype)
+        scans = self._rows["scan"] if "scan" in (dtype.names or ()) else np.empty(0, np.int32)
+        some = scans[one_of_each_part(len(scans), 100_000)]
+        ordered = scans.dtype.kind in "iu" and bool((np.diff(some) >= 0).all())
+        # First and last scan; none where the points are not in their order.
+        self.scans = (int(scans[0]), int(scans[-1])) if ordered and len(scans) else (0, 0)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def choose(self, first: int, last: int, most: int) -> tuple[Cloud, int]:
+        """Choose at most so many points of scans `first` to `last`, evenly.
+
+        Returns
+        -------
+        cloud
+            The points in order. Those without finite coordinates are left out.
+        count
+            How many there are.
+        """
+        low, high = 0, len(self)
+        if (first, last) != self.scans:
+            low = bisect_left(self._rows["scan"], first)
+            high = bisect_right(self._rows["scan"], last)
+        rows = self._rows[low + one_of_each_part(high - low, most)]
+        positions = np.stack([rows[axis] for axis in AXES], axis=1, dtype=np.float64)
+        known = np.isfinite(positions).all(axis=1)
+        columns = {column.name: rows[column.in_files][known] for column in self.table}
+        return Cloud(positions[known], columns, self.table), high - low
+
+
+def _table(row: np.dtype[np.void]) -> tuple[Column, ...]:
+    """Columns of a file with such rows: those of the table, in its order, and what else it holds.
+
+    Columns of one's own have no unit here: PLY files have no place for it.
+    """
+    names = [name for name in row.names or () if name not in AXES]
+    known = [column for column in TABLE.values() if column.in_files in names]
+    ours = {column.in_files for column in known}
+    rest = [Column(n, row[n].str, "", "") for n in names if n not in ours and n.isidentifier()]
+    return (*known, *rest)
 
 
 class ResultView:
@@ -33,83 +102,76 @@ class ResultView:
     page
         Where it is shown.
     file
-        The result.
+        The points.
+    pictured
+        The scene and what else is known of the run; None where there is nothing of that.
+    note
+        What one should know of the result, a sentence, or empty.
     most
         Points that are shown at a time.
     """
 
-    def __init__(self, page: LivePage, file: ResultFile, most: int = VIEW_POINTS) -> None:
-        self._page, self._file, self._most = page, file, most
-        self.painter = Painter(self._draw, DRAW_EVERY_S, BUSY_SHARE)
-        self._throttle = Throttle()
-        bounds = _bounds(file)
-        self._level = float(bounds[0, 2])
-        self._size_m = float(np.linalg.norm(bounds[1] - bounds[0])) or 1.0
-        page.frame_scene(bounds)
+    def __init__(
+        self,
+        page: LivePage,
+        file: ResultFile,
+        pictured: Pictured | None = None,
+        note: str = "",
+        most: int = VIEW_POINTS,
+    ) -> None:
+        self._file, self._pictured, self._note, self._most = file, pictured, note, most
         self._facts = page.gui.add_html("")
-        self._scans = self._add_slider(page)
-        ask = self.painter.ask
-        self._cut = HeightCut(page, bounds, float(file.origin[2]), ask)
-        self._cloud = CloudLayer(page, file.quantities, {"object": file.names}, self._size_m, ask)
-        self._scene: SceneLayer | None = None
-        self._sensor: SensorLayer | None = None
-        if file.pictured is not None:
-            self._add_pictured(file.pictured)
-        if len(file.route):
-            add_route(page, file.route - file.origin[:2], self._level, self._size_m)
-        page.add_page_controls(grid_step(self._size_m))
-        ask()
+        self._scans: Any = None
+        if file.scans[0] < file.scans[1]:
+            self._scans = page.gui.add_multi_slider("scans", *file.scans, 1, file.scans)
+        poses: NDArray[np.float64] = np.empty((0, 3))
+        if pictured is None:
+            origin, bounds = _around(file)
+            scene = None
+        else:
+            scene, origin = pictured.scene, pictured.scene.origin
+            poses = pictured.poses - origin
+            bounds = bounds_of(scene, poses, pictured.planning)
+        self._origin = origin
+        self._choose(*file.scans)
+        self._view = View(page, scene, poses, file.table, origin, bounds)
 
-    def _add_slider(self, page: LivePage) -> Any:
-        first, last = self._file.scans
-        if first >= last or not self._file.in_order:
-            return None
-        slider = page.gui.add_multi_slider("scans", first, last, 1, (first, last))
-        slider.on_update(self.painter.ask)
-        return slider
-
-    def _add_pictured(self, pictured: Pictured) -> None:
-        poses = pictured.poses - pictured.scene.origin
-        self._scene = SceneLayer(self._page, pictured.scene, poses, self._cut, self.painter.ask)
-        self._sensor = SensorLayer(self._page, self._size_m)
-        self._sensor.draw_poses(poses)
-        if (planning := pictured.planning) is not None:
-            add_discs(self._page, planning.centres, planning.radii, self._level, self._size_m)
-
-    def _draw(self) -> bool:
-        """Draw what has changed; returns whether something was left for later."""
+    def draw(self) -> None:
+        """Draw what has changed."""
         scans = self._scans.value if self._scans else self._file.scans
-        scene, sensor, pictured = self._scene, self._sensor, self._file.pictured
-        cut = self._cut.height
-        shown = (scans, cut, self._cloud.state, scene.state if scene else None)
-        drawings = [Drawing("cloud", shown, 0.0, lambda: self._draw_cloud(*scans))]
-        if scene is not None and sensor is not None and pictured is not None:
-            rays, hits = pictured.sample_rays, pictured.hit_counts
-            drawings += [
-                Drawing("sensor", scans[1], 0.0, lambda: self._place(sensor, scans[1])),
-                Drawing("rays", cut, 0.0, lambda: sensor.draw_earlier(rays, cut)),
-                Drawing("scene", scene.state, 0.0, lambda: scene.draw(hits)),
-            ]
-        self._throttle.draw(drawings)
-        settling = self._cloud.settle(), scene is not None and scene.settle()
-        return any(settling)
+        if scans != self._chosen:
+            self._choose(*scans)
+        pictured = self._pictured
+        names: tuple[str, ...] = ()
+        if pictured is not None:
+            self._view.draw_scene(pictured.hit_counts, 0)
+            self._view.draw_rays(pictured.sample_rays, 0)
+            if pictured.plan is not None:
+                self._view.draw_path(pictured.plan.path, pictured.planning)
+            names = pictured.scene.names
+        self._view.draw_cloud(self._cloud, scans, names)
 
-    def _draw_cloud(self, first: int, last: int) -> None:
-        rows, count = self._file.choose(first, last, self._most)
-        seen = self._cut.below(rows)
-        facing = None if self._scene is None else self._scene.facing(seen[POSITION])
-        self._cloud.draw(seen, facing, (first, last, self._cut.height))
-        shown = "all shown" if len(rows) == count else f"{len(rows):,} shown"
+    def _choose(self, first: int, last: int) -> None:
+        self._chosen = (first, last)
+        self._cloud, count = self._file.choose(first, last, self._most)
+        shown = "all shown" if len(self._cloud) == count else f"{len(self._cloud):,} shown"
         lines = [f"{count:,} of {len(self._file):,} points, {shown}"]
-        if (away := self._file.origin).any():
-            lines.append("relative to " + ", ".join(f"{metres:.0f}" for metres in away) + " m")
-        if self._file.note:
-            lines.append(escape(self._file.note))
+        if self._origin.any():
+            away = ", ".join(f"{metres:.0f}" for metres in self._origin)
+            lines.append(f"relative to {away} m")
+        lines += [escape(self._note)] if self._note else []
         self._facts.content = f'<div style="padding:0 0.8em">{"<br>".join(lines)}</div>'
 
-    def _place(self, sensor: SensorLayer, scan: int) -> None:
-        if (position := self._file.sensor_at(scan)) is not None:
-            sensor.place(position)
+
+def _around(file: ResultFile) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Whole metres near the points of a file, (3,), and the box (2, 3) around them from there."""
+    positions = file.choose(*file.scans, 100_000)[0].positions
+    if not len(positions):
+        return np.zeros(3), np.array([[-1.0, -1.0, 0.0], [1.0, 1.0, 1.0]])
+    # Nearly all of them: few strays do not count.
+    box = np.percentile(positions, [0.5, 99.5], axis=0)
+    origin = np.where(np.abs(box[0]) > 10_000, np.round(box[0]), 0.0)
+    return origin, box - origin
 
 
 def view_result(path: Path, *, port: int, browser: bool = True) -> None:
@@ -129,27 +191,39 @@ def view_result(path: Path, *, port: int, browser: bool = True) -> None:
     LidarpoolError
         If there is no cloud, or it is damaged.
     """
+    pictured, note = None, ""
+    if path.is_dir():
+        pictured, note = _pictured_in(path)
+        path /= CLOUD
+        if not path.exists():
+            raise LidarpoolError(
+                f"{path.parent} holds no {CLOUD}: give the folder of a finished run (its --out), "
+                "or a cloud."
+            )
     file = ResultFile(path)
-    if file.note:
-        click.echo(f"note: {file.note}", err=True)
-    with live_page(f"lidarpool: {file.path.parent.name or file.path.name}", port) as page:
-        view = ResultView(page, file)
+    if note:
+        click.echo(f"note: {note}", err=True)
+    with live_page(f"lidarpool: {path.parent.name or path.name}", port) as page:
+        view = ResultView(page, file, pictured, note)
         click.echo(f"{page.url} shows {len(file):,} points; Ctrl-C ends it", err=True)
         if browser:
             open_browser(page.url)
         try:
-            view.painter.run()
+            with redrawn(view.draw, DRAW_EVERY_S, BUSY_SHARE):
+                while True:
+                    time.sleep(1.0)
         except KeyboardInterrupt:
             return
 
 
-def _bounds(file: ResultFile) -> NDArray[np.float64]:
-    """Box (2, 3) of what there is to see, displayed positions."""
-    if (pictured := file.pictured) is not None:
-        poses = pictured.poses - pictured.scene.origin
-        return scene_bounds(pictured.scene, poses, pictured.planning)
-    positions = file.choose(*file.scans, 100_000)[0][POSITION]
-    if not len(positions):
-        return np.array([[-1.0, -1.0, 0.0], [1.0, 1.0, 1.0]])
-    # Nearly all positions: few strays do not count.
-    return np.percentile(positions, [0.5, 99.5], axis=0).astype(np.float64)
+def _pictured_in(folder: Path) -> tuple[Pictured | None, str]:
+    """Read what pictures of a result show; if that fails, return a sentence that says so.
+
+    It is no error: the cloud is what one wants to see, and is all there.
+    """
+    if not (folder / PICTURE_FILE).exists():
+        return None, ""
+    try:
+        return Pictured.load(folder / PICTURE_FILE), ""
+    except LidarpoolError as error:
+        return None, f"The cloud is shown without the scene. {error}"

@@ -1,32 +1,41 @@
 """The live page of a run: while it runs, and until somebody has seen enough of it.
 
 The run calls in its own thread, and is never kept waiting by a browser: what it brings is
-noted, and a `Painter` reads and draws the latest of it in another.
+noted, and drawn in another thread now and then, as much as a small share of the time allows.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from html import escape
+from threading import Event
 from typing import Any
 
 import click
+import numpy as np
+from numpy.typing import NDArray
 
 from poolpart import Partition
 
+from ..plan import best
 from ..run.job import Job
-from ..run.progress import Progress, Show
+from ..run.picture_file import sensor_places
+from ..run.progress import STAGES, Progress, Show, in_words, is_sure, time_in_words
+from ..run.result import Result
 from ..run.store import RunStore
-from ..scan import Frame, Receipt
-from .page import PORT, LivePage, live_page, open_browser
-from .painter import Painter
-from .run_panel import Occupancy, RunControl, RunPanel, RunState
-from .run_scene import RunScene
+from ..scan import Frame
+from .live_points import LivePoints
+from .page import PORT, LivePage, live_page, open_browser, redrawn
+from .view import View, bounds_of
 
-DRAW_EVERY_S = 0.25
+DRAW_EVERY_S, BUSY_SHARE = 0.5, 0.07
 ASK_EVERY_S = 2.0  # how busy the partitions are
-LAST_DRAWING_S = 60.0  # that the end of a run waits for
+FRAMES_SHOWN = 40  # whose rays are shown
+
+_BOX = '<div style="padding:0 0.8em;font-size:0.85em;font-variant-numeric:tabular-nums">'
 
 
 class LiveRun:
@@ -41,45 +50,43 @@ class LiveRun:
     """
 
     def __init__(self, page: LivePage, job: Job) -> None:
-        self._page = page
-        self.control = RunControl()
-        self.painter = Painter(self._draw, DRAW_EVERY_S)
-        self._panel, self._text = RunPanel(), page.gui.add_html("")
-        self._add_buttons()
-        self._scene = RunScene(page, job, self.painter.ask)
-        self._words = "starting"
+        self.page, self._job = page, job
+        self.paused, self.stopped = Event(), Event()  # what somebody at the page wants
+        self._text = page.gui.add_html("")
+        self._pause = page.gui.add_button("Pause")
+        self._stop = page.gui.add_button("Stop", color="red")
+        self._pause.on_click(self._on_pause)
+        self._stop.on_click(lambda _: self.stopped.set())
+        poses = sensor_places(job.survey)
+        bounds = bounds_of(job.scene, poses, job.planning)
+        columns = job.survey.stored_columns
+        self._view = View(page, job.scene, poses, columns, job.scene.origin, bounds)
         self._store: RunStore | None = None
+        self._points: LivePoints | None = None
         self._progress: Progress | None = None
+        self._first: Progress | None = None  # that rates are taken from
+        self._frames: deque[Frame] = deque(maxlen=FRAMES_SHOWN)
         self._partitions: Mapping[str, Partition] = {}
-        self._busy: dict[str, Occupancy] = {}
+        self._busy: dict[str, tuple[int, int]] = {}  # {partition: busy slots, all slots}
         self._ask_at = 0.0
         self._over = False
-        page.on_client_connect(self.painter.ask)
-        self.painter.ask()
-
-    @property
-    def url(self) -> str:
-        """Where the page is."""
-        return self._page.url
+        self._rays: NDArray[np.float32] | None = None  # of all the run, at its end
 
     # -- the run's side, in its thread ---------------------------------------------------
 
     def follow(self, store: RunStore) -> None:
         """Show what is committed from now on, and what an earlier run has left."""
-        self._scene.points.parts.add(store.db.ordered)
+        points = LivePoints(store)
+        points.add(store.db.ordered)
         if store.kept:
             self._progress = store.progress()
-        store.on_parts = self._on_parts
-        self._store = store
-        self.painter.ask()
-
-    def _on_parts(self, receipts: Sequence[Receipt]) -> None:
-        """Note parts that were committed; the painter reads them, or some of them."""
-        self._scene.points.parts.add(receipts)
-        self.painter.ask()
+        store.on_parts = points.add
+        self._store, self._points = store, points
 
     def with_progress(self, show: Show, partitions: Mapping[str, Partition]) -> Show:
         """Return a function to call with the progress: it calls `show` and tells the page.
+
+        It raises KeyboardInterrupt if somebody has stopped the run.
 
         Parameters
         ----------
@@ -95,91 +102,138 @@ class LiveRun:
         return tell
 
     def on_frame(self, frame: Frame) -> None:
-        """Note a frame; it is displayed unless another comes at once."""
-        self._scene.note(frame)
-        self.painter.ask()
+        """Note a frame; it is displayed unless many others come at once."""
+        self._frames.append(frame)
 
     def on_progress(self, progress: Progress) -> None:
-        """Note how far the run is.
-
-        Raises
-        ------
-        KeyboardInterrupt
-            If it was stopped.
-        """
-        self._progress, self._words = progress, "running"
+        """Note how far the run is; raises KeyboardInterrupt if it was stopped."""
+        self._first = self._first or progress
+        self._progress = progress
         now = time.monotonic()
         if now >= self._ask_at:
             self._ask_at = now + ASK_EVERY_S
             with suppress(OSError, RuntimeError):  # a lost cluster is for the run to tell of
-                for name, partition in self._partitions.items():
-                    stats = partition.stats()
-                    self._busy[name] = Occupancy(stats.busy, stats.slots)
-        self.painter.ask()
-        self.control.check()
+                stats = {name: part.stats() for name, part in self._partitions.items()}
+                self._busy = {name: (of.busy, of.slots) for name, of in stats.items()}
+        if self.stopped.is_set():
+            raise KeyboardInterrupt
 
     def wants_pause(self) -> bool:
         """Whether the run is to stand still."""
-        return self.control.paused
+        return self.paused.is_set() and not self.stopped.is_set()
 
-    def finish(self) -> None:
+    def finish(self, result: Result) -> None:
         """Say that the run is over, and show all of it; its parts may be removed after that."""
-        if self._store is not None:
-            self._scene.complete(self._store)
-        self._over, self._words, self._busy = True, "done", {}
+        if self._points is not None:
+            self._points.finish(result)
+        self._rays = result.sample_rays
+        self._busy, self._over = {}, True
         self._pause.disabled = True
         self._stop.label = "Close"
-        self.painter.ask()
 
     def stay(self) -> None:
         """Keep the page until Ctrl-C, or until it is closed from the page itself."""
-        click.echo(f"the live page stays at {self._page.url}; Ctrl-C ends it", err=True)
+        click.echo(f"the live page stays at {self.page.url}; Ctrl-C ends it", err=True)
         with suppress(KeyboardInterrupt):
-            self.control.wait_for_stop()
+            while not self.stopped.wait(0.2):  # one without limit is not left on Ctrl-C everywhere
+                pass
 
     # -- the page's side -----------------------------------------------------------------
 
-    def _add_buttons(self) -> None:
-        self._pause = self._page.gui.add_button("Pause")
-        self._stop = self._page.gui.add_button("Stop", color="red")
+    def _on_pause(self, _: Any) -> None:
+        if self.paused.is_set():
+            self.paused.clear()
+        else:
+            self.paused.set()
+        self._pause.label = "Go on" if self.paused.is_set() else "Pause"
 
-        @self._pause.on_click
-        def _pause(_: Any) -> None:
-            if self.control.paused:
-                self.control.go_on()
-            else:
-                self.control.pause()
-            self._pause.label = "Go on" if self.control.paused else "Pause"
-            self.painter.ask()
+    def draw(self) -> None:
+        """Draw what is new."""
+        if not self.page.get_clients():  # whoever comes later has it drawn then
+            return
+        points, view, names = self._points, self._view, self._job.scene.names
+        self._text.content = self._panel()
+        if points is None:
+            view.draw_scene(np.zeros(len(self._job.scene.faces)), 0)
+            return
+        points.gather()
+        if points.cloud is not None:
+            view.draw_cloud(points.cloud, points.version, names)
+        view.draw_scene(points.hit_counts, points.version)
+        self._draw_frames()
+        self._draw_path()
 
-        @self._stop.on_click
-        def _stop(_: Any) -> None:
-            self.control.stop()
-            self.painter.ask()
+    def _draw_frames(self) -> None:
+        frames = list(self._frames)
+        if frames:
+            self._view.place_sensor(frames[-1].pose.position)
+        if self._rays is not None:
+            self._view.draw_rays(self._rays, "all")
+        elif frames:
+            starts = np.repeat(
+                np.array([frame.pose.position for frame in frames], np.float32),
+                [len(frame.samples) for frame in frames],
+                axis=0,
+            )
+            ends = np.concatenate([frame.samples for frame in frames])
+            self._view.draw_rays(np.stack([starts, ends], axis=1), frames[-1].scan)
 
-    def _draw(self) -> bool:
-        """Draw what is new; returns whether something was left for later."""
-        if not self._page.get_clients():  # whoever comes later has it drawn then
-            return False
-        left = self._store is not None and self._scene.draw(self._store, self._over)
-        words = self._words
-        if not self._over:
-            if self._progress is not None and self._progress.waits_for:
-                words = f"waiting for slots of {self._progress.waits_for}"
-            words = "stopping" if self.control.stopped else words
-            if self.control.paused and self._progress is not None:
-                words = "paused" if self._progress.paused else "pausing"
-        frames = self._scene.frames
-        state = RunState(
-            words,
-            dict(self._busy),
-            self._scene.displayed,
-            frames.taken,
-            frames.dropped,
-            self._scene.points.error,
-        )
-        self._text.content = self._panel.html(self._progress, state)
-        return left
+    def _draw_path(self) -> None:
+        planning, store = self._job.planning, self._store
+        if planning is not None and store is not None and len(store.db.trials) == self._job.trials:
+            self._view.draw_path(best(store.db.trials, planning).path, planning)
+
+    def _panel(self) -> str:
+        """Write how far the run is."""
+        progress, points = self._progress, self._points
+        if progress is None:
+            return f"{_BOX}<b>starting</b></div>"
+        lines = [f"<b>{self._words(progress)}</b>, {progress.seconds:,.0f} s{self._pace(progress)}"]
+        lines += [
+            _bar(label, getattr(progress, count), getattr(progress, total))
+            for label, count, total in STAGES
+            if getattr(progress, total)
+        ]
+        shown = len(points.cloud) if points is not None and points.cloud is not None else 0
+        some = "" if shown == progress.points else f", {shown:,} of them displayed"
+        lines.append(f"<b>{progress.points:,} points</b>{some}")
+        if points is not None and points.error:
+            lines.append(escape(points.error))
+        lines += [_bar(f"{escape(name)}, slots busy", *slots) for name, slots in self._busy.items()]
+        return _BOX + "".join(f"<div>{line}</div>" for line in lines) + "</div>"
+
+    def _words(self, progress: Progress) -> str:
+        if self._over:
+            return "done"
+        if self.stopped.is_set():
+            return "stopping"
+        if self.paused.is_set():
+            return "paused" if progress.paused else "pausing"
+        if progress.waits_for:
+            return f"waiting for slots of {escape(progress.waits_for)}"
+        return "running" if self._first is not None else "starting"
+
+    def _pace(self, progress: Progress) -> str:
+        """Tell scans a second, and how long the rest will take."""
+        first, left = self._first, progress.scans - progress.collected
+        if first is None or progress.collected <= first.collected or not left:
+            return ""
+        rate = (progress.collected - first.collected) / (progress.seconds - first.seconds)
+        words = f", {in_words(rate)} scans/s"
+        if is_sure(progress.collected, progress.scans, progress.seconds):
+            words += f", {time_in_words(left / rate)} left"
+        return words
+
+
+def _bar(label: str, done: int, whole: int) -> str:
+    share = 100 * done / max(whole, 1)
+    return (
+        '<div style="display:flex;margin-top:0.35em">'
+        f'<span style="flex:1">{label}</span><span>{done:,} / {whole:,}</span></div>'
+        '<div style="height:0.3em;border-radius:2px;background:rgba(128,134,142,0.3)">'
+        f'<div style="height:100%;border-radius:2px;width:{share:.1f}%;background:#2f7fd6">'
+        "</div></div>"
+    )
 
 
 @contextmanager
@@ -194,22 +248,11 @@ def live_run(job: Job, *, port: int = PORT, browser: bool = True) -> Iterator[Li
         Port to listen on, or the next that is free; 0 for any.
     browser
         Whether to open a browser where there is a desktop.
-
-    Raises
-    ------
-    Exception
-        After the body, if the page could not be drawn.
     """
     with live_page("lidarpool", port) as page:
         live = LiveRun(page, job)
-        thread = live.painter.start()
         click.echo(f"live page: {page.url}", err=True)
         if browser:
             open_browser(page.url)
-        try:
+        with redrawn(live.draw, DRAW_EVERY_S, BUSY_SHARE):
             yield live
-        finally:
-            live.painter.end()
-            thread.join(LAST_DRAWING_S)
-        if live.painter.error is not None:
-            raise live.painter.error

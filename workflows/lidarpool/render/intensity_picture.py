@@ -62,7 +62,7 @@ def draw_intensity(
     table = mapped("turbo", np.linspace(0.08, 0.97, 256))
     page = Page(size, theme)
     axes = page.show(
-        shot, shot.paint(_colours(density, hits > 0, (low, high), table, theme), theme, 0.5)
+        shot, shot.paint(density_colours(density, hits > 0, (low, high), table, theme), theme, 0.5)
     )
     page.lines(axes, shot, rays - scene.origin, theme.ray, width=0.45, alpha=0.5)
     page.sensors(axes, shot, sensors - scene.origin)
@@ -83,7 +83,7 @@ def density_range(density: Floats) -> tuple[float, float]:
     return float(low), float(max(high, 2 * low))
 
 
-def _colours(
+def density_colours(
     density: Floats,
     hit: NDArray[np.bool_],
     scale: tuple[float, float],

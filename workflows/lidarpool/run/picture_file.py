@@ -80,7 +80,7 @@ class Pictured:
         """Return what the pictures of a result show."""
         return cls(
             scene,
-            _places(survey) + scene.origin,
+            sensor_places(survey) + scene.origin,
             result.hit_counts,
             result.sample_rays,
             planning if result.plan is not None else None,
@@ -185,7 +185,7 @@ class Pictured:
         return cls(scene, poses, counts, rays, planning, plan, trials)
 
 
-def _places(survey: Survey) -> NDArray[np.float64]:
+def sensor_places(survey: Survey) -> NDArray[np.float64]:
     """Where the sensor was, (p, 3): at each station, or now and then on its way."""
     path = survey.path
     if not path.moves:

@@ -1,0 +1,68 @@
+"""Colours of points by their columns, and what a legend says of them."""
+
+import numpy as np
+import pytest
+
+from lidarpool.columns.table import CHANNEL, OBJECT, TABLE, Z
+from lidarpool.live.colouring import TURBO, as_bytes, colours_of
+
+HEIGHTS = np.linspace(0, 10, 200)
+
+
+def test_numbers_go_up_the_colours():
+    colours, legend = colours_of(HEIGHTS, Z)
+    assert colours[0].tolist() == as_bytes(TURBO)[0].tolist()
+    assert colours[-1].tolist() == as_bytes(TURBO)[255].tolist()
+    assert "z, m: position along z, up" in legend
+    assert "linear-gradient" in legend
+
+
+def test_the_middle_of_a_bar_about_zero_is_zero():
+    assert ">0<" in colours_of(np.linspace(-8, 7.98, 200), Z)[1]
+
+
+def test_what_is_unknown_is_grey():
+    values = np.full(200, np.nan, np.float32)
+    values[:100] = np.linspace(5, 7, 100)
+    colours, _ = colours_of(values, TABLE["range"])
+    assert (colours[100:] == 128).all()
+    assert not (colours[:100] == 128).all(axis=1).any()
+
+
+def test_times_of_a_long_survey_are_told_apart():
+    """Nanoseconds of an hour: more digits than single precision has."""
+    colours, _ = colours_of(3_600_000_000_000 + np.arange(200) * 1000, TABLE["time"])
+    assert len(np.unique(colours, axis=0)) > 100
+
+
+def test_objects_have_names_and_colours_of_their_own():
+    colours, legend = colours_of(np.arange(200) % 3, OBJECT, ("Ball", "<b>Box</b>"))
+    assert len(np.unique(colours, axis=0)) == 3
+    assert "Ball" in legend
+    assert "&lt;b&gt;Box" in legend
+    assert "object 2" in legend
+    many = tuple(f"thing {number}" for number in range(100))
+    assert "and 88 more" in colours_of(np.arange(100), OBJECT, many)[1]
+
+
+def test_few_labels_are_named_and_many_are_on_a_scale():
+    few, key = colours_of(np.uint8([0, 7, 7, 2]), TABLE["class"])
+    assert len(np.unique(few, axis=0)) == 3
+    assert [name in key for name in ("class 0", "class 1", "class 2", "class 7")] == [
+        True, False, True, True,
+    ]  # fmt: skip
+    assert colours_of(np.uint8([7]), TABLE["class"])[0].tolist() == [few[1].tolist()]
+    many, bar = colours_of(np.arange(64, dtype=np.uint16), CHANNEL)
+    assert len(np.unique(many, axis=0)) == 64
+    assert "linear-gradient" in bar
+
+
+@pytest.mark.parametrize("column", TABLE.values(), ids=lambda column: column.name)
+def test_every_column_takes_no_points_equal_ones_and_its_largest(column):
+    dtype = np.dtype(column.dtype)
+    assert colours_of(np.zeros(0, dtype), column)[0].shape == (0, 3)
+    same, legend = colours_of(np.ones(5, dtype), column, ("Ball",))
+    assert len(np.unique(same, axis=0)) == 1
+    assert "nan" not in legend
+    if dtype.kind in "iu":
+        assert colours_of(np.array([0, np.iinfo(dtype).max], dtype), column)[0].shape == (2, 3)

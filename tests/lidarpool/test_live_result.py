@@ -1,0 +1,265 @@
+"""A finished result on a page: its points, scene, sensors, rays and planning; nobody looks yet."""
+
+import io
+
+import numpy as np
+import pytest
+import trimesh
+
+from lidarpool import LidarpoolError, Planning, Scene
+from lidarpool.columns.table import CHANNEL, OBJECT, SCAN
+from lidarpool.export.ply_format import header, row_type
+from lidarpool.live.page import live_page
+from lidarpool.live.result_page import ResultFile, ResultView, view_result
+from lidarpool.live.surface import MeshNode, Surface, coloured_mesh
+from lidarpool.plan import Plan
+from lidarpool.run.picture_file import PICTURE_FILE, Pictured
+
+POSES = 25
+ORIGIN = np.array([500_000.0, 100.0, 0.0])
+
+
+def write(path, positions, scans=100):
+    """Write a cloud as a run does."""
+    count = len(positions)
+    row = row_type(np.dtype(np.float64), (SCAN, CHANNEL, OBJECT))
+    rows = np.zeros(count, row)
+    for axis, name in enumerate("xyz"):
+        rows[name] = positions[:, axis]
+    rows["scan"] = np.arange(count) * scans // max(1, count)
+    rows["ring"] = np.arange(count) % 40
+    path.write_bytes(header(row, count) + rows.tobytes())
+    return path
+
+
+# -- the points ---------------------------------------------------------------------------
+
+
+def test_scans_are_chosen_and_thinned(tmp_path):
+    x = np.arange(50_000) // 500
+    file = ResultFile(write(tmp_path / "a.ply", np.column_stack([x, 0 * x, 0 * x])))
+    assert (len(file), file.scans) == (50_000, (0, 99))
+    cloud, count = file.choose(20, 29, 10_000)
+    assert count == len(cloud) == 5_000
+    assert (cloud["scan"].min(), cloud["scan"].max()) == (20, 29)
+    cloud, count = file.choose(0, 99, 4_000)
+    assert (count, len(cloud)) == (50_000, 4_000)
+    assert np.bincount(cloud["scan"]).min() >= 35
+    assert np.bincount(cloud["channel"]).min() > 50
+    assert np.array_equal(cloud.positions[:, 0], cloud["scan"])
+
+
+def test_no_points_and_points_that_are_nowhere_are_no_reason_to_fail(tmp_path):
+    nothing = ResultFile(write(tmp_path / "a.ply", np.zeros((0, 3))))
+    assert (len(nothing), nothing.scans, nothing.choose(0, 0, 10)[1]) == (0, (0, 0), 0)
+    nowhere = ResultFile(write(tmp_path / "b.ply", np.full((1000, 3), np.nan)))
+    assert len(nowhere.choose(0, 99, 1000)[0]) == 0
+
+
+def test_columns_that_nobody_knows_are_in_the_menu(tmp_path, page):
+    """A cloud of another program, without scans."""
+    row = np.dtype([(a, "<f4") for a in "xyz"] + [("nx", "<f4"), ("2-a", "|u1"), ("ring", "<u2")])
+    lines = ["property float x", "property float y", "property float z", "property float nx"]
+    lines += ["property uchar 2-a", "property ushort ring"]
+    rows = np.zeros(20, row)
+    rows["x"] = rows["nx"] = np.arange(20)
+    head = ["ply", "format binary_little_endian 1.0", "element vertex 20", *lines, "end_header", ""]
+    (tmp_path / "theirs.ply").write_bytes("\n".join(head).encode() + rows.tobytes())
+    file = ResultFile(tmp_path / "theirs.ply")
+    view = ResultView(page, file)
+    view.draw()
+    assert view._view._colour.options == ("z", "channel", "nx")
+    assert view._scans is None
+    assert file.choose(*file.scans, 100)[0]["nx"].tolist() == list(range(20))
+
+
+def test_what_is_no_result_is_refused(tmp_path):
+    for name, words in (
+        ("", r"holds no cloud\.ply: give the folder"),
+        ("none.ply", "cannot be read"),
+        ("cut.ply", "is not a point cloud of lidarpool"),
+    ):
+        (tmp_path / "cut.ply").write_bytes(b"ply\n")
+        with pytest.raises(LidarpoolError, match=words):
+            view_result(tmp_path / name, port=0, browser=False)
+
+
+# -- the page -----------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def pictured():
+    """Return a room with a roof, 6 by 8 by 3 metres, far from zero, scanned from 25 poses."""
+    room = trimesh.creation.box(bounds=[(0, 0, 0), (6, 8, 3)])
+    faces = np.int32(room.faces)
+    scene = Scene(np.array(room.vertices), faces, np.zeros(12, np.int32), ("room",), ORIGIN)
+    poses = np.column_stack([np.full(POSES, 3.0), np.linspace(1, 7, POSES), np.ones(POSES)])
+    rays = np.stack([np.repeat(poses[:2], 9, axis=0), np.full((18, 3), 2.9)], axis=1)
+    rays[:9, 1, 2] = 0.5
+    return Pictured(
+        scene,
+        poses + ORIGIN,
+        np.arange(12),
+        rays.astype(np.float32),
+        Planning((1, 1), (5, 7), [(1, 6)], 0.5),
+        Plan(np.array([[1.0, 1.0], [5.0, 7.0]]), 7.2, 7.2, 1.0, 0, 1),
+        (),
+    )
+
+
+@pytest.fixture
+def cloud(tmp_path):
+    """Return a file of 10,000 points on the room's walls and ceiling."""
+    local = np.random.default_rng(0).uniform((0, 0, 0), (6, 8, 3), (10_000, 3))
+    local[::2, 0], local[1::2, 2] = 0.0, 3.0
+    return write(tmp_path / "cloud.ply", local + ORIGIN)
+
+
+@pytest.fixture
+def page():
+    """Return a page that nobody looks at."""
+    with live_page("a result", port=0) as page:
+        yield page
+
+
+def points(page):
+    """Positions of the points that are shown."""
+    node = page.scene.get_handle_by_name("/cloud")
+    return node.points if node is not None and node.visible else np.empty((0, 3))
+
+
+def scenes(page):
+    """Meshes that are shown."""
+    handles = [page.scene.get_handle_by_name(f"/scene/{name}") for name in ("one", "other")]
+    return [handle.glb_data for handle in handles if handle is not None]
+
+
+def test_the_page_shows_scene_sensors_rays_and_planning(cloud, pictured, page):
+    view = ResultView(page, ResultFile(cloud), pictured)
+    view.draw()
+    for name in ("/poses", "/rays", "/path", "/discs/0"):
+        assert page.scene.get_handle_by_name(name) is not None, name
+    assert len(scenes(page)) == 1
+    assert "hits per square metre" in view._view._scene_legend.content
+    assert len(page.scene.get_handle_by_name("/poses").batched_positions) == POSES
+    assert "10,000 of 10,000 points" in view._facts.content
+    view._scans.value = (10, 19)
+    view.draw()
+    assert "1,000 of 10,000 points" in view._facts.content
+
+
+def test_under_a_roof_the_page_is_cut_and_can_be_made_whole(cloud, pictured, page):
+    view = ResultView(page, ResultFile(cloud), pictured)
+    view.draw()
+    assert view._view.cut == pytest.approx(2)  # halfway up from the sensors
+    assert 0 < len(points(page)) < 4000
+    assert points(page)[:, 2].max() <= 2
+    assert len(page.scene.get_handle_by_name("/rays").points) == 9
+    view._view._cut.value = view._view._cut.max
+    view.draw()
+    assert view._view.cut is None
+    assert len(points(page)) == 10_000
+    assert len(page.scene.get_handle_by_name("/rays").points) == 18
+    assert len(scenes(page)) == 2
+    view._view._cut.value = -1.0  # not even the floor is left
+    view.draw()
+    assert len(points(page)) == len(scenes(page)) == 0
+
+
+def test_a_colour_that_is_chosen_is_drawn_and_what_is_hidden_is_not(cloud, pictured, page):
+    view = ResultView(page, ResultFile(cloud), pictured)
+    view._view._colour.value = "object"
+    view.draw()
+    assert "room" in view._view._cloud_legend.content
+    view._view._show_cloud.value = view._view._show_rays.value = False
+    view._view._show_scene.value = False
+    view.draw()
+    assert len(points(page)) == 0
+    assert not page.scene.get_handle_by_name("/rays").visible
+    assert not page.scene.get_handle_by_name("/scene/other").visible
+
+
+def test_without_a_scene_the_cloud_is_shown_alone_near_zero(cloud, page):
+    view = ResultView(page, ResultFile(cloud), None, "why & what")
+    view.draw()
+    assert len(points(page)) == 10_000
+    assert np.abs(points(page)).max() < 200
+    assert "why &amp; what" in view._facts.content
+
+
+def test_damaged_pictures_are_noted_and_the_cloud_is_shown(cloud, capsys, monkeypatch):
+    def interrupt(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("lidarpool.live.result_page.time.sleep", interrupt)
+    (cloud.parent / PICTURE_FILE).write_bytes(b"PK\x03\x04junk")
+    view_result(cloud.parent, port=0, browser=False)
+    said = capsys.readouterr().err
+    assert "note: The cloud is shown without the scene." in said
+    assert "shows 10,000 points" in said
+
+
+# -- the scene ----------------------------------------------------------------------------
+
+
+def test_triangles_come_back_from_their_file_in_their_colours():
+    corners = np.random.default_rng(0).random((7, 3, 3)).astype(np.float32)
+    colours = np.arange(21, dtype=np.uint8).reshape(7, 3) * 12
+    data = coloured_mesh(corners, colours)
+    mesh = trimesh.load(io.BytesIO(data), file_type="glb", process=False).to_mesh()
+    assert np.array_equal(mesh.vertices[mesh.faces].astype(np.float32), corners)
+    linear = np.frombuffer(data[-4 * 21 :], np.uint8).reshape(7, 3, 4)[:, :, :3] / 255
+    screen = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    assert np.allclose(255 * screen, colours[:, None], atol=7)  # dark ones are coarse, linear
+
+
+def test_many_triangles_become_few_that_keep_shape_and_hits():
+    scene = Scene.seed()
+    surface = Surface(scene, most=5000)
+    corners = surface.corners.reshape(-1, 3)
+    assert 500 < len(surface.corners) <= 5000
+    assert np.allclose(corners.min(axis=0), scene.vertices.min(axis=0), atol=0.5)
+    assert np.allclose(corners.max(axis=0), scene.vertices.max(axis=0), atol=0.5)
+    first = scene.face_object == 0  # of six objects, far from each other
+    colours, legend = surface.coloured(np.where(first, 3, 0))
+    middles = surface.corners.mean(axis=1)
+    low, high = scene.object_bounds[0]
+    there = ((middles > low - 1) & (middles < high + 1)).all(axis=1)
+    vivid = np.ptp(colours.astype(int), axis=1) > 40
+    assert vivid[there].mean() > 0.9
+    assert not vivid[~there].any()
+    assert "hits per square metre" in legend
+    assert len(Surface(scene).corners) == len(scene.faces)  # few enough
+
+
+def test_what_rises_above_the_cut_is_pressed_down_to_it():
+    surface = Surface(Scene.seed())
+    corners, kept = surface.below(1.5)
+    assert corners[:, :, 2].max() == 1.5
+    assert kept.sum() == len(corners) < len(surface.corners)
+    assert np.array_equal(corners[:, :, :2], surface.corners[kept][:, :, :2])
+    assert surface.below(None)[1].all()
+    assert surface.corners[:, :, 2].max() > 1.5
+
+
+def test_floor_and_roof_are_found_and_the_sky_is_none(pictured):
+    local = pictured.poses - ORIGIN
+    assert Surface(pictured.scene).around(local) == pytest.approx((0, 3))
+    assert Surface(Scene.seed()).around(np.array([[0.0, 0, 1]])) == (None, None)
+
+
+def test_a_mesh_is_never_gone_while_another_comes_and_none_is_left_over(page):
+    node = MeshNode(page, "/scene")
+    corners = np.random.default_rng(0).random((3, 3, 3)).astype(np.float32)
+    shown = []
+    for number in range(4):
+        node.show(corners, np.full((3, 3), 10 * number, np.uint8), True)
+        shown.append(scenes(page))
+        node.settle()
+    assert [len(meshes) for meshes in shown] == [1, 2, 2, 2]
+    assert set(shown[1]) & set(shown[2])
+    node._alone_at = 0.0
+    node.settle()
+    assert len(scenes(page)) == 1
+    node.show(corners[:0], np.zeros((0, 3), np.uint8), True)
+    assert scenes(page) == []

@@ -1,0 +1,280 @@
+"""What a page shows in space: scene, cloud, sensors, rays and path, and their controls."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable, Sequence
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import ArrayLike, NDArray
+
+from ..columns.cloud import Cloud
+from ..columns.table import AXES, Column, Z
+from ..plan import Planning
+from ..scene.scene import Scene
+from .colouring import colours_of
+from .page import LivePage
+from .surface import MeshNode, Surface
+
+MOST_POSES = 1000  # that have a ball
+MOST_RAYS = 150  # more of them hide what they hit
+
+_RED, _PALE = (224, 24, 45), (232, 140, 150)
+_PATH, _DISC = (20, 150, 90), (120, 130, 150)
+# As shares of the scene's diagonal. Points can be seen where there are few, and told apart where
+# there are many.
+_BALL, _POSE, _END = 0.009, 0.0054, 0.008
+_POINT, _POINT_OF_MANY = 0.0035, 0.6
+# Where a scene is cut that has a roof: so far up from the sensors, as a share of the way to it.
+_CUT = 0.5
+
+
+class View:
+    """Scene, cloud, sensors, rays and path on a page, with what one can choose about them.
+
+    Everything is drawn in the scene's local coordinates, and by one thread. What is drawn again
+    looks at first whether it has changed.
+
+    Parameters
+    ----------
+    page
+        Where they are shown.
+    scene
+        The scene; None where there is only a cloud.
+    poses
+        (p, 3) where the sensor is in the course of time, metres.
+    table
+        The columns of the cloud.
+    origin
+        World position of the local origin, (3,), metres.
+    bounds
+        Box (2, 3) of what there is to see, metres.
+    """
+
+    def __init__(
+        self,
+        page: LivePage,
+        scene: Scene | None,
+        poses: NDArray[np.float64],
+        table: Sequence[Column],
+        origin: NDArray[np.float64],
+        bounds: NDArray[np.float64],
+    ) -> None:
+        self._page, self._scene, self._poses = page, scene, poses
+        self._origin, self._ground = origin, float(bounds[0, 2])
+        self._size_m = float(np.linalg.norm(bounds[1] - bounds[0])) or 1.0
+        self._columns = {c.name: c for c in (Z, *(c for c in table if c not in AXES))}
+        self._drawn: dict[str, Hashable] = {}  # {name: what it depended on when it was drawn}
+        self._surface: Surface | None = None
+        self._mesh = MeshNode(page, "/scene")
+        self._cloud: Any = None  # viser shows no cloud without points
+        self._lines: dict[str, Any] = {}  # {name: node}; nor no lines
+        self._sensor: Any = None
+        page.frame_scene(bounds)
+        self._add_controls(bounds)
+        if len(poses):
+            self._add_poses()
+
+    def _add_controls(self, bounds: NDArray[np.float64]) -> None:
+        gui = self._page.gui
+        low, high = (bounds[:, 2] + self._origin[2]).tolist()
+        step = 10.0 ** math.floor(math.log10(max(high - low, 1e-3) / 50))
+        first, self._top = (
+            round(step * math.floor(low / step), 6),
+            round(step * (math.floor(high / step) + 1), 6),
+        )
+        self._cut: Any = gui.add_slider("cut above, m", first, self._top, step, self._top)
+        with gui.add_folder("cloud"):
+            self._show_cloud = gui.add_checkbox("show", initial_value=True)
+            self._colour = gui.add_dropdown("colour", tuple(self._columns))
+            self._point_size = gui.add_slider("point size", 0.1, 4.0, 0.1, 1.0)
+            self._cloud_legend = gui.add_html("")
+        if self._scene is not None:
+            with gui.add_folder("scene"):
+                self._show_scene = gui.add_checkbox("show", initial_value=True)
+                self._show_rays = gui.add_checkbox("rays", initial_value=True)
+                self._scene_legend = gui.add_html("")
+
+    @property
+    def cut(self) -> float | None:
+        """Height above which nothing is shown, metres; None where all is."""
+        value = self._cut.value
+        return None if value >= self._top else float(value) - float(self._origin[2])
+
+    def _changed(self, name: str, *state: Hashable) -> bool:
+        """Whether something is to be drawn that depends on this."""
+        changed = self._drawn.get(name) != state
+        self._drawn[name] = state
+        return changed
+
+    def draw_cloud(self, cloud: Cloud, version: Hashable, names: Sequence[str] = ()) -> None:
+        """Show these points.
+
+        Parameters
+        ----------
+        cloud
+            The points, world coordinates.
+        version
+            Another value where they are others than before.
+        names
+            Of the objects.
+        """
+        cut, shown = self.cut, self._show_cloud.value
+        colour, size = self._colour.value, self._point_size.value
+        if not self._changed("cloud", version, cut, shown, colour, size):
+            return
+        if not shown or not len(cloud):
+            self._cloud_legend.content = ""
+            if self._cloud is not None:
+                self._cloud.visible = False
+            return
+        column = self._columns[colour]
+        values = cloud.positions[:, 2] if column is Z else cloud[column.name]
+        colours, self._cloud_legend.content = colours_of(
+            values, column, names if column.name == "object" else ()
+        )
+        positions = (cloud.positions - self._origin).astype(np.float32)
+        if cut is not None:
+            below = positions[:, 2] <= cut
+            positions, colours = positions[below], colours[below]
+        share = min(_POINT, _POINT_OF_MANY / len(cloud) ** 0.5)
+        self._draw_points(positions, colours, share * self._size_m * size)
+
+    def _draw_points(
+        self, positions: NDArray[np.float32], colours: NDArray[np.uint8], size_m: float
+    ) -> None:
+        if self._cloud is None and len(positions):
+            self._cloud = self._page.scene.add_point_cloud(
+                "/cloud",
+                positions,
+                colours,
+                point_size=size_m,
+                point_shape="circle",
+                point_shading="flat",
+                precision="float32",
+            )
+        elif self._cloud is not None:
+            with self._page.atomic():  # else there would be points without colours for a moment
+                self._cloud.visible = len(positions) > 0
+                if len(positions):
+                    self._cloud.points = positions
+                    self._cloud.colors = colours
+                    self._cloud.point_size = size_m
+
+    def draw_scene(self, hit_counts: NDArray[Any], version: Hashable) -> None:
+        """Show the scene with the hits (f,) of each triangle; another version has other hits."""
+        self._mesh.settle()
+        if self._scene is None:
+            return
+        if self._surface is None:
+            self._surface = Surface(self._scene)
+            self._look_around(self._surface)
+        if self._changed("scene", version, self.cut):
+            colours, self._scene_legend.content = self._surface.coloured(hit_counts)
+            corners, kept = self._surface.below(self.cut)
+            self._mesh.show(corners, colours[kept], self._show_scene.value)
+        if self._changed("scene shown", self._show_scene.value):
+            self._mesh.set_visible(self._show_scene.value)
+            self._scene_legend.visible = self._show_scene.value
+
+    def _look_around(self, surface: Surface) -> None:
+        """Let one look into a building, where the sensors stand in one, and find the floor."""
+        floor, roof = surface.around(self._poses)
+        self._ground = self._ground if floor is None else floor
+        if self.cut is None and roof is not None:
+            top = float(self._poses[:, 2].max())
+            height = top + _CUT * (roof - top) + float(self._origin[2])
+            self._cut.value = min(max(height, self._cut.min), self._top)
+
+    def draw_rays(self, rays: NDArray[np.float32], version: Hashable) -> None:
+        """Show some of the rays (n, 2, 3) in local coordinates, if they end below the cut."""
+        cut, shown = self.cut, self._show_rays.value
+        if not self._changed("rays", version, cut, shown):
+            return
+        if cut is not None:
+            rays = rays[(rays[:, :, 2] <= cut).all(axis=1)]
+        self._draw_lines("/rays", rays[:: len(rays) // MOST_RAYS + 1] if shown else rays[:0])
+
+    def _draw_lines(self, name: str, lines: NDArray[np.float32]) -> None:
+        if name in self._lines:
+            self._lines[name].visible = len(lines) > 0
+            if len(lines):
+                self._lines[name].points = lines
+        elif len(lines):
+            self._lines[name] = self._page.scene.add_line_segments(
+                name, lines, _PALE, thickness=1.0, thickness_units="screen"
+            )
+
+    def place_sensor(self, position: ArrayLike) -> None:
+        """Show the sensor at a position, (3,) metres, local."""
+        if self._sensor is None:
+            self._sensor = self._page.scene.add_icosphere(
+                "/sensor", _BALL * self._size_m, _RED, cast_shadow=False
+            )
+            self._page.scene.add_label("/sensor/label", "sensor", anchor="bottom-left")
+        self._sensor.position = np.asarray(position, np.float64)
+
+    def _add_poses(self) -> None:
+        count = min(len(self._poses), MOST_POSES)
+        some = self._poses[np.linspace(0, len(self._poses) - 1, count).astype(np.int64)]
+        ball = trimesh.creation.icosphere(subdivisions=2, radius=_POSE * self._size_m)
+        self._page.scene.add_batched_meshes_simple(
+            "/poses",
+            ball.vertices,
+            ball.faces,
+            batched_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
+            batched_positions=some,
+            batched_colors=_RED,
+            lod="off",
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+
+    def draw_path(self, path: NDArray[np.float64], planning: Planning | None) -> None:
+        """Show a path, (n, 2) in metres, over the ground, and what it goes around, once."""
+        if not self._changed("path"):
+            return
+        scene, size = self._page.scene, self._size_m
+        corners = np.column_stack([path, np.full(len(path), self._ground + 0.004 * size)])
+        scene.add_line_segments(
+            "/path",
+            np.stack([corners[:-1], corners[1:]], axis=1),
+            _PATH,
+            thickness=4.0,
+            thickness_units="screen",
+        )
+        for name, at in (("start", corners[0]), ("target", corners[-1])):
+            scene.add_icosphere(f"/path/{name}", _END * size, _PATH, position=at, cast_shadow=False)
+            scene.add_label(f"/path/{name}/label", name, anchor="bottom-left")
+        if planning is None:
+            return
+        height = 0.002 * size
+        for number, ((x, y), radius) in enumerate(
+            zip(planning.centres.tolist(), planning.radii.tolist(), strict=True)
+        ):
+            scene.add_cylinder(
+                f"/discs/{number}",
+                radius,
+                height,
+                _DISC,
+                radial_segments=48,
+                opacity=0.35,
+                cast_shadow=False,
+                receive_shadow=False,
+                position=(x, y, self._ground + height / 2),
+            )
+
+
+def bounds_of(
+    scene: Scene, poses: NDArray[np.float64], planning: Planning | None
+) -> NDArray[np.float64]:
+    """Box (2, 3) that holds the scene, the sensors at (p, 3) and both ends of the path, local."""
+    places = [*scene.bounds, *poses]
+    low, high = np.min(places, axis=0), np.max(places, axis=0)
+    if planning is not None:
+        ends = np.array([planning.start, planning.target])
+        low[:2] = np.minimum(low[:2], ends.min(axis=0))
+        high[:2] = np.maximum(high[:2], ends.max(axis=0))
+    return np.stack([low, high])
