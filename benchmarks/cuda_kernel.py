@@ -92,10 +92,6 @@ class Bench:
         cupy, engine, n, repeats = self.cupy, self.engine, len(directions), self.repeats
         scan = self.whole(directions)
         parts = list(engine._made(scan))
-        tables = [cupy.asarray(directions[a:b]) for a, b in scan.chunks(engine.chunk)]
-        limits = (np.float64(0.0), np.float64(np.inf))
-        start = cupy.asarray(self.origin[None])
-        counts = cupy.zeros(engine._mesh.face_count, np.int64)
         results = [engine._cast("cast_pattern", size, rays) for _, size, rays in parts]
         hits = sum(int((place >= 0).sum()) for _, place in results)
 
@@ -103,19 +99,12 @@ class Bench:
             for _, size, rays in parts:
                 engine._cast("cast_pattern", size, rays)
 
-        def tally(every: bool) -> None:
-            for table in tables:
-                rays = (start, np.int32(0), table, np.int64(len(table)), *limits)
-                engine._tally(len(table), rays, every, counts)
-
         def pack() -> None:
             for t, place in results:
                 engine._packer().add(t, place, 0, 1.0)
 
         times = {
             "cast": milliseconds(cupy, cast, repeats),
-            "count_closest": milliseconds(cupy, lambda: tally(False), repeats),
-            "count_every": milliseconds(cupy, lambda: tally(True), repeats),
             "pack": milliseconds(cupy, pack, repeats),
             "scan_to_host": wall_milliseconds(cupy, lambda: engine.scan(scan), repeats),
         }
@@ -157,9 +146,6 @@ class Bench:
             wrong[name] = len(sample)
             if np.array_equal(scan.ray, turned.ray):
                 wrong[name] = int((scan.distance != turned.distance).sum())
-        for every in (False, True):
-            counts = [c.count(self.origin, sample, every=every) for c in (device, reference)]
-            wrong[f"counts, every {every}"] = int((counts[0] != counts[1]).sum())
         return {"sample": len(sample), "hits": int(want.hit.sum()), **wrong}
 
 

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from raybeam import Pattern, RayCaster, available_backends
-from raybeam.rays import rotated
 
 from .raycast_scenes import Job
 
@@ -103,7 +102,7 @@ class BruteForce(Engine):
         first, second, third = (job.vertices[job.faces[:, k]] for k in range(3))
         edge, other = second - first, third - first
         step = len(job.directions) // self.rays(job)
-        some = rotated(job.directions, job.rotation)[::step][: self.rays(job)]
+        some = (job.directions @ job.rotation.T)[::step][: self.rays(job)]
         away = job.origins[0] - first
         q = np.cross(away, edge)
         height = (other * q).sum(axis=1)

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from raybeam import available_backends
 from raybeam.embree_backend import EmbreeBackend
 from raybeam.mesh import local_mesh
-from raybeam.rays import rotated
 
 from .raycast_engines import BruteForce, Cast, Cuda, Embree, Engine, Numpy
 from .raycast_scenes import Job
@@ -144,7 +143,7 @@ class Warp(Engine):
             indices=warp.array(job.faces.reshape(-1), dtype=int, device=self.device),
             bvh_constructor=self.builder,
         )
-        turned = rotated(job.directions, job.rotation).astype(np.float32)
+        turned = (job.directions @ job.rotation.T).astype(np.float32)
         directions = warp.array(turned, dtype=warp.vec3, device=self.device)
         n = len(turned)
         t = warp.empty(n, dtype=float, device=self.device)
@@ -189,7 +188,7 @@ def _cast_rays(scene: Any, job: Job, origins: Any, chunk: int, threads: int) -> 
     """Loop over chunks of rays that were made before."""
     import open3d
 
-    directions = rotated(job.directions, job.rotation)
+    directions = job.directions @ job.rotation.T
     chunks = []
     for origin in origins:
         rays = np.empty((len(directions), 6), np.float32)

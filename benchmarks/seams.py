@@ -50,5 +50,5 @@ def escaped(
     leaks = 0
     for origins in (inside, inside + room * rng.uniform(-1, 1, (count, 3))):
         directions = seam_rays(*mesh, origins, count, rng)
-        leaks += count - len(caster.returns(origins, directions))
+        leaks += count - int(caster.cast(origins, directions).hit.sum())
     return leaks

@@ -28,7 +28,6 @@ import numpy as np
 from raybeam import cuda_backend, ploc
 from raybeam.layout import Layout, lay_out
 from raybeam.mesh import LocalMesh, local_mesh
-from raybeam.rays import rotated
 
 from .raycast_scenes import Job, jobs
 
@@ -60,7 +59,7 @@ def compiled(folder: Path) -> ctypes.CDLL:
 
 def count(library: ctypes.CDLL, layout: Layout, mesh: LocalMesh, job: Job) -> dict[str, float]:
     """Cast a job's rays; what was seen a ray, and the share that hit."""
-    columns = np.ascontiguousarray(rotated(job.directions, job.rotation).T)
+    columns = job.rotation @ job.directions.T
     n = columns.shape[1]
     distance, place = np.empty(n), np.empty(n, np.int32)
     before = _seen(library)

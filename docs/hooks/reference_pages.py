@@ -37,7 +37,7 @@ _FIRST = {
         *("Pool", "Partition", "Rule", "per_gpu", "per_host", "n_workers", "named", "rest"),
         *("Results", "PartitionStats", "StageStats", "Pipe", "local_cluster"),
     ),
-    "raybeam": ("RayCaster", "Pattern", "Hits", "Returns", "ScanReturns"),
+    "raybeam": ("RayCaster", "Pattern", "Hits", "ScanReturns"),
 }
 
 

@@ -2,7 +2,7 @@
 
 from .backend import BackendUnavailable
 from .caster import RayCaster
-from .hits import Hits, Returns, ScanReturns
+from .hits import Hits, ScanReturns
 from .pattern import Pattern
 from .registry import available_backends
 
@@ -11,7 +11,6 @@ __all__ = [
     "Hits",
     "Pattern",
     "RayCaster",
-    "Returns",
     "ScanReturns",
     "available_backends",
 ]

@@ -5,9 +5,9 @@ from __future__ import annotations
 from operator import index
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from .hits import Hits, Returns, ScanReturns
+from .hits import Hits, ScanReturns
 from .mesh import local_mesh
 from .pattern import Pattern
 from .rays import check_rays
@@ -38,7 +38,7 @@ class RayCaster:
     Raises
     ------
     ValueError
-        If the mesh is empty, not finite, of a wrong shape, or has faces without vertices.
+        If the mesh is not finite, of a wrong shape, has faces without vertices, or no area.
     BackendUnavailable
         If the backend asked for cannot be used; the message says what to install.
 
@@ -106,19 +106,6 @@ class RayCaster:
         """
         return self._engine.cast(check_rays(origins, directions, t_min, t_max))
 
-    def returns(
-        self,
-        origins: ArrayLike,
-        directions: ArrayLike,
-        t_min: float = 0.0,
-        t_max: float = np.inf,
-    ) -> Returns:
-        """Closest hits of the rays that have one; less to make and to move than `cast`.
-
-        Parameters and errors are those of `cast`.
-        """
-        return self._engine.returns(check_rays(origins, directions, t_min, t_max))
-
     def scan(
         self,
         pattern: Pattern,
@@ -168,8 +155,6 @@ class RayCaster:
             If a position is not finite, a rotation is none, the poses do not suffice for the
             rays, the window's ends are no rows, there are more than 2**32 rays, or the groups
             do not ascend from 0.
-        TypeError
-            If the pattern is none, or what should be a whole number is not.
 
         Examples
         --------
@@ -196,31 +181,3 @@ class RayCaster:
                 tally=tally,
             )
         )
-
-    def count(
-        self,
-        origins: ArrayLike,
-        directions: ArrayLike,
-        t_min: float = 0.0,
-        t_max: float = np.inf,
-        *,
-        every: bool = False,
-    ) -> NDArray[np.int64]:
-        """How many of the rays hit each triangle: (face_count,).
-
-        Parameters and errors are those of `cast`, and:
-
-        Parameters
-        ----------
-        every
-            Count a ray for every triangle that it meets, not only for the closest. Of triangles
-            that a ray meets at one distance, as at a common edge, all are counted; the embree
-            backend counts one of them.
-
-        Examples
-        --------
-        >>> caster = RayCaster([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], backend="numpy")
-        >>> caster.count([0.25, 0.25, 3], [[0, 0, -1], [0, 0, 1]]).tolist()
-        [1]
-        """
-        return self._engine.count(check_rays(origins, directions, t_min, t_max), every)

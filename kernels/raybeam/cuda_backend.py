@@ -4,30 +4,32 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any, ClassVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
-from . import cuda_scene
+from . import cuda_build
 from .backend import Backend, Found
-from .collector import Collector
 from .cuda_module import Kernels, options
 from .cuda_results import Packer, PinnedRoom
-from .cuda_scene import WORK, free, sent
-from .hits import Returns, ScanReturns
-from .memory import lacking
+from .hits import ScanReturns
+from .layout import Layout, lay_out
+from .memory import require
 from .mesh import LocalMesh
 from .pattern import Pattern
 from .rays import Rays
-from .scan import Scan
+from .scan import Collector, Scan
 
 _STACK_STEP = 32
-_RAY_BYTES = 104  # a ray of a chunk: origin, direction, hit with its weights, sums; 101 and room
 _MOST_INT = (1 << 31) - 1  # rays of a pose, as intersect.cu is told: more than a chunk has
 _KEEP = 1 << 30  # bytes of hits that wait on the device, at most
+# Bytes left free for a chunk of rays and for the walk's stacks, of which each resident thread has
+# one: 2048 for each of 132 multiprocessors, 64 places of 8 bytes, are 138 MB.
+_WORK = 3 << 28
+_LAYOUT_BYTES = 330  # on the host a triangle, at the peak of a build by NumPy, the mesh apart
+_TABLE_BYTES = 124  # on the device a triangle in the finished tables, the nodes apart
 
 
 class CudaBackend(Backend):
@@ -77,11 +79,11 @@ class CudaBackend(Backend):
         self._cupy = cupy = self._library()
         self._device = _device(cupy, device)
         with self._device:
-            tables = cuda_scene.make(cupy, self._device.id, mesh, self.device_build)
+            tables = self._built()
             # In steps, so that scenes share what is compiled.
             self._stack = -(-max(tables.stack, 1) // _STACK_STEP) * _STACK_STEP
             self._kernels = Kernels(cupy, self._device.id, "intersect.cu", flags(self._stack))
-            self._keep = max(0, min(_KEEP, (free(cupy) - WORK) // 4))
+            self._keep = max(0, min(_KEEP, (self._free() - _WORK) // 4))
             cupy.cuda.get_current_stream().synchronize()
         self._corners, self._faces, self._frame = tables.corners, tables.faces, tables.frame
         self._scene = (tables.nodes, tables.triangles, tables.corners, tables.faces, tables.frame)
@@ -96,79 +98,65 @@ class CudaBackend(Backend):
 
         return cupy
 
-    @contextmanager
-    def _on_device(self, rays: int) -> Iterator[None]:
-        """Switch to the device; what it has no memory for is told in both numbers."""
-        with self._device:
-            try:
-                yield
-            except self._cupy.cuda.memory.OutOfMemoryError as error:
-                need = _RAY_BYTES * min(rays, self.chunk) + 8 * self._mesh.face_count + self._keep
-                what = f"On CUDA device {self._device.id} a cast of {rays:,} rays"
-                instead = "free some, or use another device or backend 'embree'"
-                raise MemoryError(lacking(need, free(self._cupy), what, instead)) from error
-
-    def closest(self, rays: Rays, weights: bool) -> Found:
+    def closest(self, rays: Rays) -> Found:
         """See `Backend.closest`."""
-        cp = self._cupy
-        with self._on_device(len(rays)):
-            table = self._table(rays)
-            t, place = self._cast("cast_table", len(rays), self._limited(table, rays))
+        cp, n = self._cupy, len(rays)
+        with self._device:
+            stride = np.int32(0 if len(rays.origins) == 1 else 3)
+            table = (cp.asarray(rays.origins), stride, cp.asarray(rays.directions))
+            limits = (np.float64(t * self._mesh.scale) for t in (rays.t_min, rays.t_max))
+            t, place = self._cast("cast_table", n, (*table, np.int64(n), *limits))
             ray, *hits = self._packer().add(t, place, 0, 1.0)
-            u = v = cp.empty(0)
-            if weights:
-                u, v = cp.empty(len(ray)), cp.empty(len(ray))
-                given = (self._corners, self._frame, *table, ray, place, np.int64(len(ray)))
-                self._kernels.run("weigh_table", len(ray), *given, u, v)
+            u, v = cp.empty(len(ray)), cp.empty(len(ray))
+            given = (self._corners, self._frame, *table, ray, place, np.int64(len(ray)))
+            self._kernels.run("weigh_table", len(ray), *given, u, v)
             return Found(*(array.get() for array in (ray, *hits, u, v)))
-
-    def along(self, rays: Rays) -> NDArray[np.int32]:
-        """See `Backend.along`."""
-        triangles = np.arange(self._mesh.face_count, dtype=np.int32)
-        return np.repeat(triangles, self.count(rays, every=True))
-
-    def returns(self, rays: Rays) -> Returns:
-        """See `Backend.returns`."""
-        with self._on_device(len(rays)):
-            packer = self._packer()
-            for start in range(0, len(rays), self.chunk):
-                part = rays.part(start, start + self.chunk)
-                given = self._limited(self._table(part), part)
-                packer.add(*self._cast("cast_table", len(part), given), start, self._mesh.scale)
-            return packer.returns()
 
     def scan(self, scan: Scan) -> ScanReturns:
         """See `Backend.scan`; the rays are made on the device, hits are chosen on the host."""
-        with self._on_device(len(scan)):
+        with self._device:
             packer = self._packer()
             for start, n, rays in self._made(scan):
                 packer.add(*self._cast("cast_pattern", n, rays), start, self._mesh.scale)
-            found = packer.returns()
+            ray, distance, triangle = packer.returns()
         collector = Collector(scan, self._mesh.face_count)
-        collector.tally(found.triangle)
-        kept = collector.keep(found.ray, 0, len(scan))
-        collector.add(Returns(found.ray[kept], found.distance[kept], found.triangle[kept]))
+        collector.tally(triangle)
+        kept = collector.keep(ray, 0, len(scan))
+        collector.add(0, ray[kept], distance[kept], triangle[kept])
         return collector.result()
 
-    def count(self, rays: Rays, every: bool) -> NDArray[np.int64]:
-        """See `Backend.count`; only the counts leave the device."""
-        with self._on_device(len(rays)):
-            counts = self._cupy.zeros(self._mesh.face_count, np.int64)
-            for start in range(0, len(rays), self.chunk):
-                part = rays.part(start, start + self.chunk)
-                given = self._limited(self._table(part), part)
-                self._tally(len(part), given, every, counts)
-            return self._cupy.asnumpy(counts)
+    # ---- the scene ----
 
-    # ---- arguments of the kernels ----
+    def _built(self) -> Layout:
+        """Build the tables on the device where that is faster, and where there is memory for it.
 
-    def _table(self, rays: Rays) -> tuple[Any, ...]:
-        stride = np.int32(0 if len(rays.origins) == 1 else 3)
-        return self._cupy.asarray(rays.origins), stride, self._cupy.asarray(rays.directions)
+        Raises MemoryError if even the finished tables do not fit the device, or their making the
+        host.
+        """
+        cupy, mesh, there = self._cupy, self._mesh, self._free()
+        n = len(mesh.corners)
+        if n >= self.device_build and cuda_build.BYTES * n + _WORK <= there:
+            tables = cuda_build.build(cupy, self._device.id, mesh)
+            cupy.get_default_memory_pool().free_all_blocks()  # several times what is kept
+            return tables
+        need = _TABLE_BYTES * n + _WORK
+        if need > there:  # before NumPy builds for minutes
+            raise MemoryError(
+                f"The mesh needs {need / 2**20:.0f} MiB on the CUDA device and "
+                f"{there / 2**20:.0f} MiB are free: use a smaller mesh or backend 'embree'."
+            )
+        require(_LAYOUT_BYTES * n, f"The tree over {n:,} triangles")
+        made = lay_out(mesh)
+        given = (made.nodes, made.triangles, made.corners, made.faces, made.frame)
+        nodes, triangles, corners, faces, frame = (_sent(cupy, table) for table in given)
+        return Layout(nodes, triangles, corners, faces, frame, made.stack)
 
-    def _limited(self, table: tuple[Any, ...], rays: Rays) -> tuple[Any, ...]:
-        limits = (np.float64(t * self._mesh.scale) for t in (rays.t_min, rays.t_max))
-        return (*table, np.int64(len(rays)), *limits)
+    def _free(self) -> int:
+        """Bytes that can be had on the device."""
+        pool = self._cupy.get_default_memory_pool()
+        return int(self._cupy.cuda.runtime.memGetInfo()[0] + pool.free_bytes())
+
+    # ---- casts ----
 
     def _made(self, scan: Scan) -> Iterator[tuple[int, int, tuple[Any, ...]]]:
         """Chunks of a scan: number of the first ray, how many, and arguments for cast_pattern."""
@@ -199,13 +187,11 @@ class CudaBackend(Backend):
         cupy, kept = self._cupy, self._patterns.get(pattern)
         if kept is None:
             tables = _tables(pattern)
-            if sum(table.nbytes for table in tables) + self._keep + WORK > free(cupy):
+            if sum(table.nbytes for table in tables) + self._keep + _WORK > self._free():
                 return None
             # Two threads may both come here: then the second copy is kept, and both are right.
-            kept = self._patterns[pattern] = tuple(sent(cupy, table) for table in tables)
+            kept = self._patterns[pattern] = tuple(_sent(cupy, table) for table in tables)
         return kept
-
-    # ---- casts ----
 
     def _packer(self) -> Packer:
         return Packer(self._cupy, self._kernels, self._faces, self._room, self._keep)
@@ -215,14 +201,6 @@ class CudaBackend(Backend):
         t, place = self._cupy.empty(n), self._cupy.empty(n, np.int32)
         self._kernels.run(kernel, n, *self._scene, *rays, t, place)
         return t, place
-
-    def _tally(self, n: int, rays: tuple[Any, ...], every: bool, counts: Any) -> None:
-        """Add to the counts of a chunk's triangles."""
-        if every:
-            self._kernels.run("count_table", n, *self._scene, *rays, counts)
-            return
-        _, place = self._cast("cast_table", n, rays)
-        self._kernels.run("count_closest", n, self._faces, place, np.int64(n), counts)
 
 
 def _tables(pattern: Pattern) -> tuple[NDArray[np.float64], ...]:
@@ -254,3 +232,19 @@ def _device(cupy: Any, number: int | None) -> Any:
     if number is not None and not 0 <= number < count:
         raise ValueError(f"There is no CUDA device {number}: this process sees {count}, from 0.")
     return cupy.cuda.Device(number)
+
+
+def _sent(cupy: Any, array: NDArray[Any]) -> Any:
+    """Copy an array to the current device, and wait for that.
+
+    A device that reads ordinary memory itself, as Grace Hopper does, may still be about to read
+    when `set` returns: the caller may let go of the array once this has returned.
+
+    Not by `asarray`, which copies by way of page-locked memory as large as the array and keeps
+    that: right for the rays of a chunk, too much for a scene.
+    """
+    copy = cupy.empty(array.shape, array.dtype)
+    if array.size:
+        copy.set(array)
+        cupy.cuda.get_current_stream().synchronize()
+    return copy

@@ -9,25 +9,13 @@ import numpy as np
 
 from . import ploc
 from .cuda_module import Kernels, options
-from .layout import FLOOR, LEAF_SIZE, UNIT
+from .layout import FLOOR, LEAF_SIZE, UNIT, Layout
 from .mesh import LocalMesh
 from .tree import PAD
 
 BYTES = 400  # on the device a triangle, at the peak of a build, the finished tables included
 _RADIUS = 8  # as in ploc.py: both builds give the same tree
 _PAIRS = 32  # bits above which build.cu's sums hold the number of pairs
-
-
-@dataclass(frozen=True)
-class Tables:
-    """A scene on the device: the arrays of `layout.Layout`, in the device's memory."""
-
-    nodes: Any
-    triangles: Any
-    corners: Any
-    faces: Any
-    frame: Any
-    stack: int
 
 
 @dataclass(frozen=True)
@@ -53,7 +41,7 @@ def flags() -> tuple[str, ...]:
     return options(RADIUS=_RADIUS, LEAF_SIZE=LEAF_SIZE, PAD=PAD, UNIT=UNIT, FLOOR=FLOOR)
 
 
-def build(cupy: Any, device: int, mesh: LocalMesh) -> Tables:
+def build(cupy: Any, device: int, mesh: LocalMesh) -> Layout:
     """Build the tables of a mesh on the current device: bit for bit those of `layout.lay_out`.
 
     Parameters
@@ -80,7 +68,7 @@ def build(cupy: Any, device: int, mesh: LocalMesh) -> Tables:
     points = corners.reshape(-1, 3)
     low, high = cupy.asnumpy(points.min(axis=0)), cupy.asnumpy(points.max(axis=0))
     frame = np.concatenate([mesh.centre, [mesh.scale], low - PAD, high + PAD])
-    return Tables(nodes, records, placed, faces, cupy.asarray(frame), stack)
+    return Layout(nodes, records, placed, faces, cupy.asarray(frame), stack)
 
 
 def _order(cp: Any, kernels: Kernels, corners: Any) -> Any:
@@ -137,7 +125,7 @@ def _crown(
     pairs, rounds = ploc.crown(low, high, bits[:, 7] >> 1, cp.asnumpy(ids), made)
     n = len(children)
     if len(pairs):
-        # Not by `set`, which may read them when they are gone already (cuda_scene.sent).
+        # Not by `set`, which may read them when they are gone already (_sent of cuda_backend.py).
         children[made - n : made - n + len(pairs)] = cp.asarray(pairs)
     for start, stop in rounds:
         nodes = (np.int32(start), np.int32(stop - start), np.int32(n))

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .cuda_module import Kernels
-from .hits import Gathering, Returns
+from .hits import Part, joined
 
 _PINNED = 1 << 30  # bytes that are page-locked, at most
 _LEAST = 1 << 16
@@ -100,7 +100,7 @@ class Packer:
         self._limit = limit
         self._waiting: list[tuple[Any, ...]] = []  # on the device: ray, distance, triangle
         self._bytes = 0
-        self._fetched = Gathering()
+        self._fetched: list[Part] = []
 
     def add(self, distance: Any, place: Any, first: int, scale: float) -> tuple[Any, ...]:
         """Take the results of a cast, one entry a ray; distances are divided by `scale`.
@@ -120,14 +120,14 @@ class Packer:
             self._fetch()
         return hits
 
-    def returns(self) -> Returns:
+    def returns(self) -> Part:
         """Everything taken, on the host."""
         self._fetch()
-        return self._fetched.returns()
+        return joined(self._fetched)
 
     def _fetch(self) -> None:
         total = sum(len(ray) for ray, _, _ in self._waiting)
-        arrays = tuple(self._room.empty(total, dtype) for dtype in _DTYPES)
+        ray, distance, triangle = arrays = [self._room.empty(total, dtype) for dtype in _DTYPES]
         start = 0
         for parts in self._waiting:
             stop = start + len(parts[0])
@@ -137,5 +137,5 @@ class Packer:
                     # used by another stream, once this returns.
                     part.get(out=array[start:stop])
             start = stop
-        self._fetched.add(Returns(*arrays))
+        self._fetched.append((ray, distance, triangle))
         self._waiting, self._bytes = [], 0

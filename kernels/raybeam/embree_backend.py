@@ -11,15 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .backend import Backend, Found
-from .clip import clip
-from .collector import Collector
-from .hits import Returns, ScanReturns
+from .hits import ScanReturns
 from .memory import require
 from .mesh import LocalMesh
 from .rays import Rays
 from .refine import Refiner
-from .scan import Scan
-from .tree import PAD
+from .scan import Collector, Scan
 from .workspace import Starts, Workspace
 
 Float = NDArray[np.float64]
@@ -48,26 +45,23 @@ _BYTES = 300
 class _Limits:
     """Limits of distances, in local units.
 
-    The rough ones are numbers of float32, so that one in float32 and one in float64 compare alike.
+    Attributes
+    ----------
+    t_min, t_max
+        Hits between these count.
+    near
+        A rough distance behind this is not before `t_min`.
+    far
+        A rough distance before this is not behind `t_max`.
+    last
+        A rough distance behind this is behind `t_max`.
     """
 
     t_min: float
     t_max: float
-
-    @property
-    def near(self) -> float:
-        """A rough distance behind this is not before `t_min`."""
-        return _rounded(self.t_min + _CLEAR)
-
-    @property
-    def far(self) -> float:
-        """A rough distance before this is not behind `t_max`."""
-        return _rounded(self.t_max - _CLEAR)
-
-    @property
-    def last(self) -> float:
-        """A rough distance behind this is behind `t_max`."""
-        return _rounded(self.t_max + _CLEAR)
+    near: float
+    far: float
+    last: float
 
 
 @dataclass(frozen=True)
@@ -124,39 +118,30 @@ class EmbreeBackend(Backend):
 
         super().__init__(mesh, threads, device)
         n = len(mesh.corners)
-        require(_BYTES * n, f"Embree's tree over {n:,} triangles", "use a smaller mesh")
+        require(_BYTES * n, f"Embree's tree over {n:,} triangles")
         self._threads = threads or 0  # 0: Open3D takes every core
         self._tensor = open3d.core.Tensor.from_numpy
-        self._scene: Any = None
-        if len(mesh.corners):  # an empty scene is an error to Open3D
-            points = mesh.corners.reshape(-1, 3).astype(np.float32)
-            rows = np.arange(len(points), dtype=np.uint32).reshape(-1, 3)
-            self._scene = open3d.t.geometry.RaycastingScene(nthreads=self._threads)
-            self._scene.add_triangles(self._tensor(points), self._tensor(rows))
+        points = mesh.corners.reshape(-1, 3).astype(np.float32)
+        rows = np.arange(len(points), dtype=np.uint32).reshape(-1, 3)
+        self._scene = open3d.t.geometry.RaycastingScene(nthreads=self._threads)
+        self._scene.add_triangles(self._tensor(points), self._tensor(rows))
         self._refine = Refiner(mesh)
-        low, high = mesh.box
-        self._low, self._high = low - PAD, high + PAD
         self._local = threading.local()  # threads of one worker may cast at the same time
 
-    def closest(self, rays: Rays, weights: bool) -> Found:
+    def closest(self, rays: Rays) -> Found:
         """See `Backend.closest`."""
-        u = v = none = np.zeros(0)
-        if self._scene is None or not len(rays):
-            return Found(none.astype(np.intp), none, none.astype(np.int32), u, v)
         desk, limits = self._desk(len(rays)), self._limits(rays.t_min, rays.t_max)
         unit, starts = desk.aim(rays.directions), Starts(self._mesh.to_local(rays.origins))
         hits = self._within(desk, unit, starts, limits)
         t, place = self._distance(hits, hits.ray, unit, starts, limits)
-        if weights:
-            at = starts.of(hits.ray)
-            u, v = self._refine.weights(at, rays.directions[hits.ray], place)
+        u, v = self._refine.weights(starts.of(hits.ray), rays.directions[hits.ray], place)
         return Found(hits.ray, t, self._mesh.index[place], u, v)
 
     def scan(self, scan: Scan) -> ScanReturns:
         """See `Backend.scan`; rays are made where Embree reads them, a chunk at a time."""
         collector = Collector(scan, self._mesh.face_count)
         limits = self._limits(scan.t_min, scan.t_max)
-        for start, stop in scan.chunks(self.chunk) if self._scene is not None else ():
+        for start, stop in scan.chunks(self.chunk):
             desk = self._desk(stop - start)
             unit, starts = desk.make(scan, start, stop, self._mesh)
             hits = self._within(desk, unit, starts, limits)
@@ -165,46 +150,20 @@ class EmbreeBackend(Backend):
             kept = hits.ray[collector.keep(hits.ray, start, stop)]
             t, place = self._distance(hits, kept, unit, starts, limits)
             t /= self._mesh.scale
-            ray = kept.astype(np.uint32)
-            ray += np.uint32(start)
-            collector.add(Returns(ray, t, self._mesh.index.take(place)))
+            collector.add(start, kept, t, self._mesh.index.take(place))
         return collector.result()
 
-    def along(self, rays: Rays) -> NDArray[np.int32]:
-        """See `Backend.along`; of triangles at one distance Open3D lists one."""
-        if self._scene is None or not len(rays):
-            return np.zeros(0, np.int32)
-        origins, scale = self._mesh.to_local(rays.origins), self._mesh.scale
-        entry, _ = clip(self._low, self._high, origins, rays.directions)
-        rows = np.empty((len(rays), 6), np.float32)
-        rows[:, :3] = np.clip(origins + entry[:, None] * rays.directions, -_NEAR, _NEAR)
-        rows[:, 3:] = rays.directions
-        answer = self._scene.list_intersections(self._tensor(rows), nthreads=self._threads)
-        ray = answer["ray_ids"].numpy().astype(np.intp)
-        place = answer["primitive_ids"].numpy().astype(np.intp)
-        rough = answer["t_hit"].numpy() + entry.take(ray)
-        unit = rays.directions.take(ray, axis=0).T
-        t = self._refine.distance(_of(origins, ray), unit, place, rough)
-        hit = (t >= rays.t_min * scale) & (t <= rays.t_max * scale)
-        found: NDArray[np.int32] = self._mesh.index[place[hit]]
-        return found
-
     def _limits(self, t_min: float, t_max: float) -> _Limits:
-        return _Limits(t_min * self._mesh.scale, t_max * self._mesh.scale)
+        t_min, t_max = t_min * self._mesh.scale, t_max * self._mesh.scale
+        # Numbers of float32, so that distances in float32 and in float64 compare with them alike.
+        with np.errstate(over="ignore"):
+            rough = np.array([t_min + _CLEAR, t_max - _CLEAR, t_max + _CLEAR]).astype(np.float32)
+        return _Limits(t_min, t_max, *rough.tolist())
 
     def _within(self, desk: Workspace, unit: Float, starts: Starts, limits: _Limits) -> _Hits:
         """Closest hits, refined where that decides whether they count; see `_CLEAR`.
 
-        Parameters
-        ----------
-        desk
-            Its rows hold the directions already.
-        unit
-            (3, n): the same directions in float64; they stay as they are.
-        starts
-            Of the rays.
-        limits
-            Between which hits count.
+        The rows of `desk` hold the directions already; `unit`, (3, n), are the same in float64.
         """
         t, place = self._cast(desk, unit, starts, 0.0)
         counts = t < np.inf if limits.last == np.inf else t <= limits.last
@@ -235,9 +194,7 @@ class EmbreeBackend(Backend):
     ) -> tuple[NDArray[np.intp], Float, NDArray[np.uint32]]:
         """Find the next hits, behind `t_min`, of rays that hit something before.
 
-        Returns
-        -------
-        Numbers of the rays that have one, in any order; refined distances; places.
+        Returns the rays that have one, in any order; refined distances; places.
         """
         rays, distances, places = [], [], []
         for ahead in _STARTS:
@@ -260,18 +217,13 @@ class EmbreeBackend(Backend):
     ) -> tuple[NDArray[np.floating[Any]], NDArray[np.uint32]]:
         """Closest hits at or behind a distance `begin`, up to float32 rounding; see `_within`.
 
-        Returns
-        -------
-        t
-            (n,): rough distances, local; inf for a miss.
-        place
-            uint32 (n,): rows of the mesh's corners.
+        Returns rough distances (n,), local, inf for a miss; and rows of the mesh's corners (n,).
         """
         n = unit.shape[1]
         ways: Float | None = None
         if begin > 0 or np.abs(starts.points).max() > _NEAR:
             points = starts.of(np.arange(n))
-            entry, _ = clip(self._low, self._high, points, unit.T)
+            entry, _ = self._mesh.clip(points, unit.T)
             near = np.abs(points).max(axis=1) <= _NEAR
             ways = np.maximum(np.where(near, 0, entry), begin)
             # From so far away that float64 cannot place the start, it stays near the scene.
@@ -321,14 +273,3 @@ def _columns_of(unit: Float, ray: NDArray[np.intp]) -> Float:
     for row, axis in zip(unit, out, strict=True):
         row.take(ray, out=axis, mode="clip")  # the mode in which it writes straight to `out`
     return out
-
-
-def _rounded(t: float) -> float:
-    """Return a number of float32 near a distance; inf stays inf."""
-    with np.errstate(over="ignore"):
-        return float(np.float32(t))
-
-
-def _of(values: Float, rows: NDArray[np.intp]) -> Float:
-    """Rows of what is either one for all or one a ray."""
-    return values if len(values) == 1 else values.take(rows, axis=0)

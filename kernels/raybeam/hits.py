@@ -7,11 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .memory import Meter
-
-RAY_BYTES = 28  # a ray in `Hits`
-HIT_BYTES = 16  # a hit in `Returns`
-MOST_RAYS = 1 << 32  # in one call, for their numbers in `Returns` to fit
+# Ray, distance and triangle of some hits, as in `ScanReturns`.
+Part = tuple[NDArray[np.uint32], NDArray[np.float64], NDArray[np.int32]]
 
 
 @dataclass(frozen=True)
@@ -46,28 +43,6 @@ class Hits:
 
 
 @dataclass(frozen=True)
-class Returns:
-    """Only the rays that hit, in ray order: what a lidar reports.
-
-    Attributes
-    ----------
-    ray
-        uint32 (k,): number of the ray, ascending.
-    distance
-        float64 (k,): as in `Hits`, metres.
-    triangle
-        int32 (k,): as in `Hits`.
-    """
-
-    ray: NDArray[np.uint32]
-    distance: NDArray[np.float64]
-    triangle: NDArray[np.int32]
-
-    def __len__(self) -> int:
-        return len(self.ray)
-
-
-@dataclass(frozen=True)
 class ScanReturns:
     """What a scan found: the hits that are kept of it, in ray order, and counts of all hits.
 
@@ -96,25 +71,10 @@ class ScanReturns:
         return len(self.ray)
 
 
-class Gathering:
-    """Hits found part after part, to be joined when all are there."""
-
-    def __init__(self) -> None:
-        self._parts: list[Returns] = []
-        self._meter = Meter("Joining the hits", "cast fewer rays at a time")
-
-    def add(self, part: Returns) -> None:
-        """Take in the next hits; raises MemoryError when they could not be joined any more."""
-        self._parts.append(part)
-        self._meter.add(HIT_BYTES * len(part))
-
-    def returns(self) -> Returns:
-        """All hits, in the order in which they were added."""
-        if len(self._parts) == 1:
-            return self._parts[0]
-        parts = [Returns(np.zeros(0, np.uint32), np.zeros(0), np.zeros(0, np.int32)), *self._parts]
-        return Returns(
-            np.concatenate([part.ray for part in parts]),
-            np.concatenate([part.distance for part in parts]),
-            np.concatenate([part.triangle for part in parts]),
-        )
+def joined(parts: list[Part]) -> Part:
+    """Hits that were found part after part, in that order; a single part is not copied."""
+    if len(parts) == 1:
+        return parts[0]
+    parts = [(np.zeros(0, np.uint32), np.zeros(0), np.zeros(0, np.int32)), *parts]
+    ray, distance, triangle = map(np.concatenate, zip(*parts, strict=True))
+    return ray, distance, triangle

@@ -2,14 +2,13 @@
 //
 // Compiled by NVRTC, which has no standard headers, so there are none here; the tests compile the
 // same text for the CPU. One thread a ray, blocks of 128 threads, a grid of one dimension.
-// STACK (a number) is defined on the command line: places for nodes that wait their turn. BLOCKS
-// may be: blocks that must find room on a multiprocessor, which bounds the registers of a thread.
+// STACK (a number) is defined on the command line: places for nodes that wait their turn.
 //
-// Threads know nothing of each other: no shared memory, no barriers, no votes of a warp, so it
-// does not matter which of them run together. All that they share is counted by atomics, in whole
-// numbers, so the order does not matter either. Offsets into tables are 64 bits wide; what an int
-// holds is bounded by layout: fewer than 2^28 triangles, so places shifted by LEAF_BITS fit, and
-// the greatest code of a leaf is not DONE. A chunk of rays is far below 2^31 (cuda_backend.py).
+// Threads know nothing of each other: no shared memory, no barriers, no votes of a warp, no
+// atomics, so it does not matter which of them run together. Offsets into tables are 64 bits wide;
+// what an int holds is bounded by layout: fewer than 2^28 triangles, so places shifted by LEAF_BITS
+// fit, and the greatest code of a leaf is not DONE. A chunk of rays is far below 2^31
+// (cuda_backend.py).
 // Tables of float4 are allocations of their own, which the device aligns to 256 bytes.
 //
 // CuPy adds -ftz=true: what is not normal in float counts as zero. The bands below have room for
@@ -35,13 +34,8 @@
 // Comparisons are written so that one with NaN is false, and false means "no hit".
 
 typedef long long Count;
-typedef unsigned long long Sum;
 
-#ifdef BLOCKS
-#define BOUNDS __launch_bounds__(128, BLOCKS)
-#else
-#define BOUNDS __launch_bounds__(128)
-#endif
+#define KERNEL extern "C" __global__ void __launch_bounds__(128)
 
 // What is counted when this runs on the CPU; on a device, nothing.
 #ifndef SEEN
@@ -386,8 +380,6 @@ __device__ __forceinline__ bool may_hit(const float4* record, const Walk& w, Gue
     return true;
 }
 
-// ---- what is made of hits ----
-
 // Finds the closest hit: local distance, and place in the tables (-1: none yet).
 //
 // The test that decides costs as much as several nodes, and the rays of a warp come to their
@@ -402,9 +394,7 @@ struct Closest {
     __device__ __forceinline__ Closest(double t_max) : t(t_max), place(-1), one(-1), two(-1) {}
 
     // Take in a triangle; false when there is no room for another.
-    template <class Rays>
-    __device__ __forceinline__ bool offer(
-        const Scene&, const Rays&, Count, int at, const Guess& guess, double, Walk& w)
+    __device__ __forceinline__ bool offer(int at, const Guess& guess, Walk& w)
     {
         if (guess.sure) w.to = fminf(w.to, guess.far);
         if (one >= 0 && near_one > w.to) one = -1;
@@ -443,39 +433,12 @@ struct Closest {
     }
 };
 
-// Counts every triangle on the way, by the caller's number.
-struct Tally {
-    double t_max;
-    Sum* counts;
-
-    template <class Rays>
-    __device__ __forceinline__ bool offer(
-        const Scene& scene, const Rays& rays, Count i, int at, const Guess& guess, double t_min,
-        Walk& w)
-    {
-        bool hit = guess.sure && guess.far < w.to - 16.0f * SLACK;
-        if (!hit) {
-            Exact found;
-            hit = decide(scene, rays.load(scene, i), at, found) && found.t >= t_min &&
-                  found.t <= t_max;
-        }
-        if (hit) atomicAdd(counts + scene.faces[at], 1ull);
-        return true;
-    }
-
-    template <class Rays>
-    __device__ __forceinline__ void settle(
-        const Scene&, const Rays&, Count, double, Walk&)
-    {
-    }
-};
-
-// Offer the taker all triangles that the ray may hit and that may still be of use. Nodes and
+// Offer all triangles that the ray may hit and that may still be of use. Nodes and
 // triangles have loops of their own (Aila and Laine, 2009), so that the rays of a warp do the same
 // work at a time.
-template <class Rays, class Taker>
+template <class Rays>
 __device__ __forceinline__ void walk(
-    const Scene& scene, const Rays& rays, Count i, double t_min, double t_max, Taker& taker)
+    const Scene& scene, const Rays& rays, Count i, double t_min, double t_max, Closest& best)
 {
     Walk w;
     if (!begin(scene, rays.load(scene, i), t_min, t_max, w)) return;
@@ -489,13 +452,13 @@ __device__ __forceinline__ void walk(
                 const int leaf = ~node, place = leaf >> LEAF_BITS;
                 Guess guess;
                 if (may_hit(scene.triangles + 3 * (Count)place, w, guess))
-                    room = taker.offer(scene, rays, i, place, guess, t_min, w);
+                    room = best.offer(place, guess, w);
                 // The rest of the leaf, one triangle on and one less.
                 const bool more = leaf & ((1 << LEAF_BITS) - 1);
                 node = more ? ~(leaf + (1 << LEAF_BITS) - 1) : pop(stack, top, w.to);
             }
         }
-        taker.settle(scene, rays, i, t_min, w);
+        best.settle(scene, rays, i, t_min, w);
     } while (node != DONE);
 }
 
@@ -503,7 +466,7 @@ __device__ __forceinline__ void walk(
 
 // Closest hits of rays from memory: local distance and place in the tables; -1 for a miss, whose
 // distance is not written.
-extern "C" __global__ void BOUNDS cast_table(
+KERNEL cast_table(
     const float4* __restrict__ nodes, const float4* __restrict__ triangles,
     const double* __restrict__ corners, const int* __restrict__ faces,
     const double* __restrict__ frame,
@@ -522,7 +485,7 @@ extern "C" __global__ void BOUNDS cast_table(
 }
 
 // Closest hits of a pattern's rays from one pose after another; the rest as in cast_table.
-extern "C" __global__ void BOUNDS cast_pattern(
+KERNEL cast_pattern(
     const float4* __restrict__ nodes, const float4* __restrict__ triangles,
     const double* __restrict__ corners, const int* __restrict__ faces,
     const double* __restrict__ frame,
@@ -544,7 +507,7 @@ extern "C" __global__ void BOUNDS cast_pattern(
 }
 
 // Weights of the second and third corner for hits of cast_table, one a ray that is listed.
-extern "C" __global__ void BOUNDS weigh_table(
+KERNEL weigh_table(
     const double* __restrict__ corners, const double* __restrict__ frame,
     const double* __restrict__ origins, int origin_stride,
     const double* __restrict__ directions,
@@ -561,37 +524,11 @@ extern "C" __global__ void BOUNDS weigh_table(
     v[k] = hit.c / hit.det;
 }
 
-// Count every triangle along rays from memory.
-extern "C" __global__ void BOUNDS count_table(
-    const float4* __restrict__ nodes, const float4* __restrict__ triangles,
-    const double* __restrict__ corners, const int* __restrict__ faces,
-    const double* __restrict__ frame,
-    const double* __restrict__ origins, int origin_stride,
-    const double* __restrict__ directions, Count count, double t_min, double t_max,
-    Sum* __restrict__ counts)
-{
-    const Count i = blockIdx.x * (Count)blockDim.x + threadIdx.x;
-    if (i >= count) return;
-    const Scene scene = {nodes, triangles, corners, faces, frame};
-    const TableRays rays = {origins, origin_stride, directions};
-    Tally tally = {t_max, counts};
-    walk(scene, rays, i, t_min, t_max, tally);
-}
-
-// ---- kernels: hits of a cast made smaller ----
-
-// Count the triangles of closest hits.
-extern "C" __global__ void BOUNDS count_closest(
-    const int* __restrict__ faces, const int* __restrict__ place, Count count,
-    Sum* __restrict__ counts)
-{
-    const Count i = blockIdx.x * (Count)blockDim.x + threadIdx.x;
-    if (i < count && place[i] >= 0) atomicAdd(counts + faces[place[i]], 1ull);
-}
+// ---- hits of a cast made smaller ----
 
 // Close up hits, in ray order: number of the ray, distance in metres, the caller's triangle.
 // `ends` are the sums of hits up to each ray, itself included; the first ray's number is `first`.
-extern "C" __global__ void BOUNDS pack(
+KERNEL pack(
     const int* __restrict__ faces, const double* __restrict__ distance,
     const int* __restrict__ place, const int* __restrict__ ends, Count count, Count first,
     double scale, unsigned int* __restrict__ ray, double* __restrict__ metres,

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .mesh import LocalMesh
-from .tree import PAD, WideTree, build_tree, single
+from .tree import WideTree, build_tree, single
 
 _WIDTH = 4  # seven float4 a node: one 128-byte line
 LEAF_SIZE = 4
@@ -18,7 +18,7 @@ FLOOR = 1e-35  # products of tiny edges are off by less where float32 underflows
 
 @dataclass(frozen=True)
 class Layout:
-    """Tables for the device; see the head of intersect.cu for what their columns hold.
+    """Tables for the device, or on it; see the head of intersect.cu for what their columns hold.
 
     Attributes
     ----------
@@ -43,24 +43,17 @@ class Layout:
     frame: NDArray[np.float64]
     stack: int
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes of all tables."""
-        tables = (self.nodes, self.triangles, self.corners, self.faces, self.frame)
-        return sum(table.nbytes for table in tables)
-
 
 def lay_out(mesh: LocalMesh) -> Layout:
     """Build the tree over a mesh and flatten both."""
     tree = build_tree(mesh.corners, _WIDTH, LEAF_SIZE)
     corners = mesh.corners[tree.order]
-    low, high = mesh.box
     return Layout(
         _nodes(tree),
         _records(corners),
         corners.reshape(-1, 9),
         mesh.index[tree.order],
-        np.concatenate([mesh.centre, [mesh.scale], low - PAD, high + PAD]),
+        np.concatenate([mesh.centre, [mesh.scale], *mesh.box]),
         _stack_need(tree),
     )
 

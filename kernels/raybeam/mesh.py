@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .given import as_array
 from .memory import require
+from .rays import finite_rows, real_rows, refuse_rows
+from .tree import PAD
+
+TINY = 2.0**-60  # stands for a direction component of zero, so that nothing becomes 0 * inf
 
 _BLOCK = 1 << 16  # triangles that are looked at together
 _VERTEX_BYTES, _FACE_BYTES = 48, 180  # while a mesh is checked, at most
@@ -48,17 +52,41 @@ class LocalMesh:
         """Points (n, 3) in metres to local coordinates."""
         return (points - self.centre) * self.scale
 
-    @property
+    @cached_property
     def box(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Least and greatest local coordinates of all triangles: (3,) and (3,)."""
+        """Least and greatest local coordinates of all triangles, padded as in the tree: (3,)."""
         points = self.corners.reshape(-1, 3)
-        if not len(points):
-            return np.zeros(3), np.zeros(3)
-        return points.min(axis=0), points.max(axis=0)
+        return points.min(axis=0) - PAD, points.max(axis=0) + PAD
+
+    def clip(
+        self, origins: NDArray[np.float64], directions: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Local distances at which rays enter (0 when they start inside) and leave the box.
+
+        A ray meets the box where ``entry <= leave``.
+
+        Parameters
+        ----------
+        origins
+            (n, 3) or (1, 3), local.
+        directions
+            (n, 3), unit vectors.
+        """
+        low, high = self.box
+        entry = np.zeros(len(directions))
+        leave = np.full(len(directions), np.inf)
+        for axis in range(3):
+            along = directions[:, axis]
+            along = np.where(np.abs(along) < TINY, np.copysign(TINY, along), along)
+            one = (low[axis] - origins[:, axis]) / along
+            two = (high[axis] - origins[:, axis]) / along
+            np.maximum(entry, np.minimum(one, two), out=entry)
+            np.minimum(leave, np.maximum(one, two), out=leave)
+        return entry, leave
 
 
 def local_mesh(vertices: ArrayLike, faces: ArrayLike) -> LocalMesh:
-    """Check a mesh and bring it into local coordinates.
+    """Check a mesh and bring it into local coordinates; see `RayCaster` for what is raised.
 
     Parameters
     ----------
@@ -66,32 +94,24 @@ def local_mesh(vertices: ArrayLike, faces: ArrayLike) -> LocalMesh:
         (v, 3) real and finite, metres.
     faces
         (f, 3) integers: rows of `vertices`.
-
-    Raises
-    ------
-    ValueError
-        For anything else, saying which row is wrong.
-    MemoryError
-        If there is not enough memory to do that.
     """
-    points = _check_vertices(vertices)
+    points = real_rows("vertices", vertices)
     rows = _check_faces(faces, len(points))
+    refuse_rows("Vertex", points, finite_rows, "finite coordinates")
+    points = points.astype(np.float64)
     used = np.zeros(len(points), np.bool_)
     used[rows.reshape(-1)] = True
     low, high = points[used].min(axis=0), points[used].max(axis=0)
     centre = low / 2 + high / 2
     half = float(np.maximum(high - centre, centre - low).max())
-    if half > 0 and not 1e-100 < half < 1e100:
-        raise ValueError(
-            f"The mesh reaches from {low.tolist()} to {high.tolist()}: "
-            "its size must be between 1e-100 and 1e100 metres."
-        )
     scale = math.ldexp(1.0, -math.frexp(half)[1]) if half > 0 else 1.0
     corners = ((points - centre) * scale)[rows]
     solid = np.concatenate(
         [_solid(corners[start : start + _BLOCK]) for start in range(0, len(corners), _BLOCK)]
     )
     index = np.flatnonzero(solid).astype(np.int32)
+    if not len(index):
+        raise ValueError("No triangle of the mesh has an area: there is nothing to hit.")
     return LocalMesh(
         centre, scale, corners if len(index) == len(rows) else corners[solid], index, len(rows)
     )
@@ -104,41 +124,21 @@ def _solid(corners: NDArray[np.float64]) -> NDArray[np.bool_]:
     return x | y | z
 
 
-def _check_vertices(vertices: ArrayLike) -> NDArray[np.float64]:
-    given = as_array("vertices", vertices)
-    if given.ndim != 2 or given.shape[1] != 3 or given.dtype.kind not in "fiu":
-        raise ValueError(
-            f"vertices must be real numbers of shape (v, 3), not {given.dtype} {given.shape}."
-        )
-    points = given.astype(np.float64)
-    bad = ~np.isfinite(points).all(axis=1)
-    if bad.any():
-        row = int(np.argmax(bad))
-        raise ValueError(
-            f"Vertex {row} is {points[row].tolist()} ({int(bad.sum())} of {len(points)} are not "
-            "finite): remove or repair these vertices and their faces first."
-        )
-    return points
-
-
 def _check_faces(faces: ArrayLike, vertex_count: int) -> NDArray[np.int64]:
-    given = as_array("faces", faces)
-    if given.ndim != 2 or given.shape[1] != 3 or not len(given):
+    given = np.asarray(faces)
+    if given.ndim != 2 or given.shape[1] != 3 or not len(given) or given.dtype.kind not in "iu":
         raise ValueError(
-            f"faces must have the shape (f, 3) with at least one triangle, not {given.shape}: "
-            "triangulate polygons, and do not cast on an empty mesh."
+            "faces must be integers (rows of vertices) of shape (f, 3), at least one triangle, "
+            f"not {given.dtype} {given.shape}."
         )
-    if given.dtype.kind not in "iu":
-        raise ValueError(f"faces must be integers (rows of vertices), not {given.dtype}.")
-    if len(given) >= 2**28:
+    if len(given) >= 2**28:  # triangles' places in the tree are 31 bits, of which a leaf takes 3
         raise ValueError(f"{len(given)} triangles are too many: the limit is {2**28 - 1}.")
     need = _VERTEX_BYTES * vertex_count + _FACE_BYTES * len(given)
-    require(need, f"A mesh of {len(given):,} triangles", "use a smaller mesh")
-    bad = ((given < 0) | (given >= vertex_count)).any(axis=1)
-    if bad.any():
-        row = int(np.argmax(bad))
+    require(need, f"A mesh of {len(given):,} triangles")
+    bad = np.flatnonzero(((given < 0) | (given >= vertex_count)).any(axis=1))
+    if len(bad):
         raise ValueError(
-            f"Face {row} is {given[row].tolist()}, but there are {vertex_count} vertices: "
+            f"Face {bad[0]} is {given[bad[0]].tolist()}, but there are {vertex_count} vertices: "
             f"indices must be 0 to {vertex_count - 1}."
         )
     return given.astype(np.int64, copy=False)

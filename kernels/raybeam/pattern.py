@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from operator import index
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .given import as_array
-from .memory import require
 from .poses import Poses, check_poses
 from .rays import check_origins, unit_directions
 
@@ -32,8 +29,6 @@ class Pattern:
     ValueError
         For a wrong shape, or a direction that is zero or not finite, or an origin that is not
         finite.
-    MemoryError
-        If there is no room for them.
 
     Examples
     --------
@@ -50,10 +45,8 @@ class Pattern:
         self._directions.flags.writeable = False
         self._origins: NDArray[np.float64] | None = None
         if origins is not None:
-            table = check_origins(origins, len(self))
-            require(24 * len(self), f"A pattern of {len(self):,} origins", "use several patterns")
             self._origins = np.empty((3, len(self)))
-            self._origins[...] = table.T
+            self._origins[...] = check_origins(origins, len(self)).T
             self._origins.flags.writeable = False
 
     def __len__(self) -> int:
@@ -106,17 +99,10 @@ class Pattern:
         ------
         ValueError
             If the poses are none, or a ray has no pose or no row in the pattern.
-        TypeError
-            If numbers are not whole.
         """
-        ray = as_array("numbers", numbers)
-        if ray.dtype.kind not in "iu" and ray.size:
-            raise TypeError(f"numbers of rays must be whole, not {ray.dtype}.")
-        if ray.ndim != 1:
-            raise ValueError(f"numbers of rays must have the shape (m,), not {ray.shape}.")
-        ray = ray.astype(np.int64)
-        most = int(ray.max()) + 1 if len(ray) else 0
+        ray = np.asarray(numbers).astype(np.int64, casting="same_kind")
         first = index(start)
+        most = int(ray.max()) + 1 if len(ray) else 0
         if first < 0 or (len(ray) and (int(ray.min()) < 0 or not len(self))):
             raise ValueError(
                 f"There are no rays {ray.min() if len(ray) else 0} to {most} after row {start} of "
@@ -138,31 +124,3 @@ class Pattern:
         if self._origins is None:
             return at, directions
         return poses.turned(self._origins.take(row, axis=1), pose) + at, directions
-
-
-def check_pattern(pattern: object) -> Pattern:
-    """Return it; raises TypeError if it is no pattern."""
-    if not isinstance(pattern, Pattern):
-        raise TypeError(
-            f"pattern must be a raybeam.Pattern, not {type(pattern).__name__}: "
-            "make one of the directions, once, by Pattern(directions)."
-        )
-    return pattern
-
-
-def check_window(pattern: Pattern, window: Any) -> tuple[int, int]:
-    """Half-open range of rows, the whole pattern for None; it may go past the pattern's end.
-
-    Raises TypeError or ValueError for what is not that.
-    """
-    try:
-        start, stop = (0, len(pattern)) if window is None else map(index, window)
-    except (TypeError, ValueError) as error:
-        raise TypeError(
-            f"window must be two row numbers, (start, stop), or None for all, not {window!r}."
-        ) from error
-    if not 0 <= start <= stop:
-        raise ValueError(f"Rows {start} to {stop} are no window: expected 0 <= start <= stop.")
-    if stop > start and not len(pattern):
-        raise ValueError(f"Rows {start} to {stop} cannot be cast: the pattern has none.")
-    return start, stop

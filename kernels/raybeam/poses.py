@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .given import as_array
 from .rays import finite_rows, real_rows, refuse_rows
 
 _SLACK = 2e-9  # on products of a rotation's rows
@@ -39,7 +38,9 @@ class Poses:
     def turned(
         self, vectors: NDArray[np.float64], pose: NDArray[np.integer[Any]]
     ) -> NDArray[np.float64]:
-        """Turn vectors into the mesh's axes, with the operations of `raybeam.rays.rotated`.
+        """Turn vectors into the mesh's axes, with one fixed order of rounding.
+
+        ``matrices @ vectors`` would do, but its last bit depends on the machine's BLAS.
 
         Parameters
         ----------
@@ -67,28 +68,10 @@ class Poses:
 def check_poses(
     positions: ArrayLike, rotations: ArrayLike | None, rays_per_pose: int | None, rays: int
 ) -> Poses:
-    """Poses as float64 arrays, of equal length.
-
-    Parameters
-    ----------
-    positions
-        (3,) or (k, 3), metres.
-    rotations
-        None, (3, 3) or (k, 3, 3), orthonormal.
-    rays_per_pose
-        Rays of each pose; None for all, which only a single pose can have.
-    rays
-        Number of rays that need a pose.
-
-    Raises
-    ------
-    ValueError
-        For numbers that are no poses, and if the poses do not suffice for the rays.
-    TypeError
-        If `rays_per_pose` is no whole number.
-    """
-    places = check_positions(positions)
-    turns = check_rotations(rotations)
+    """Poses for so many rays; see `RayCaster.scan`, which tells what is what and what is raised."""
+    places = real_rows("positions", positions)
+    refuse_rows("Position", places, finite_rows, "finite coordinates")
+    turns = None if rotations is None else _check_rotations(rotations)
     count = max(len(places), 1 if turns is None else len(turns))
     for given in (places, turns):
         if given is not None and len(given) not in (1, count):
@@ -96,36 +79,26 @@ def check_poses(
                 f"There are {len(places)} positions and {0 if turns is None else len(turns)} "
                 "rotations: give one for all poses, or one for each."
             )
-    each = _check_rays_per_pose(rays_per_pose, count, rays)
+    if rays_per_pose is None and count > 1:
+        raise ValueError(
+            f"There are {count:,} poses: rays_per_pose must say how many rays each of them has."
+        )
+    each = max(rays, 1) if rays_per_pose is None else index(rays_per_pose)
+    if each < 1 or count * each < rays:
+        raise ValueError(
+            f"{count:,} poses of {each:,} rays are not enough for {rays:,} rays: "
+            "give more poses, more rays_per_pose, or a smaller window."
+        )
     return Poses(
-        np.broadcast_to(places, (count, 3)),
+        np.broadcast_to(np.ascontiguousarray(places, dtype=np.float64), (count, 3)),
         None if turns is None else np.broadcast_to(turns, (count, 3, 3)),
         each,
     )
 
 
-def check_positions(positions: ArrayLike) -> NDArray[np.float64]:
-    """Positions (k, 3) in float64; raises ValueError unless there is one and all are finite."""
-    table = real_rows("positions", positions)
-    if not len(table):
-        raise ValueError("There are no positions: a scan needs at least one pose.")
-    refuse_rows("Position", table, finite_rows, "finite coordinates")
-    return np.ascontiguousarray(table, dtype=np.float64)
-
-
-def check_rotations(rotations: ArrayLike | None) -> NDArray[np.float64] | None:
+def _check_rotations(rotations: ArrayLike) -> NDArray[np.float64]:
     """Rotation matrices (k, 3, 3) in float64; raises ValueError for one that is not orthonormal."""
-    if rotations is None:
-        return None
-    given = as_array("rotations", rotations)
-    if given.dtype.kind not in "fiu" or given.ndim not in (2, 3) or given.shape[-2:] != (3, 3):
-        raise ValueError(
-            "rotations must be orthonormal matrices of shape (3, 3) or (k, 3, 3), "
-            f"not {given.dtype} {given.shape}."
-        )
-    matrices = np.array(given, dtype=np.float64).reshape(-1, 3, 3)
-    if not len(matrices):
-        raise ValueError("There are no rotations: give one for each pose, or None.")
+    matrices = np.ascontiguousarray(real_rows("rotations", rotations, (3, 3)), dtype=np.float64)
     # Written out for all matrices at once: a product of matrices one by one takes longer than
     # casting their rays. NaN compares as false.
     rows = np.ascontiguousarray(matrices.reshape(-1, 9).T).reshape(3, 3, -1)
@@ -143,24 +116,3 @@ def check_rotations(rotations: ArrayLike | None) -> NDArray[np.float64] | None:
             f"turn the sensor's axes to the mesh's ({len(bad)} of {len(matrices)} are like that)."
         )
     return matrices
-
-
-def _check_rays_per_pose(rays_per_pose: int | None, poses: int, rays: int) -> int:
-    if rays_per_pose is None:
-        if poses > 1:
-            raise ValueError(
-                f"There are {poses:,} poses: rays_per_pose must say how many rays each of them has."
-            )
-        return max(rays, 1)
-    try:
-        each = index(rays_per_pose)
-    except TypeError as error:
-        raise TypeError(
-            f"rays_per_pose must be a whole number, or None, not {rays_per_pose!r}."
-        ) from error
-    if each < 1 or poses * each < rays:
-        raise ValueError(
-            f"{poses:,} poses of {each:,} rays are not enough for {rays:,} rays: "
-            "give more poses, more rays_per_pose, or a smaller window."
-        )
-    return each

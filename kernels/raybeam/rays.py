@@ -9,14 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .given import as_array
-from .hits import MOST_RAYS
-from .memory import require
-
 # A squared length this close to 1 is a unit vector up to rounding and is left as it is, so that
 # directions which are normalised already are not moved by another last bit.
 _UNIT_SLACK = 1e-14
-
 
 # Rows that are checked at a time: what is needed beside the rays does not grow with them.
 _BLOCK = 1 << 18
@@ -67,13 +62,12 @@ def check_rays(origins: ArrayLike, directions: ArrayLike, t_min: float, t_max: f
     t_min, t_max
         Metres, ``0 <= t_min <= t_max``.
     """
-    table = real_rows("directions", directions)
-    _refuse_directions(table)
+    table = _check_directions(directions)
     return Rays(check_origins(origins, len(table)), table, *check_interval(t_min, t_max))
 
 
 def check_origins(origins: ArrayLike, rays: int) -> NDArray[Any]:
-    """Origins (n, 3) as given, or one (1, 3) in float64; raises ValueError for what is neither."""
+    """Origins (n, 3) as given, or one (1, 3); raises ValueError for what is neither."""
     start = real_rows("origins", origins)
     if len(start) not in (1, rays):
         raise ValueError(
@@ -81,21 +75,12 @@ def check_origins(origins: ArrayLike, rays: int) -> NDArray[Any]:
             "give one origin for all rays, or one for each."
         )
     refuse_rows("Origin", start, finite_rows, "finite coordinates")
-    return _float64(start) if len(start) == 1 else start
+    return start
 
 
 def check_interval(t_min: float, t_max: float) -> tuple[float, float]:
-    """Return both as floats.
-
-    Raises TypeError if they are no numbers, ValueError unless ``0 <= t_min <= t_max``.
-    """
-    try:
-        t_min, t_max = float(t_min), float(t_max)
-    except (TypeError, ValueError) as error:
-        raise TypeError(
-            "t_min and t_max must be numbers, the same for all rays of a call, "
-            f"not {t_min!r} and {t_max!r}."
-        ) from error
+    """Return both as floats; raises ValueError unless ``0 <= t_min <= t_max``."""
+    t_min, t_max = float(t_min), float(t_max)
     if not (0 <= t_min < np.inf and t_min <= t_max):
         raise ValueError(
             f"t_min is {t_min} and t_max {t_max}: distances must be finite, at least 0, "
@@ -108,13 +93,9 @@ def unit_directions(directions: ArrayLike) -> NDArray[np.float64]:
     """Directions as new float64 unit vectors (n, 3); raises ValueError for zero, NaN and inf.
 
     Their memory is in columns, so that the transposed array is contiguous, one row an axis.
-    Each row's result depends on that row alone, so that batches may be cut anywhere. Raises
-    MemoryError when there is no room for them.
+    Each row's result depends on that row alone, so that batches may be cut anywhere.
     """
-    table = real_rows("directions", directions)
-    _refuse_directions(table)
-    need = 24 * len(table)
-    require(need, f"A pattern of {len(table):,} directions", "cast it in several patterns")
+    table = _check_directions(directions)
     out = np.empty((3, len(table))).T
     for start in range(0, len(table), _BLOCK):
         out[start : start + _BLOCK] = _normalised(_float64(table[start : start + _BLOCK]))
@@ -124,8 +105,8 @@ def unit_directions(directions: ArrayLike) -> NDArray[np.float64]:
 def _normalised(table: NDArray[np.float64]) -> NDArray[np.float64]:
     """Make unit vectors of checked directions; returns the same array if they are that already."""
     x, y, z = table.T
-    # The order of these operations is the same in intersect.cu. No einsum or norm: those may
-    # fuse multiply and add, and then the last bit would depend on the machine.
+    # No einsum or norm: those may fuse multiply and add, and then the last bit would depend on
+    # the machine.
     with np.errstate(over="ignore", under="ignore"):
         squared = (x * x + y * y) + z * z
     off = np.abs(squared - 1) > _UNIT_SLACK
@@ -139,55 +120,24 @@ def _normalised(table: NDArray[np.float64]) -> NDArray[np.float64]:
     return out
 
 
-def rotated(
-    directions: NDArray[np.float64], rotation: NDArray[np.float64] | None
-) -> NDArray[np.float64]:
-    """Directions (n, 3) turned by a rotation matrix (3, 3), with one fixed order of rounding.
-
-    ``directions @ rotation.T`` would do, but its last bit depends on the machine's BLAS.
-    """
-    if rotation is None:
-        return directions
-    x, y, z = directions.T
-    out = np.empty_like(directions)
-    for axis, (a, b, c) in enumerate(rotation):
-        out[:, axis] = (x * a + y * b) + z * c
-    return out
-
-
-def real_rows(name: str, values: ArrayLike) -> NDArray[Any]:
-    """Real numbers (n, 3), copied only if they are no array; a single (3,) becomes one row."""
-    given = as_array(name, values)
-    if given.dtype.kind not in "fiu":
-        raise ValueError(f"{name} must be real numbers, not {given.dtype}.")
-    if given.ndim == 1 and given.shape == (3,):
-        given = given[None, :]
-    if given.ndim != 2 or given.shape[1] != 3:
-        raise ValueError(f"{name} must have the shape (n, 3) or (3,), not {given.shape}.")
+def real_rows(name: str, values: ArrayLike, shape: tuple[int, ...] = (3,)) -> NDArray[Any]:
+    """Real numbers (n, *shape), copied only if they are no array; a single row may do without n."""
+    given = np.asarray(values)
+    if given.shape == shape:
+        given = given[None]
+    if given.dtype.kind not in "fiu" or not given.ndim or given.shape[1:] != shape:
+        expected = ", ".join(map(str, shape))
+        raise ValueError(
+            f"{name} must be real numbers of shape (n, {expected}), "
+            f"not {given.dtype} {given.shape}."
+        )
     return given
-
-
-def _float64(table: NDArray[Any]) -> NDArray[np.float64]:
-    return np.ascontiguousarray(table, dtype=np.float64)
 
 
 def finite_rows(block: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Which rows (n, 3) have finite numbers only: (n,)."""
     x, y, z = np.isfinite(block).T
     return x & y & z
-
-
-def _has_length(block: NDArray[np.float64]) -> NDArray[np.bool_]:
-    return finite_rows(block) & block.any(axis=1)
-
-
-def _refuse_directions(table: NDArray[Any]) -> None:
-    if len(table) > MOST_RAYS:
-        raise ValueError(
-            f"{len(table):,} directions are more than the {MOST_RAYS:,} that one call can number: "
-            "give them in parts."
-        )
-    refuse_rows("Direction", table, _has_length, "a finite vector that is not zero")
 
 
 def refuse_rows(
@@ -207,3 +157,18 @@ def refuse_rows(
             f"{what} {rows[0]} is {_float64(table[rows[0]]).tolist()}: expected {expected} "
             f"({len(rows)} of {len(table)} rows are like that)."
         )
+
+
+def _check_directions(directions: ArrayLike) -> NDArray[Any]:
+    table = real_rows("directions", directions)
+    refuse_rows(
+        "Direction",
+        table,
+        lambda block: finite_rows(block) & block.any(axis=1),
+        "a finite vector that is not zero",
+    )
+    return table
+
+
+def _float64(table: NDArray[Any]) -> NDArray[np.float64]:
+    return np.ascontiguousarray(table, dtype=np.float64)

@@ -1,24 +1,26 @@
-"""A scan that has been checked: which rays of a pattern, from which poses, what to keep."""
+"""Scans: which rays of a pattern, from which poses; what is kept of their hits and counted."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 from operator import index
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .given import as_array
-from .hits import MOST_RAYS
-from .pattern import Pattern, check_pattern, check_window
+from .hits import Part, ScanReturns, joined
+from .pattern import Pattern
 from .poses import Poses, check_poses
 from .rays import Rays, check_interval
+
+_MOST_RAYS = 1 << 32  # of a scan, for their numbers in `ScanReturns` to fit
 
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """What `RayCaster.scan` is asked for. Rays are numbered from 0 at the window's start.
+    """What `RayCaster.scan` is asked for, checked.
 
     Attributes
     ----------
@@ -78,48 +80,126 @@ def check_scan(
     tally: bool = False,
 ) -> Scan:
     """Check the arguments of `RayCaster.scan`, which tells what they are and what is raised."""
-    start, stop = check_window(check_pattern(pattern), window)
-    count = stop - start
-    if count > MOST_RAYS:
+    if not isinstance(pattern, Pattern):
+        raise TypeError(
+            f"pattern must be a raybeam.Pattern, not {type(pattern).__name__}: "
+            "make one of the directions, once, by Pattern(directions)."
+        )
+    start, stop = (0, len(pattern)) if window is None else map(index, window)
+    if not 0 <= start <= stop or (stop > start and not len(pattern)):
         raise ValueError(
-            f"{count:,} rays are more than the {MOST_RAYS:,} that one call can number: "
+            f"Rows {start} to {stop} of a pattern with {len(pattern)} are no window: "
+            "expected 0 <= start <= stop."
+        )
+    count = stop - start
+    if count > _MOST_RAYS:
+        raise ValueError(
+            f"{count:,} rays are more than the {_MOST_RAYS:,} that one call can number: "
             "scan smaller windows."
         )
+    if index(keep_every) < 1:
+        raise ValueError(f"keep_every is {keep_every}: it must be at least 1, to keep all hits.")
     return Scan(
         pattern,
         start % max(len(pattern), 1),
         count,
         check_poses(positions, rotations, rays_per_pose, count),
         *check_interval(t_min, t_max),
-        _check_keep_every(keep_every),
-        _check_groups(groups, count),
-        bool(tally),
+        index(keep_every),
+        np.zeros(1, np.int64) if groups is None else _check_groups(groups, count),
+        tally,
     )
 
 
-def _check_keep_every(keep_every: int) -> int:
-    try:
-        every = index(keep_every)
-    except TypeError as error:
-        raise TypeError(f"keep_every must be a whole number, not {keep_every!r}.") from error
-    if every < 1:
-        raise ValueError(f"keep_every is {every}: it must be at least 1, which keeps all hits.")
-    return every
+def _check_groups(groups: ArrayLike, rays: int) -> NDArray[np.int64]:
+    begins = np.asarray(groups)
+    if (
+        (begins.ndim != 1 or not len(begins) or begins.dtype.kind not in "iu")
+        or (begins[0] != 0 or begins[-1] > rays)
+        or (begins[1:] < begins[:-1]).any()
+    ):
+        raise ValueError(
+            f"groups are {begins}: expected the numbers of the rays at which groups begin, "
+            f"whole, ascending from 0 and not past the window's {rays:,} rays."
+        )
+    return begins.astype(np.int64)
 
 
-def _check_groups(groups: ArrayLike | None, rays: int) -> NDArray[np.int64]:
-    if groups is None:
-        return np.zeros(1, np.int64)
-    given = as_array("groups", groups)
-    if given.ndim != 1 or not len(given) or given.dtype.kind not in "iu":
-        raise ValueError(
-            "groups must be numbers of the rays at which groups begin, integers of shape (g,), "
-            f"not {given.dtype} {given.shape}."
-        )
-    begins = given.astype(np.int64)
-    if begins[0] != 0 or begins[-1] > rays or (np.diff(begins) < 0).any():
-        raise ValueError(
-            f"groups begin at rays {begins[0]} to {begins[-1]}: expected numbers that ascend "
-            f"from 0 and do not go past the window's {rays:,} rays."
-        )
-    return begins
+class Collector:
+    """Takes the hits of a scan, chunk after chunk in ray order.
+
+    Parameters
+    ----------
+    scan
+        Tells what to keep and what to count.
+    face_count
+        Number of the mesh's triangles.
+
+    Examples
+    --------
+    >>> pattern = Pattern([[1, 0, 0]] * 10)
+    >>> collector = Collector(check_scan(pattern, [0, 0, 0], keep_every=2, groups=[0, 5]), 1)
+    >>> ray = np.array([1, 2, 3, 6, 7])
+    >>> ray[collector.keep(ray, 0, 10)].tolist()
+    [1, 3, 6]
+    """
+
+    def __init__(self, scan: Scan, face_count: int) -> None:
+        self._groups, self._every = scan.groups, scan.keep_every
+        self._hits = np.zeros(len(scan.groups), np.int64)
+        self._tally = np.zeros(face_count, np.int64) if scan.tally else None
+        self._kept: list[Part] = []
+
+    def keep(
+        self, ray: NDArray[np.integer[Any]], start: int, stop: int
+    ) -> slice | NDArray[np.intp]:
+        """Count the hits of rays `start` to `stop` and choose those to keep.
+
+        Parameters
+        ----------
+        ray
+            (m,): numbers of the rays that hit, ascending, counted from `start`.
+
+        Returns
+        -------
+        What selects the kept ones: rows of `ray`, or all.
+        """
+        first = int(np.searchsorted(self._groups, start, side="right")) - 1
+        last = int(np.searchsorted(self._groups, stop, side="left"))
+        begins = (self._groups[first + 1 : last] - start).astype(ray.dtype)
+        cuts = np.concatenate([[0], np.searchsorted(ray, begins), [len(ray)]])
+        counts = np.diff(cuts)
+        groups = slice(first, first + len(counts))
+        before = self._hits[groups].copy()  # of the first group, in the chunks before this one
+        self._hits[groups] += counts
+        if self._every == 1:
+            return slice(None)
+        # Of each group: the row of the first one kept, and how many are.
+        leave = -before % self._every
+        if len(counts) == 1:
+            return np.arange(leave[0], len(ray), self._every)
+        number = np.maximum(-((leave - counts) // self._every), 0)
+        offset = cuts[:-1] + leave - self._every * (np.cumsum(number) - number)
+        rows: NDArray[np.intp] = np.repeat(offset, number)
+        rows += self._every * np.arange(len(rows))
+        return rows
+
+    def tally(self, triangle: NDArray[np.int32]) -> None:
+        """Count all hits of a chunk by triangle, if that was asked for."""
+        if self._tally is not None:
+            np.add.at(self._tally, triangle.astype(np.intp), 1)
+
+    def add(
+        self,
+        start: int,
+        ray: NDArray[np.integer[Any]],
+        distance: NDArray[np.float64],
+        triangle: NDArray[np.int32],
+    ) -> None:
+        """Take kept hits of a chunk, whose rays are counted from `start`."""
+        number = ray.astype(np.uint32, copy=False)
+        self._kept.append((number + np.uint32(start) if start else number, distance, triangle))
+
+    def result(self) -> ScanReturns:
+        """Everything that was taken and counted."""
+        return ScanReturns(*joined(self._kept), self._hits, self._tally)

@@ -52,15 +52,12 @@ def build_tree(corners: NDArray[np.float64], width: int, leaf_size: int) -> Wide
     Parameters
     ----------
     corners
-        float64 (k, 3, 3): local corners; k may be 0.
+        float64 (k, 3, 3): local corners.
     width
         Most children of a node.
     leaf_size
         Most triangles of a leaf, at most `MAX_LEAF`.
     """
-    if not len(corners):
-        empty = np.full((1, 3, width), np.inf, np.float32)
-        return WideTree(empty, -empty, np.zeros((1, width), np.int32), np.zeros(0, np.int32))
     low = np.ascontiguousarray(single((corners.min(axis=1) - PAD).T))
     high = np.ascontiguousarray(single((corners.max(axis=1) + PAD).T))
     binary = ploc.build(low, high)

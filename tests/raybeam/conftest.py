@@ -106,10 +106,6 @@ class Kernels:
         return launch
 
 
-class DeviceFullError(MemoryError):
-    """What CuPy raises when the device has no memory left."""
-
-
 class CudaError(RuntimeError):
     """What CuPy raises when a call of CUDA fails."""
 
@@ -143,7 +139,6 @@ HOST = Module(
         Device=Device,
         PinnedMemory=Pinned,
         get_current_stream=lambda: SimpleNamespace(synchronize=lambda: None),
-        memory=SimpleNamespace(OutOfMemoryError=DeviceFullError),
         runtime=SimpleNamespace(
             getDeviceCount=lambda: 1,
             memGetInfo=lambda: (1 << 34, 1 << 35),

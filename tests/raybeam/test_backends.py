@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from raybeam import BackendUnavailable, Pattern, RayCaster, available_backends, registry
+from raybeam import BackendUnavailable, Pattern, RayCaster, available_backends
 from raybeam.cuda_backend import CudaBackend
 from raybeam.embree_backend import EmbreeBackend
 from raybeam.mesh import local_mesh
@@ -64,11 +64,6 @@ def test_bad_threads():
 
 def test_repr():
     assert repr(RayCaster(*MESH, "numpy")) == "RayCaster(1 triangles, backend='numpy')"
-
-
-def test_every_backend_has_a_name_of_its_own():
-    names = [backend.name for backend in registry._BACKENDS]
-    assert len(set(names)) == len(names)
 
 
 def test_import_needs_numpy_only():
@@ -160,6 +155,4 @@ def test_embree_is_told_how_many_threads(shapes):
     directions = np.random.default_rng(1).normal(size=(40_000, 3))
     caster.cast([0.05, 0.1, 0.4], directions)
     caster.scan(Pattern(directions), [0.05, 0.1, 0.4])
-    caster.count([0.05, 0.1, 0.4], directions, every=True)
-    assert {name for name, _ in told} == {"cast_rays", "list_intersections"}
-    assert {threads for _, threads in told} == {1}
+    assert set(told) == {("cast_rays", 1)}

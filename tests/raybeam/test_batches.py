@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-import tempfile
 import tracemalloc
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from raybeam import Pattern, RayCaster, traverse
+from raybeam import RayCaster, available_backends, numpy_backend
 
 FIELDS = ("distance", "triangle", "u", "v")
 
@@ -57,48 +52,8 @@ def test_blocks_may_be_of_any_size(shapes, monkeypatch):
     origins, directions = rays(2000, 3)
     whole = vase.cast(origins, directions)
     for size in (5, 333, 1 << 20):
-        monkeypatch.setattr(traverse, "_BLOCK", size)
+        monkeypatch.setattr(numpy_backend, "_BLOCK", size)
         same(vase.cast(origins, directions), whole)
-
-
-def test_returns_are_the_hits_of_cast(caster, shapes, monkeypatch):
-    vase = caster(*shapes["vase"]())
-    origins, directions = rays(2000, 4)
-    hits = vase.cast(origins, directions, 0.5, 500)
-    assert 0.1 < hits.hit.mean() < 0.9
-    for chunk in (type(vase._engine).chunk, 77):
-        monkeypatch.setattr(type(vase._engine), "chunk", chunk)
-        found = vase.returns(origins, directions, 0.5, 500)
-        np.testing.assert_array_equal(found.ray, np.flatnonzero(hits.hit))
-        np.testing.assert_array_equal(found.distance, hits.distance[hits.hit])
-        np.testing.assert_array_equal(found.triangle, hits.triangle[hits.hit])
-        assert len(found) == hits.hit.sum()
-        assert sum(row.itemsize for row in (found.ray, found.distance, found.triangle)) == 16
-
-
-@pytest.mark.parametrize("origin", [[0.3, -0.2, 2.9], [0.1, 0.2, 0.3], [9, -7, 5], [4e4, 3e4, 1e4]])
-def test_scans_may_be_cut_anywhere(caster, shapes, monkeypatch, origin):
-    """Windows and chunks of a pattern, from inside, nearby and far, with and without limits."""
-    vase = caster(*shapes["vase"]())
-    turn, _ = np.linalg.qr(np.random.default_rng(10).normal(size=(3, 3)))
-    spread = np.random.default_rng(11).normal(size=(3000, 3))
-    length = np.linalg.norm(origin)
-    pattern = Pattern((spread - np.array(origin) * (1.5 if length > 3 else 0.5)) @ turn)
-    distance = vase.scan(pattern, origin, turn).distance
-    assert 100 < len(distance) <= 3000
-    for limits in ((0, np.inf), (np.quantile(distance, 0.3), np.quantile(distance, 0.8))):
-        whole = vase.scan(pattern, origin, turn, t_min=limits[0], t_max=limits[1])
-        assert len(whole) > 50
-        for chunk in (97, 1111, 1 << 17):
-            monkeypatch.setattr(type(vase._engine), "chunk", chunk)
-            for window in ((0, 3000), (0, 1), (501, 2222)):
-                got = vase.scan(
-                    pattern, origin, turn, window=window, t_min=limits[0], t_max=limits[1]
-                )
-                want = (whole.ray >= window[0]) & (whole.ray < window[1])
-                np.testing.assert_array_equal(got.ray + window[0], whole.ray[want])
-                np.testing.assert_array_equal(got.distance, whole.distance[want])
-                np.testing.assert_array_equal(got.triangle, whole.triangle[want])
 
 
 def test_one_origin_is_the_same_as_many(caster, shapes):
@@ -140,8 +95,6 @@ def test_exact_backends_have_the_same_bits_at_seams(exact_caster, shapes, name):
 
 
 def test_embree_and_numpy_agree(shapes):
-    from raybeam import available_backends
-
     if reason := available_backends()["embree"]:
         pytest.skip(f"embree: {reason}")
     vertices, faces = shapes["vase"]()
@@ -158,17 +111,16 @@ def test_embree_and_numpy_agree(shapes):
 RESULT_BYTES = 8 + 4 + 8 + 8  # of a ray: distance, triangle, u, v
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
-def test_memory_of_a_cast_is_bounded(shapes, dtype):
+def test_memory_of_a_cast_is_bounded(shapes):
     """Beyond its answer, a cast of many rays takes no more than one of a chunk, whatever they are.
 
     The directions are no unit vectors and, at single precision, not what the caster works with:
     nothing is made of them for all rays at once.
     """
     vase = RayCaster(*shapes["vase"](), "numpy")
-    directions = np.random.default_rng(9).normal(size=(1_200_000, 3)).astype(dtype)
+    directions = np.random.default_rng(9).normal(size=(900_000, 3)).astype(np.float32)
     peaks = []
-    for count in (300_000, 1_200_000):
+    for count in (300_000, 900_000):
         tracemalloc.start()
         hits = vase.cast([0.05, 0.1, 30], directions[:count])
         peaks.append(tracemalloc.get_traced_memory()[1] - RESULT_BYTES * count)
@@ -176,27 +128,3 @@ def test_memory_of_a_cast_is_bounded(shapes, dtype):
         assert 0 < hits.hit.mean() < 0.5
     assert peaks[1] < 96 * 2**20
     assert peaks[1] - peaks[0] < 8 * 2**20
-
-
-@pytest.mark.slow
-def test_memory_with_two_million_triangles(shapes):
-    """As the operating system counts it, of three million rays at a box of terrain."""
-    code = (
-        "import resource, sys, numpy as np; from raybeam import RayCaster\n"
-        "mesh = np.load(sys.argv[1]); caster = RayCaster(mesh['v'], mesh['f'], 'numpy')\n"
-        "directions = np.random.default_rng(0).normal(size=(3_000_000, 3))\n"
-        "peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
-        "before = peak(); hits = caster.returns([0.05, 0.1, 0.4], directions)\n"
-        "print(len(hits), (peak() - before) // 1024)"
-    )
-    vertices, faces = shapes["terrain box"](700)
-    assert len(faces) > 1_950_000
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "mesh.npz"
-        np.savez(path, v=vertices, f=faces)
-        paths = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-        command = [sys.executable, "-c", code, str(path)]
-        done = subprocess.run(command, capture_output=True, text=True, env=paths, check=True)
-    hits, mebibytes = map(int, done.stdout.split())
-    assert hits == 3_000_000
-    assert mebibytes < 512

@@ -8,13 +8,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from raybeam import Pattern, RayCaster, cuda_build, cuda_scene, ploc
+from raybeam import Pattern, RayCaster, cuda_backend, cuda_build, ploc
 from raybeam.layout import lay_out
 from raybeam.mesh import local_mesh
 from raybeam.scan import check_scan
 
 pytest.importorskip("hypothesis")
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -103,9 +103,9 @@ def test_chain_of_ever_better_partners(built):
 )
 @given(points=st.one_of(coarse, fine))
 def test_any_triangles(built, points):
-    mesh = local_mesh(points, np.arange(len(points)).reshape(-1, 3))
-    if len(mesh.corners):
-        assert_same_as_numpy(built, mesh)
+    a, b, c = points.reshape(-1, 3, 3).transpose(1, 0, 2)
+    assume(np.cross(b - a, c - a).any())
+    assert_same_as_numpy(built, local_mesh(points, np.arange(len(points)).reshape(-1, 3)))
 
 
 def test_same_on_every_run(built, shapes):
@@ -127,8 +127,7 @@ def test_device_builds_where_it_pays(source_backend, shapes, monkeypatch, triang
 
 def test_host_builds_where_only_the_tables_fit(source_backend, shapes, monkeypatch):
     mesh = local_mesh(*shapes["soup"]("random", count=4000))
-    need = lay_out(mesh).nbytes + cuda_scene.WORK
-    assert need < cuda_build.BYTES * len(mesh.corners) + cuda_scene.WORK
+    need = cuda_build.BYTES * len(mesh.corners) + cuda_backend._WORK - 1
     runtime = source_backend._library().cuda.runtime
     monkeypatch.setattr(runtime, "memGetInfo", lambda: (need, 1 << 35))
     monkeypatch.setattr(cuda_build, "build", None)

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from raybeam import Pattern, cuda_scene
+from raybeam import Pattern, cuda_backend
 from raybeam.cuda_results import PinnedRoom
 from raybeam.mesh import local_mesh
 from raybeam.scan import check_scan
@@ -142,7 +142,7 @@ def test_pattern_that_does_not_fit_goes_chunk_by_chunk(source_backend, shapes, m
     pattern = Pattern(directions, 0.01 * directions[::-1])
     scan = check_scan(pattern, [0.05, 0.1, 0.4], window=(5, 4990))
     runtime = source_backend._library().cuda.runtime
-    room = cuda_scene.WORK + engine._keep
+    room = cuda_backend._WORK + engine._keep
     monkeypatch.setattr(source_backend, "chunk", 500)
     with monkeypatch.context() as patch:
         patch.setattr(runtime, "memGetInfo", lambda: (room + 3000 * 48 - 1, 1 << 35))

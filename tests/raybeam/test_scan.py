@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from raybeam import Pattern, RayCaster, workspace
-from raybeam.collector import Collector
 from raybeam.rays import unit_directions
-from raybeam.scan import check_scan
+from raybeam.scan import Collector, check_scan
 
 TRIANGLE = [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]
 
@@ -72,6 +73,13 @@ def scanned(caster, case, window, **more):
     )  # fmt: skip
 
 
+def hits_of(caster, origins, directions, *limits):
+    """What `cast` finds of rays, as a scan gives it."""
+    hits = caster.cast(origins, directions, *limits)
+    ray = np.flatnonzero(hits.hit).astype(np.uint32)
+    return SimpleNamespace(ray=ray, distance=hits.distance[ray], triangle=hits.triangle[ray])
+
+
 def same(got, want):
     for name in ("ray", "triangle", "distance"):
         mine, other = getattr(got, name), getattr(want, name)
@@ -79,31 +87,17 @@ def same(got, want):
         np.testing.assert_array_equal(mine, other, err_msg=name)
 
 
-WINDOWS = [(0, 1000), (0, 2400), (937, 1003), (2999, 5000), (123, 123)]
-
-
-@pytest.mark.parametrize("name", CASES)
-@pytest.mark.parametrize("scale", [1.0, 3e3], ids=["near", "far"])
-def test_rays_are_those_of_the_interface(caster, shapes, name, scale):
-    """Windows that go past the pattern's end, with and without limits; the rays themselves."""
-    vase, case = caster(*shapes["vase"]()), case_of(name, scale)
-    if scale > 1:  # aim at the mesh
-        aim = case["directions"] - case["positions"][0]
-        if case["rotations"] is not None:
-            case["rotations"][:] = case["rotations"][0]
-            aim = aim @ case["rotations"][0]
-        case["directions"] = aim
+def check(caster, case, windows, limits):
+    """A scan's hits are those of its rays, and `Pattern.rays` makes the same rays."""
     pattern = Pattern(case["directions"], case["origins"])
-    limits = (0.5, 1.5) if scale == 1 else (np.linalg.norm(case["positions"][0]), np.inf)
-    for window in WINDOWS:
+    for window in windows:
         origins, directions = made(case, window)
-        for t_min, t_max in ((0.0, np.inf), limits):
-            want = vase.returns(origins, directions, t_min, t_max)
-            got = scanned(vase, case, window, t_min=t_min, t_max=t_max)
-            same(got, want)
-            assert got.hits.tolist() == [len(want)]
-            assert got.tally is None
-            assert len(want) > len(origins) / 10 or not len(origins)
+        want = hits_of(caster, origins, directions, *limits)
+        got = scanned(caster, case, window, t_min=limits[0], t_max=limits[1])
+        same(got, want)
+        assert got.hits.tolist() == [len(want.ray)]
+        assert got.tally is None
+        assert len(want.ray) > len(origins) / 10 or not len(origins)
         some = np.random.default_rng(1).integers(0, max(len(origins), 1), 50)[: len(origins)]
         pose = {"start": window[0], "rays_per_pose": case["each"]}
         at, to = pattern.rays(some, case["positions"], case["rotations"], **pose)
@@ -112,6 +106,23 @@ def test_rays_are_those_of_the_interface(caster, shapes, name, scale):
 
 
 @pytest.mark.parametrize("name", CASES)
+def test_rays_are_those_of_the_interface(caster, shapes, name):
+    """Windows that go past the pattern's end, with and without limits; the rays themselves."""
+    vase, case = caster(*shapes["vase"]()), case_of(name)
+    check(vase, case, [(0, 2400), (123, 123)], (0.0, np.inf))
+    check(vase, case, [(937, 1003), (2999, 5000)], (0.5, 1.5))
+
+
+@pytest.mark.parametrize("name", ["one pose", "firings", "firings, lever arms"])
+def test_rays_from_far_away(caster, shapes, name):
+    vase, case = caster(*shapes["vase"]()), case_of(name, 3e3)
+    case["rotations"][:] = case["rotations"][0]
+    case["directions"] = (case["directions"] - case["positions"][0]) @ case["rotations"][0]
+    check(vase, case, [(0, 1000)], (0.0, np.inf))
+    check(vase, case, [(937, 1003)], (np.linalg.norm(case["positions"][0]), np.inf))
+
+
+@pytest.mark.parametrize("name", ["one pose", "a pose each ray", "firings, lever arms"])
 def test_scans_may_be_cut_anywhere(caster, shapes, name, monkeypatch):
     case = case_of(name)
     whole = scanned(caster(*shapes["vase"]()), case, (700, 2700), t_min=0.5, t_max=2)
@@ -121,21 +132,6 @@ def test_scans_may_be_cut_anywhere(caster, shapes, name, monkeypatch):
         monkeypatch.setattr(type(vase._engine), "chunk", chunk)
         monkeypatch.setattr(workspace, "_BLOCK", block)
         same(scanned(vase, case, (700, 2700), t_min=0.5, t_max=2), whole)
-
-
-def test_many_poses_are_as_one_after_another(caster, shapes):
-    vase, case = caster(*shapes["vase"]()), case_of("firings, lever arms")
-    pattern = Pattern(case["directions"], case["origins"])
-    got = scanned(vase, case, (500, 2900), t_min=0.3)
-    rays, distances = [], []
-    for pose in range(60):
-        start = 500 + 40 * pose
-        given = pattern, case["positions"][pose], case["rotations"][pose]
-        one = vase.scan(*given, window=(start, start + 40), t_min=0.3)
-        rays.append(one.ray + np.uint32(40 * pose))
-        distances.append(one.distance)
-    np.testing.assert_array_equal(got.ray, np.concatenate(rays))
-    np.testing.assert_array_equal(got.distance, np.concatenate(distances))
 
 
 def test_positions_and_rotations_may_be_one_for_all(caster, shapes):
@@ -153,12 +149,12 @@ def test_pattern_shorter_than_a_chunk(caster, shapes):
     case["directions"], case["origins"] = case["directions"][:7], case["origins"][:7]
     got = scanned(vase, case, (5, 2100))
     assert len(got) > 1000
-    same(got, vase.returns(*made(case, (5, 2100))))
+    same(got, hits_of(vase, *made(case, (5, 2100))))
 
 
 # ---- thinning and counts ----
 
-GROUPS = [[0], [0, 1000, 2000], [0, 0, 13, 13, 14, 1999, 2390, 2400], [0, 2400]]
+GROUPS = [[0], [0, 1000, 2000], [0, 0, 13, 13, 14, 1999, 2390, 2400]]
 
 
 def thinned(want, groups, every, rays):
@@ -171,30 +167,31 @@ def thinned(want, groups, every, rays):
     return hits, keep
 
 
-@pytest.mark.parametrize("name", ["one pose", "firings, lever arms"])
 @pytest.mark.parametrize(
-    "limits",
-    [(0, np.inf), (0.5, np.inf), (0, 1.5), (0.8, 1.2), (1, 1.0001), (50, 60)],
-    ids=str,
+    ("name", "limits"),
+    [
+        ("one pose", (0, np.inf)),
+        ("firings, lever arms", (0.5, 1.5)),
+        ("one pose", (1, 1.0001)),
+        ("firings, lever arms", (50, 60)),
+    ],
 )
 def test_thinning_keeps_what_the_whole_has(caster, shapes, name, limits, monkeypatch):
     vase, case = caster(*shapes["vase"]()), case_of(name)
     given = {"window": (300, 2700), "t_min": limits[0], "t_max": limits[1]}
     whole = scanned(vase, case, **given)
     want_tally = np.bincount(whole.triangle, minlength=vase.face_count)
-    for chunk in (type(vase._engine).chunk, 111):
+    for chunk, every in ((1 << 16, 1), (1 << 16, 5), (111, 2), (111, 10_000)):
         monkeypatch.setattr(type(vase._engine), "chunk", chunk)
-        for every in (1, 2, 5, 10_000):
-            for groups in GROUPS:
-                more = {"keep_every": every, "groups": groups, "tally": True}
-                got = scanned(vase, case, **given, **more)
-                hits, keep = thinned(whole, groups, every, 2400)
-                assert got.hits.tolist() == hits
-                np.testing.assert_array_equal(got.ray, whole.ray[keep])
-                np.testing.assert_array_equal(got.distance, whole.distance[keep])
-                np.testing.assert_array_equal(got.triangle, whole.triangle[keep])
-                np.testing.assert_array_equal(got.tally, want_tally)
-                assert got.hits.dtype == got.tally.dtype == np.int64
+        for groups in GROUPS:
+            got = scanned(vase, case, **given, keep_every=every, groups=groups, tally=True)
+            hits, keep = thinned(whole, groups, every, 2400)
+            assert got.hits.tolist() == hits
+            np.testing.assert_array_equal(got.ray, whole.ray[keep])
+            np.testing.assert_array_equal(got.distance, whole.distance[keep])
+            np.testing.assert_array_equal(got.triangle, whole.triangle[keep])
+            np.testing.assert_array_equal(got.tally, want_tally)
+            assert got.hits.dtype == got.tally.dtype == np.int64
 
 
 def test_thinning_where_rays_graze(caster):
@@ -226,9 +223,6 @@ def test_nothing_to_scan(caster, shapes):
         assert found.hits.tolist() == [0, 0]
     away = vase.scan(Pattern([[0, 0, 1]] * 5), [0, 0, 50], keep_every=2, tally=True)
     assert (len(away), away.hits.tolist(), away.tally.sum()) == (0, [0], 0)
-    flat = caster(np.zeros((3, 3)), [[0, 1, 2]])
-    found = flat.scan(Pattern([[0, 0, -1]] * 5), [0, 0, 1], groups=[0, 2], tally=True)
-    assert (found.hits.tolist(), found.tally.tolist()) == ([0, 0], [0])
 
 
 def test_groups_are_counted_across_chunks():
@@ -250,22 +244,20 @@ def test_groups_are_counted_across_chunks():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"window": (2, 1)}, "Rows 2 to 1 are no window: expected 0 <= start <= stop"),
+        ({"window": (2, 1)}, "Rows 2 to 1 of a pattern with 3 are no window: expected 0 <= start"),
         ({"window": (-1, 2)}, "Rows -1 to 2"),
         ({"window": (5, 2**32 + 6)}, "4,294,967,297 rays are more than the 4,294,967,296 that"),
+        ({"pattern": Pattern(np.empty((0, 3))), "window": (0, 2)}, "Rows 0 to 2 of a pattern with"),
         ({"rotations": 2 * np.eye(3)}, r"Rotation 0 is .*orthonormal.*1 of 1"),
         ({"rotations": [np.eye(3), np.eye(3)[::-1] * 1.1]}, r"Rotation 1 is .*orthonormal.*1 of 2"),
-        ({"rotations": np.eye(2)}, r"orthonormal matrices of shape .*, not float64 \(2, 2\)"),
+        ({"rotations": np.eye(2)}, r"rotations must be .* \(n, 3, 3\), not float64 \(2, 2\)"),
         ({"rotations": np.full((3, 3), np.nan)}, "orthonormal"),
         ({"rotations": np.full((3, 3), 1e200)}, "orthonormal"),
-        ({"rotations": np.eye(3) * 1j}, "orthonormal.*complex"),
-        ({"rotations": "level"}, "orthonormal"),
-        ({"rotations": np.zeros((0, 3, 3))}, "There are no rotations"),
-        ({"rotations": [[1, 0, 0], [0, 1], [0, 0, 1]]}, "rotations must be an array or rows"),
-        ({"positions": [0, 0, np.nan]}, "Position 0 is .*nan"),
+        ({"rotations": np.eye(3) * 1j}, "rotations must be real numbers .* not complex128"),
+        ({"rotations": np.zeros((0, 3, 3))}, "1 positions and 0 rotations"),
         ({"positions": [[0, 0, 0], [0, np.inf, 1]]}, "Position 1 is .*inf"),
-        ({"positions": np.zeros((0, 3))}, "There are no positions"),
-        ({"positions": np.zeros((2, 2))}, r"positions must have the shape \(n, 3\)"),
+        ({"positions": np.zeros((0, 3))}, "0 positions and 0 rotations"),
+        ({"positions": np.zeros((2, 2))}, r"positions must be real numbers of shape \(n, 3\)"),
         ({"positions": np.zeros((2, 3))}, "There are 2 poses: rays_per_pose must say"),
         ({"rotations": rotations(2)}, "There are 2 poses: rays_per_pose must say"),
         (
@@ -276,40 +268,29 @@ def test_groups_are_counted_across_chunks():
             {"positions": np.zeros((2, 3)), "rays_per_pose": 1},
             "2 poses of 1 rays are not enough for 3 rays",
         ),
-        ({"rays_per_pose": 2}, "1 poses of 2 rays are not enough for 3 rays"),
         ({"rays_per_pose": 0}, "1 poses of 0 rays"),
         ({"t_min": 2, "t_max": 1}, "t_min is 2.0 and t_max 1.0"),
         ({"keep_every": 0}, "keep_every is 0: it must be at least 1"),
-        ({"groups": [1, 2]}, "groups begin at rays 1 to 2: expected numbers that ascend from 0"),
-        ({"groups": [0, 2, 1]}, "groups begin at rays 0 to 1"),
-        ({"groups": [0, 4]}, "groups begin at rays 0 to 4: .* the window's 3 rays"),
-        ({"groups": []}, "groups must be numbers of the rays at which groups begin"),
-        ({"groups": [0.0]}, r"groups must be .*, not float64 \(1,\)"),
-        ({"groups": [[0]]}, r"groups must be .*, not int64 \(1, 1\)"),
+        *(
+            ({"groups": groups}, "expected the numbers of the rays at which groups begin")
+            for groups in ([1, 2], [0, 2, 1], [0, 4], [], [0.0], [[0]])
+        ),
     ],
 )
 def test_scan_refused(change, words):
     caster = RayCaster(*TRIANGLE, "numpy")
     with pytest.raises(ValueError, match=words):
-        caster.scan(Pattern(np.eye(3)), **{"positions": [0, 0, 0], **change})
+        caster.scan(**{"pattern": Pattern(np.eye(3)), "positions": [0, 0, 0], **change})
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        *(
-            ({"window": window}, r"window must be two row numbers, \(start, stop\), or")
-            for window in ((0, 1.0), (0, 1, 2), 1, slice(0, 1))
-        ),
-        ({"rays_per_pose": 1.5}, "rays_per_pose must be a whole number, or None, not 1.5"),
-        ({"keep_every": 1.0}, "keep_every must be a whole number, not 1.0"),
-        ({"t_min": None}, "t_min and t_max must be numbers"),
-    ],
+    "change",
+    [{"window": (0, 1.0)}, {"rays_per_pose": 1.5}, {"keep_every": 1.0}, {"t_min": None}],
     ids=str,
 )
-def test_what_is_of_a_wrong_type(change, words):
+def test_what_is_no_number(change):
     caster = RayCaster(*TRIANGLE, "numpy")
-    with pytest.raises(TypeError, match=words):
+    with pytest.raises(TypeError):
         caster.scan(Pattern(np.eye(3)), [0, 0, 0], **change)
 
 
@@ -320,12 +301,6 @@ def test_window_of_numpy_integers():
     assert hits.ray.tolist() == [0]
 
 
-def test_window_of_an_empty_pattern():
-    caster = RayCaster(*TRIANGLE, "numpy")
-    with pytest.raises(ValueError, match="Rows 0 to 2 cannot be cast: the pattern has none"):
-        caster.scan(Pattern(np.empty((0, 3))), [0, 0, 0], window=(0, 2))
-
-
 def test_directions_that_are_no_pattern():
     caster = RayCaster(*TRIANGLE, "numpy")
     with pytest.raises(TypeError, match=r"pattern must be .*, not list: make one .* by Pattern"):
@@ -333,12 +308,6 @@ def test_directions_that_are_no_pattern():
 
 
 # ---- the pattern itself ----
-
-
-def test_more_rays_than_can_be_numbered_are_refused():
-    many = np.broadcast_to([0.0, 0.0, 1.0], (2**32 + 1, 3))  # takes no memory
-    with pytest.raises(ValueError, match=r"4,294,967,297 directions are more than the 4,294,967,2"):
-        Pattern(many)
 
 
 def test_pattern_refused():
@@ -365,8 +334,7 @@ def test_pattern_is_what_was_given():
 @pytest.mark.parametrize(
     ("change", "error", "words"),
     [
-        ({"numbers": [0.5]}, TypeError, "numbers of rays must be whole, not float64"),
-        ({"numbers": [[1]]}, ValueError, r"numbers of rays must have the shape \(m,\), not \(1, 1"),
+        ({"numbers": [0.5]}, TypeError, "float64"),
         ({"numbers": [3, -1]}, ValueError, "There are no rays -1 to 4 after row 0"),
         ({"start": -1}, ValueError, "There are no rays 0 to 2 after row -1"),
         ({"positions": np.zeros((2, 3))}, ValueError, "There are 2 poses: rays_per_pose"),
@@ -379,5 +347,5 @@ def test_rays_refused(change, error, words):
 
 
 def test_no_rays_of_a_pattern():
-    origins, directions = Pattern(np.eye(3)).rays([], [1, 2, 3])
+    origins, directions = Pattern(np.eye(3)).rays(np.zeros(0, int), [1, 2, 3])
     assert (origins.tolist(), directions.shape) == ([[1, 2, 3]], (0, 3))

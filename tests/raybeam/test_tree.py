@@ -118,12 +118,6 @@ def test_tree_is_better_than_halves_of_a_sorted_list(shapes):
     assert cost(tree.low, tree.high) < 0.6 * halved
 
 
-def test_no_triangles_make_a_tree_that_nothing_meets():
-    tree = build_tree(np.zeros((0, 3, 3)), 4, 4)
-    assert list(leaves(tree)) == []
-    assert _stack_need(tree) == 0
-
-
 def test_layout_for_the_device(shapes):
     mesh = local_mesh(*shapes["vase"]())
     layout = lay_out(mesh)
@@ -135,7 +129,3 @@ def test_layout_for_the_device(shapes):
         layout.triangles.reshape(k, 3, 4)[:, 0, :3], layout.corners[:, :3].astype(np.float32)
     )
     assert 0 < layout.stack < 64
-    assert layout.nbytes == sum(
-        table.nbytes
-        for table in (layout.nodes, layout.triangles, layout.corners, layout.faces, layout.frame)
-    )

@@ -80,21 +80,3 @@ def test_embree_leaks_little(shapes):
     vertices, faces = shapes["vase"]()
     caster = RayCaster(vertices, faces, "embree")
     assert escaped(caster, vertices, faces, INSIDE, 20_000, 6) < 0.005 * 40_000
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [*CLOSED, "six objects"])
-def test_no_ray_of_ten_million_escapes(exact_caster, shapes, name):
-    """Two million of them each, half where the mesh stands and half far from zero."""
-    if name == "six objects":
-        meshes = list(six_objects(shapes["sphere"]))
-    else:
-        meshes = [(*(shapes[name](700) if name == "terrain box" else shapes[name]()), INSIDE)]
-    count = 500_000 // len(meshes)
-    for vertices, faces, inside in meshes:
-        turn, _ = np.linalg.qr(np.random.default_rng(7).normal(size=(3, 3)))
-        for offset in (0, 5e5):
-            moved, start = vertices @ turn.T + offset, turn @ inside + offset
-            caster = exact_caster(moved, faces)
-            for part in range(4):
-                assert escaped(caster, moved, faces, start, count // 4, part) == 0

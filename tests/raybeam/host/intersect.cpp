@@ -12,6 +12,4 @@ extern "C" const long long* what_was_seen() { return seen; }
 RUN(cast_table)
 RUN(cast_pattern)
 RUN(weigh_table)
-RUN(count_table)
-RUN(count_closest)
 RUN(pack)

@@ -35,11 +35,6 @@ static inline To bits(From from)
 static inline int __float_as_int(float f) { return bits<int>(f); }
 static inline float __int_as_float(int i) { return bits<float>(i); }
 
-static inline unsigned long long atomicAdd(unsigned long long* at, unsigned long long more)
-{
-    return __atomic_fetch_add(at, more, __ATOMIC_RELAXED);
-}
-
 using std::fabs;
 using std::fmax;
 using std::fmin;
