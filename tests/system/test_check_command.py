@@ -134,7 +134,7 @@ def test_a_backend_that_is_not_here(check, monkeypatch):
 def test_a_survey_that_hits_nothing_is_told_of(check):
     outcome = check("--json", text=json.dumps(SHORT | {"poses": [[0, 0, 1000]]}))
     assert outcome.code == 0
-    assert "no ray cast here hit anything" in json.loads(outcome.out)["notes"][0]
+    assert "no ray that was cast hit anything" in json.loads(outcome.out)["notes"][0]
 
 
 def test_an_unfinished_run_is_told_of(check, tmp_path):

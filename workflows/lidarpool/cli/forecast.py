@@ -33,7 +33,7 @@ from ..scan.rig import PATTERN_RAYS, Rig, RigPlan
 from ..scenario.sections import PoolSection
 from ..scene.scene import Scene
 from ..sensor import Survey
-from .run_command import RUN_FOLDER
+from .run_command import NO_HITS, RUN_FOLDER
 
 # Measured on Linux: a process of ours with Dask and Open3D loaded, and what a triangle takes at
 # most while a caster is built (Embree 300, NumPy 320, CUDA up to 400, there on the device).
@@ -157,7 +157,7 @@ def forecast(job: Job, pool: PoolSection, out: Path, client: Client | None = Non
     if _worker_bytes(job) <= MEMORY_LIMIT:
         made.sample = sample_survey(job.scene, job.survey)
         if not made.sample.hits:
-            made.notes.append("no ray cast here hit anything: look at poses, ranges and units")
+            made.notes.append(NO_HITS)
     _reckon(made, alone=client is None)
     return made
 

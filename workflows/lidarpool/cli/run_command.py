@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from ..live import LiveRun
 
 RUN_FOLDER = "run"  # of what is kept of a run until its result is whole, in the output folder
+NO_HITS = "no ray that was cast hit anything: look at poses, ranges and units"
 
 
 @dataclass(frozen=True)
@@ -229,6 +230,8 @@ def _local_client(scenario: Scenario, options: RunOptions, planning: bool) -> It
 def _tell(out: Path, result: Result, job: Job, files: list[str]) -> None:
     for note in result.notes:
         click.echo(f"note: {note}")
+    if not result.hits:
+        click.echo(f"note: {NO_HITS}")
     click.echo(
         f"{job.survey.scan_count:,} scans, {result.rays:,} rays, {result.hits:,} hits on "
         f"{counted(len(job.scene.names), 'object')}, {len(result.points):,} points in the cloud "

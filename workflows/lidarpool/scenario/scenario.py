@@ -16,7 +16,7 @@ from ..base.words import did_you_mean
 from ..plan import Planning
 from ..scene.floor import floor_under
 from ..scene.mesh import Mesh
-from ..scene.meshfile import SUFFIXES, UNITLESS, load_meshes
+from ..scene.meshfile import SUFFIXES, UNITLESS, read_mesh_file
 from ..scene.scene import Scene
 from ..scene.shapes import seed_objects
 from ..sensor import Pose, Survey
@@ -90,6 +90,7 @@ class Scenario(Section):
 
     _folder: Path = PrivateAttr(default=Path())  # that relative file names start from
     _source: str = PrivateAttr(default="scenario")  # for messages
+    _notes: list[str] = PrivateAttr(default_factory=list)  # of what was left out of the scene
 
     @field_validator("scene", "sensor", "cloud", "planning", "pool", mode="before")
     @classmethod
@@ -172,7 +173,10 @@ class Scenario(Section):
         return scenario
 
     def advice(self, scene: Scene) -> list[str]:
-        """Return notes on what looks like a mistake: a size that speaks of another unit."""
+        """Return notes on what looks like a mistake: a size that speaks of another unit.
+
+        Also on objects that `build_scene` left out.
+        """
         unitless = [
             entry.file
             for entry in self.scene.files
@@ -180,10 +184,11 @@ class Scenario(Section):
         ]
         side = float(np.ptp(scene.bounds, axis=0).max())
         if not unitless or SMALL_M <= side <= LARGE_M:
-            return []
+            return list(self._notes)
         return [
+            *self._notes,
             f"{unitless[0]} states no unit, and in metres the scene is {side:,.5g} m long: if that "
-            f"is wrong, give the file's unit ({'mm' if side > LARGE_M else 'km'}?) in scene.files"
+            f"is wrong, give the file's unit ({'mm' if side > LARGE_M else 'km'}?) in scene.files",
         ]
 
     def build_scene(self) -> Scene:
@@ -194,6 +199,7 @@ class Scenario(Section):
         LidarpoolError
             If a mesh file cannot be read.
         """
+        self._notes.clear()
         meshes: list[Mesh] = list(seed_objects()) if self.scene.has_seed else []
         for entry in self.scene.files:
             meshes += self._read(entry)
@@ -260,11 +266,18 @@ class Scenario(Section):
                 seed=section.seed,
             )
 
-    def _read(self, entry: MeshFile) -> tuple[Mesh, ...]:
-        path = self._folder / Path(entry.file).expanduser()
+    def _read(self, entry: MeshFile) -> list[Mesh]:
         with self._named():
+            try:
+                path = self._folder / Path(entry.file).expanduser()
+            except RuntimeError as error:  # of a user who is not known
+                raise LidarpoolError(f"the file {entry.file!r} has no place: {error}") from error
             transform = entry.transform()
-        return load_meshes(path, unit=entry.unit, up_axis=entry.up_axis, transform=transform)
+        content = read_mesh_file(path, unit=entry.unit, up_axis=entry.up_axis, transform=transform)
+        if content.skipped:
+            names = ", ".join(content.skipped[:3]) + ", …" * (len(content.skipped) > 3)
+            self._notes.append(f"{entry.file} scales {names} to nothing: left out")
+        return content.meshes
 
     def _world_poses(
         self, scene: Scene

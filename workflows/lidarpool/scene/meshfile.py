@@ -4,54 +4,44 @@ from __future__ import annotations
 
 import codecs
 import errno
-import io
-import json
 import logging
 import re
 import stat
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..base.errors import LidarpoolError
 from ..base.words import did_you_mean
-from .gltf_buffers import buffers_beside
+from .dae import read_dae
+from .gltf import read_gltf
 from .mesh import Mesh
-from .meshfault import MeshFileError
-from .meshguard import binary_stl_size, find_fault, gltf_fault, gltf_header
-from .objfile import read_obj
-from .offfile import read_off
-from .plymesh import read_ply_mesh
-from .threemf import placed_objects
+from .nodes import Content, MeshFileError
+from .polygon_files import read_obj, read_off, read_ply_mesh, read_stl
+from .threemf import read_3mf
 from .transform import UNITS_M, UP_AXES, Transform
 
-if TYPE_CHECKING:
-    import trimesh
-
-SUFFIXES = (".glb", ".gltf", ".obj", ".stl", ".ply", ".off", ".dae", ".3mf")
+# A reader takes the content of a file and its path, and raises whatever it stumbles over. Each is
+# our own; why no library serves is said in its module.
+_READERS: dict[str, Callable[[bytes, Path], Content]] = {
+    ".glb": read_gltf,
+    ".gltf": read_gltf,
+    ".obj": read_obj,
+    ".stl": read_stl,
+    ".ply": read_ply_mesh,
+    ".off": read_off,
+    ".dae": read_dae,
+    ".3mf": read_3mf,
+}
+SUFFIXES = tuple(_READERS)
 UNITLESS = (".obj", ".stl", ".ply", ".off")  # that cannot say in which unit their numbers are
 
 # Nothing on Earth is farther from the origin of its map; see also `sections.Coordinate`.
 FARTHEST_M = 1e8
 _LETTERS = 200  # of a name, or of what a reader says
 
-# What trimesh logs of files goes to those who listen, instead of to the terminal with a traceback.
-logging.getLogger("trimesh").addHandler(logging.NullHandler())
-
-# {ending: reader} of the formats whose faces are polygons.
-_POLYGONS = {".obj": read_obj, ".ply": read_ply_mesh, ".off": read_off}
-
-# By the 3MF core specification, 3.4.
-_3MF_UNITS_M = {
-    "micron": 1e-6,
-    "millimeter": 1e-3,
-    "millimeters": 1e-3,  # what trimesh says where the file says nothing
-    "centimeter": 1e-2,
-    "inch": 0.0254,
-    "foot": 0.3048,
-    "meter": 1.0,
-}
+_log = logging.getLogger(__name__)
 
 
 def load_meshes(
@@ -64,7 +54,8 @@ def load_meshes(
     """Read all objects of a mesh file.
 
     Every instance of a scene graph is a mesh of its own, named by its node; files without
-    names give one object named by the file.
+    names give one object named by the file. Objects that their nodes scale to nothing are left
+    out, and named in a warning of this module's logger.
 
     Parameters
     ----------
@@ -88,6 +79,20 @@ def load_meshes(
     LidarpoolError
         If the file cannot be read whole, or there are no triangles in it.
     """
+    content = read_mesh_file(path, unit=unit, up_axis=up_axis, transform=transform)
+    if content.skipped:
+        _log.warning("%s: scaled to nothing, left out: %s", path, ", ".join(content.skipped))
+    return tuple(content.meshes)
+
+
+def read_mesh_file(
+    path: str | Path,
+    *,
+    unit: str | None = None,
+    up_axis: str | None = None,
+    transform: Transform | None = None,
+) -> Content:
+    """Read as `load_meshes` does; what is left out is only in the result."""
     path = Path(path)
     if unit is not None and unit not in UNITS_M:
         raise LidarpoolError(f"unit is {unit!r}; it must be one of {', '.join(UNITS_M)}.")
@@ -95,21 +100,25 @@ def load_meshes(
         raise LidarpoolError(f"up_axis is {up_axis!r}; it must be x, y or z.")
     data = _bytes_of(path)
     with np.errstate(all="ignore"):  # of broken numbers in files; what is not finite is refused
-        meshes, own_unit_m, own_axis = _read_whole(path, data)
-        unit_m = UNITS_M[unit] if unit else own_unit_m or 1.0
-        upright = Transform(UP_AXES[up_axis or own_axis or "z"] * unit_m, np.zeros(3))
+        content = _read_whole(path, data)
+        unit_m = UNITS_M[unit] if unit else content.unit_m or 1.0
+        upright = Transform(UP_AXES[up_axis or content.up_axis or "z"] * unit_m, np.zeros(3))
         try:
-            return tuple(_placed(mesh, path.stem, upright, transform) for mesh in meshes)
+            content.meshes = [
+                _placed(mesh, path.stem, upright, transform) for mesh in content.meshes
+            ]
         except LidarpoolError as error:
             raise LidarpoolError(f"{path}: {error}") from error
+    return content
 
 
-def _read_whole(path: Path, data: bytes) -> tuple[list[Mesh], float | None, str | None]:
-    """As `_read`, whatever the file is: at least one mesh, or LidarpoolError."""
+def _read_whole(path: Path, data: bytes) -> Content:
+    """Read a file, whatever it is: at least one mesh, or LidarpoolError."""
+    suffix = path.suffix.lower()
     try:
-        if fault := find_fault(path, data):
-            raise MeshFileError(fault)
-        meshes, own_unit_m, own_axis = _read(path, data)
+        if foreign := _foreign_content(suffix, data):
+            raise MeshFileError(foreign)
+        content = _READERS[suffix](data, path)
     except MemoryError:
         raise
     except MeshFileError as refused:
@@ -117,29 +126,29 @@ def _read_whole(path: Path, data: bytes) -> tuple[list[Mesh], float | None, str 
     except LidarpoolError as error:
         raise LidarpoolError(f"{path}: {error}") from error
     except Exception as error:
-        # The readers raise whatever they stumble over: ValueError, IndexError, KeyError,
-        # AssertionError, BadZipFile, XMLSyntaxError, DaeError, NotImplementedError, …
+        # Readers raise whatever they stumble over: ValueError, IndexError, KeyError, BadZipFile,
+        # ParseError, struct.error, …
         reason = _printable(str(error)) or type(error).__name__
         raise LidarpoolError(
             f"{path} is broken or cut short ({reason}): export it again."
         ) from error
-    if not meshes:
+    if not content.meshes:
+        if content.skipped:
+            raise LidarpoolError(f"{path} holds no triangles that are not scaled to nothing.")
         raise LidarpoolError(
-            f"{path} holds no triangles: it is empty, cut short, or not a {path.suffix} file."
+            f"{path} holds no triangles: it is empty, or has only points, lines or other things "
+            "that reflect no light."
         )
-    return meshes, own_unit_m, own_axis
+    return content
 
 
 def _bytes_of(path: Path) -> bytes:
     """Check that `path` is a readable file of a known kind, and read it."""
     try:
         kind = path.stat().st_mode
+        if stat.S_ISREG(kind) and path.suffix.lower() in SUFFIXES:
+            data = path.read_bytes()
     except OSError as error:
-        if error.errno == errno.ENOENT and path.is_symlink():
-            raise LidarpoolError(
-                f"{path} is a link to {path.readlink()}, which does not exist: mend the link, or "
-                "give the file itself."
-            ) from error
         if error.errno in (errno.ENOENT, errno.ENOTDIR):
             raise LidarpoolError(
                 f"{path} does not exist: check the name and the folder.{_like(path)}"
@@ -154,10 +163,6 @@ def _bytes_of(path: Path) -> bytes:
             f"{path} has the ending {path.suffix or '(none)'}, which is not a mesh format that "
             f"can be read; these are: {' '.join(SUFFIXES)}."
         )
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise LidarpoolError(f"{path} cannot be read: {error.strerror}.") from error
     if not data:
         raise LidarpoolError(f"{path} is empty (0 bytes): export the mesh again.")
     return data.removeprefix(codecs.BOM_UTF8)  # which editors put before text
@@ -172,108 +177,35 @@ def _like(path: Path) -> str:
     return did_you_mean(path.name, [name for name in beside if name.lower().endswith(SUFFIXES)])
 
 
-def _read(path: Path, data: bytes) -> tuple[list[Mesh], float | None, str | None]:
-    """Meshes in the file's own unit and axes; metres in its unit and its up axis, if stated."""
-    suffix = path.suffix.lower()
-    if suffix in _POLYGONS:
-        return _POLYGONS[suffix](data, path.stem), None, None
-    if suffix == ".dae":
-        from .dae import read_dae
-
-        return read_dae(io.BytesIO(data))
-    if suffix in (".glb", ".gltf"):
-        return _read_gltf(path, data), 1.0, "y"
-    if suffix == ".3mf":
-        return _read_3mf(path, data)
-    # A few bytes behind the last triangle are more than trimesh expects.
-    scene = _trimesh_scene(data[: binary_stl_size(data)], suffix)
-    return _objects(scene, path), None, None
-
-
-def _trimesh_scene(data: bytes, suffix: str, **options: Any) -> trimesh.Scene:
-    import trimesh  # not above: half a second that workers, who read no files, do without
-
-    return trimesh.load_scene(io.BytesIO(data), file_type=suffix[1:], process=False, **options)
+# What files of other kinds begin with, and those mesh files that have a beginning of their own.
+_FOREIGN = (
+    (re.compile(rb"\x1f\x8b|BZh|\xfd7zXZ\0|7z\xbc\xaf"), "is packed: unpack it first"),
+    (re.compile(rb"(?i)<!doctype html|<html"), "is a page of the web: download the file itself"),
+    (re.compile(rb"version https://git-lfs"), "only points to a mesh: get it with git lfs pull"),
+)
+_MESHES = (
+    (re.compile(rb"glTF"), ".glb"),
+    (re.compile(rb"PK\x03\x04"), ".3mf"),
+    (re.compile(rb"ply[ \t]*[\r\n]"), ".ply"),
+    (re.compile(rb"(ST)?C?N?OFF\b"), ".off"),
+    (re.compile(rb"solid\b[^\0]*\bfacet\s+normal"), ".stl"),
+    (re.compile(rb"<\?xml[^\0]*<COLLADA\b"), ".dae"),
+    (re.compile(rb'\{[^\0]*"asset"\s*:'), ".gltf"),
+)
 
 
-def _read_gltf(path: Path, data: bytes) -> list[Mesh]:
-    """Meshes of a .glb or .gltf file."""
-    suffix = path.suffix.lower()
-    header = gltf_header(path, data)
-    buffers = buffers_beside(header, path)
-    if fault := gltf_fault(header, len(data) + sum(map(len, buffers.values()))):
-        raise MeshFileError(fault)
-    if suffix == ".gltf":
-        data = json.dumps(header).encode()
-    # Neither materials nor their pictures are looked for, and no other file is opened.
-    scene = _trimesh_scene(data, suffix, resolver=buffers, skip_materials=True)
-    return _objects(scene, path)
-
-
-def _read_3mf(path: Path, data: bytes) -> tuple[list[Mesh], float | None, str | None]:
-    """As `_read`, for .3mf files."""
-    scene = _trimesh_scene(data, ".3mf")
-    _check_complete(scene, placed_objects(data))
-    stated = {mesh.metadata.get("units") for mesh in scene.geometry.values()}
-    unknown = stated - set(_3MF_UNITS_M)
-    if unknown:
-        raise ValueError(f"unknown unit {', '.join(map(repr, unknown))}")
-    return _objects(scene, path), _3MF_UNITS_M[stated.pop()] if stated else None, "z"
-
-
-def _check_complete(scene: trimesh.Scene, placed: int | None) -> None:
-    found = len(scene.graph.nodes_geometry)
-    if placed is not None and placed != found:
-        raise LidarpoolError(
-            f"{found:,} of the {placed:,} objects that it places can be read: export it without "
-            "nested components and repeated part numbers, or as .glb."
-        )
-
-
-def _objects(scene: trimesh.Scene, path: Path) -> list[Mesh]:
-    """One mesh for each node with triangles, nodes' transforms applied."""
-    parts: dict[str, list[Mesh]] = {}  # {node of the object: its primitives}
-    for node in scene.graph.nodes_geometry:
-        matrix, key = scene.graph[node]
-        geometry = scene.geometry[key]
-        faces = np.asarray(getattr(geometry, "faces", ()), dtype=np.int64).reshape(-1, 3)
-        if not len(faces):
-            continue  # lines or points, which reflect no light
-        owner = str(node)
-        if geometry.metadata.get("from_gltf_primitive"):
-            # A glTF mesh of several materials comes as one node for each, with random names,
-            # under the node that the file names.
-            owner = str(scene.graph.transforms.parents[node])
-        name = _object_name(owner, str(key), geometry, path)
-        mesh = Mesh(name, geometry.vertices, faces)
-        parts.setdefault(owner, []).append(_moved(mesh, Transform.from_matrix(matrix)))
-    # The reader of .glb and .gltf gives the last object first.
-    owners = list(parts)
-    if path.suffix.lower() in (".glb", ".gltf"):
-        owners.reverse()
-    return [_joined(parts[owner]) for owner in owners]
-
-
-def _object_name(owner: str, key: str, geometry: Any, path: Path) -> str:
-    """Name of the object that belongs to node `owner`, `key` being its geometry's name."""
-    if path.suffix.lower() == ".stl":
-        name = str(geometry.metadata.get("name") or path.stem)
-        # What trimesh calls a solid without a name.
-        return path.stem if re.fullmatch(r"geometry_\d+", name) else name
-    # A number is what the glTF reader calls a node without a name.
-    return key if owner.isdigit() else owner
-
-
-def _joined(parts: list[Mesh]) -> Mesh:
-    """One mesh of several."""
-    if len(parts) == 1:
-        return parts[0]
-    first = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
-    return Mesh(
-        parts[0].name,
-        np.concatenate([part.vertices for part in parts]),
-        np.concatenate([part.faces + at for part, at in zip(parts, first, strict=True)]),
-    )
+def _foreign_content(suffix: str, data: bytes) -> str | None:
+    """Say what a file is by its content that is not what it is called; None for nothing known."""
+    head = data[:4000].lstrip()
+    for pattern, what in _FOREIGN:
+        if pattern.match(head):
+            return what
+    kinds = [kind for pattern, kind in _MESHES if pattern.match(head)]
+    if kinds == [".3mf"] and suffix != ".3mf":
+        return "is a ZIP archive: unpack it first, or call it .3mf if it is one"
+    if kinds and suffix not in kinds and {suffix, kinds[0]} != {".glb", ".gltf"}:
+        return f"is a {kinds[0]} file by its content: give it that ending"
+    return None
 
 
 def _placed(mesh: Mesh, stem: str, upright: Transform, transform: Transform | None) -> Mesh:

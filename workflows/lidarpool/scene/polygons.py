@@ -41,11 +41,7 @@ def triangulated(
     ValueError
         If a corner names no vertex, or a polygon that is not convex has too many corners.
     """
-    if len(corners) and not 0 <= corners.min() <= corners.max() < len(vertices):
-        raise ValueError(
-            f"faces name vertices {corners.min()} to {corners.max()}, counted from 0, of "
-            f"{len(vertices)}"
-        )
+    _check(vertices, corners)
     first = np.cumsum(sizes) - sizes
     ends = np.cumsum(np.maximum(sizes - 2, 0))
     out = np.full((int(ends[-1]) if len(ends) else 0, 3), -1, dtype=np.int64)
@@ -63,6 +59,30 @@ def triangulated(
                     out[places[i]] = -1
                     out[places[i, : len(clipped)]] = rows[i][clipped]
     return out[out[:, 0] >= 0]
+
+
+def with_holes(vertices: NDArray[np.float64], rings: list[NDArray[np.int64]]) -> NDArray[np.int64]:
+    """Triangles (t, 3) of one polygon: its outline, and outlines of holes in it.
+
+    Raises
+    ------
+    ValueError
+        As `triangulated`.
+    """
+    corners = np.concatenate(rings)
+    _check(vertices, corners)
+    flat = _plane(vertices[corners], len(rings[0]))
+    ends = np.cumsum([len(ring) for ring in rings]).astype(np.uint32)
+    found = mapbox_earcut.triangulate_float64(flat, ends).astype(np.int64)
+    return corners[found].reshape(-1, 3)
+
+
+def _check(vertices: NDArray[np.float64], corners: NDArray[np.int64]) -> None:
+    if len(corners) and not 0 <= corners.min() <= corners.max() < len(vertices):
+        raise ValueError(
+            f"faces name vertices {corners.min()} to {corners.max()}, counted from 0, of "
+            f"{len(vertices)}"
+        )
 
 
 def _begun_well(vertices: NDArray[np.float64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -101,13 +121,15 @@ def _clipped(points: NDArray[np.float64]) -> NDArray[np.int64]:
     return found.astype(np.int64).reshape(-1, 3)
 
 
-def _plane(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _plane(points: NDArray[np.float64], outline: int | None = None) -> NDArray[np.float64]:
     """Corners (k, 3) of a polygon as seen from its outside, anticlockwise: (k, 2).
 
-    The clipper makes triangles that run anticlockwise, whatever the polygon does.
+    The clipper makes triangles that run anticlockwise, whatever the polygon does. Of a polygon
+    with holes only the first corners are its `outline`.
     """
     points = points - points[0]  # of coordinates far from zero nothing is lost
-    normal = np.cross(points, np.roll(points, -1, axis=0)).sum(axis=0)
+    around = points[:outline]
+    normal = np.cross(around, np.roll(around, -1, axis=0)).sum(axis=0)
     drop = int(np.abs(normal).argmax())
     across, up = (drop + 1) % 3, (drop + 2) % 3
     if normal[drop] < 0:

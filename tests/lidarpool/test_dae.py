@@ -1,0 +1,222 @@
+"""COLLADA files: nothing vanishes in silence, and what is harmless does no harm."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from lidarpool.base.errors import LidarpoolError
+from lidarpool.scene.meshfile import load_meshes
+from lidarpool.scene.scene import Scene
+
+DAE = """<?xml version="1.0"?>{doctype}
+<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+ <asset>{asset}</asset>
+ {libraries}
+ <library_geometries><geometry id="g" name="shape"><mesh>
+  <source id="p"><float_array id="a" count="24">{numbers}</float_array>
+   <technique_common><accessor source="#a" {accessor}>
+    <param name="X" type="float"/><param name="Y" type="float"/><param name="Z" type="float"/>
+   </accessor></technique_common></source>
+  <vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
+  {primitive}
+ </mesh></geometry></library_geometries>
+ <library_nodes>{nodes}</library_nodes>
+ <library_visual_scenes><visual_scene id="s">
+  <node id="n" name="Wall">{here}</node>
+ </visual_scene></library_visual_scenes>
+ <scene><instance_visual_scene url="#s"/></scene>
+</COLLADA>
+"""
+V = '<input semantic="VERTEX" source="#v" offset="0"/>'
+HERE = '<instance_geometry url="#g"/>'
+# Corners of a square of 4 x 4, and of one of 2 x 2 in it.
+SQUARES = "0 0 0  4 0 0  4 4 0  0 4 0  1 1 0  3 1 0  3 3 0  1 3 0"
+PARTS = {
+    "doctype": "",
+    "asset": "<up_axis>Z_UP</up_axis>",
+    "libraries": "",
+    "numbers": SQUARES,
+    "accessor": 'count="8" stride="3"',
+    "primitive": f'<polylist count="1">{V}<vcount>4</vcount><p>0 1 2 3</p></polylist>',
+    "nodes": "",
+    "here": HERE,
+}
+
+
+def load(tmp_path, **parts):
+    path = tmp_path / "m.dae"
+    path.write_text(DAE.format(**(PARTS | parts)))
+    return load_meshes(path)
+
+
+def area(meshes):
+    return sum(trimesh.Trimesh(m.vertices, m.faces, process=False).area for m in meshes)
+
+
+def test_names_unit_axis_and_digits(tmp_path):
+    meshes = load(
+        tmp_path,
+        asset='<unit name="centimeter" meter="0.01"/><up_axis>Y_UP</up_axis>',
+        numbers=SQUARES.replace("4 0 0", "50000012.25 0 0"),
+        here="<translate>10 0 0</translate>"
+        f'<node name="Chair"><rotate>0 0 1 90</rotate>{HERE}</node>'
+        f'<node name="Chair"><scale>2 2 -2</scale>{HERE}</node>',
+    )
+    assert Scene.from_meshes(meshes).names == ("Chair", "Chair.2")
+    # 50000012.25 along x, turned by 90 degrees about z to y, moved by 10; then Y-up: y is z.
+    np.testing.assert_allclose(meshes[0].vertices[:, 2].max(), 500000.1225, rtol=1e-15)
+    np.testing.assert_allclose(meshes[0].vertices[:, 0].max(), 0.1, rtol=1e-7)
+    assert meshes[1].vertices[:, 0].max() == pytest.approx(1000000.345, rel=1e-15)
+
+
+def test_what_states_nothing_is_in_metres_and_stands_by_its_standard(tmp_path):
+    # COLLADA 1.4.1: up_axis is Y_UP where it is left out.
+    (mesh,) = load(tmp_path, asset="")
+    assert np.ptp(mesh.vertices, axis=0).tolist() == [4, 0, 4]
+
+
+EFFECT = '<technique_common><instance_material symbol="m" target="{}"/></technique_common>'
+MATERIAL = (
+    '<library_materials><material id="m"><instance_effect url="#no"/></material>'
+    "</library_materials>"
+)
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        # As the walls of a hospital were: the material, or what it is made of, is not there.
+        {"here": HERE.replace("/>", f">{EFFECT.format('#gone')}</instance_geometry>")},
+        {
+            "here": HERE.replace("/>", f">{EFFECT.format('#m')}</instance_geometry>"),
+            "libraries": MATERIAL,
+        },
+        {"libraries": '<library_images><image id="i"/></library_images>'},
+        {
+            "libraries": '<library_images><image id="i"><init_from>../gone.png</init_from></image>'
+            "</library_images>"
+        },
+        {
+            "libraries": '<library_effects><effect id="e"><profile_COMMON><color>red</color>'
+            "</profile_COMMON></effect></library_effects>"
+        },
+        {"primitive": f"<!-- shelf -->{PARTS['primitive']}"},
+        {"here": f"<!-- shop -->{HERE}<instance_light url='#gone'/>"},
+        {"here": f"<rotate>0 0 0 0</rotate>{HERE}"},
+        {"here": f"<lookat>0 0 0  0 0 -1  0 1 0</lookat>{HERE}"},
+        {"numbers": f"7 7 {SQUARES}", "accessor": 'count="8" stride="3" offset="2"'},
+        {
+            "numbers": SQUARES.replace("  ", " 99 ") + " 99",
+            "accessor": 'count="8" stride="4"',
+        },
+        {"primitive": f'<tristrips count="1">{V}<p>0 1 3 2</p></tristrips>'},
+        {"primitive": f'<trifans count="1">{V}<p>0 1 2 3</p></trifans>'},
+        {"primitive": f'<polygons count="1">{V}<p>0 1 2 3</p></polygons>'},
+        {
+            "primitive": '<triangles count="2"><input semantic="VERTEX" source="#v" offset="1"/>'
+            '<input semantic="NORMAL" source="#gone" offset="0"/>'
+            "<p>9 0 9 1 9 2 9 0 9 2 9 3</p></triangles>"
+        },
+        {
+            "primitive": f"{PARTS['primitive']}<lines>{V}<p>4 5</p></lines>",
+            "here": f'<node name="">{HERE}</node>',
+        },
+    ],
+    ids=str,
+)
+def test_what_is_harmless_does_no_harm(tmp_path, parts):
+    (mesh,) = load(tmp_path, **parts)
+    assert mesh.name == "Wall"
+    assert area([mesh]) == pytest.approx(16)
+    assert np.ptp(mesh.vertices[:, 0]) == 4
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
+    assert (np.cross(b - a, c - a)[:, 2] > 0).all()
+
+
+def test_polygons_with_holes_and_not_convex(tmp_path):
+    holed = "<ph><p>0 1 2 3</p><h>4 7 6 5</h></ph>"
+    (frame,) = load(tmp_path, primitive=f'<polygons count="1">{V}{holed}</polygons>')
+    assert area([frame]) == pytest.approx(12)
+    corners = f'<polylist count="1">{V}<vcount>6</vcount><p>0 1 5 4 7 3</p></polylist>'
+    (corner,) = load(tmp_path, primitive=corners)
+    assert area([corner]) == pytest.approx(6)
+
+
+def doubled(levels):
+    """Nodes that each contain the one before twice."""
+    here = '<instance_node url="#k{}"/>'
+    pairs = [f'<node id="k{i + 1}">{here.format(i) * 2}</node>' for i in levels]
+    return f'<node id="k0">{HERE}</node>' + "".join(pairs)
+
+
+def test_nodes_of_a_library_stand_where_they_are_named(tmp_path):
+    meshes = load(tmp_path, nodes=doubled(range(3)), here='<instance_node url="#k3"/>')
+    assert len(meshes) == 8
+
+
+CONTROLLER = '<library_controllers><controller id="c"><{} source="#g"/></controller>{}'
+AMPLE = "".join(
+    f'<!ENTITY {name} "{f"&{of};" * 10}">' for of, name in zip("abcdefgh", "bcdefghi", strict=True)
+)
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"here": HERE + '<instance_geometry url="#lost"/>'}, "'#lost', which is not in the file"),
+        ({"here": '<instance_geometry url="../other.dae#g"/>'}, "which is not in the file"),
+        (
+            {
+                "here": f'{HERE}<instance_controller url="#c"/>',
+                "libraries": CONTROLLER.format("skin", "</library_controllers>"),
+            },
+            "moves vertices by a skin",
+        ),
+        (
+            {
+                "here": f'{HERE}<instance_controller url="#c"/>',
+                "libraries": CONTROLLER.format("morph", "</library_controllers>"),
+            },
+            "moves vertices by a morph",
+        ),
+        ({"here": f"<skew>45 1 0 0 0 1 0</skew>{HERE}"}, "by <skew>"),
+        ({"here": f"<scale>nan 1 1</scale>{HERE}"}, "by a matrix that is none"),
+        ({"primitive": f"<triangles>{V}<p>0 1 9</p></triangles>"}, "name vertices 0 to 9"),
+        ({"primitive": f"<triangles>{V}<p>0 1 -1</p></triangles>"}, "name vertices -1 to 1"),
+        (
+            {"primitive": PARTS["primitive"].replace("<vcount>4", "<vcount>5")},
+            "polygons of 5 corners, 4 are there",
+        ),
+        ({"accessor": 'count="9" stride="3"'}, "9 positions of 3 numbers announced, 24 numbers"),
+        ({"accessor": 'count="8" stride="3" offset="-1"'}, "announced"),
+        ({"numbers": "nan " + SQUARES[2:]}, "1 of the 8 vertices .* NaN"),
+        ({"nodes": doubled(range(40)), "here": '<instance_node url="#k40"/>'}, "contain each oth"),
+        (
+            {"nodes": '<node id="k"><instance_node url="#k"/></node>', "here": HERE
+             + '<instance_node url="#k"/>'},
+            "contain each other",
+        ),
+        *[
+            ({"asset": f'<unit meter="{metres}"/>'}, "its unit|could not convert")
+            for metres in ("0,01", "0", "-1", "nan", "")
+        ],
+        ({"doctype": '<!DOCTYPE C [<!ENTITY i SYSTEM "file:///etc/passwd">]>', "numbers": "&i;"},
+         "broken"),
+        ({"doctype": f'<!DOCTYPE C [<!ENTITY a "0 0 0 0 0 0 0 0 0 0">{AMPLE}]>', "numbers": "&i;"},
+         "amplification"),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_what_cannot_be_read_says_what_it_is(tmp_path, parts, message):
+    with pytest.raises(LidarpoolError, match=message) as caught:
+        load(tmp_path, **parts)
+    assert len(str(caught.value)) < 400 + len(str(tmp_path))
+
+
+def test_a_cut_file_never_loses_triangles_in_silence(tmp_path):
+    path = tmp_path / "m.dae"
+    whole = DAE.format(**PARTS).strip()
+    for cut in range(1, len(whole), 40):
+        path.write_text(whole[:-cut])
+        with pytest.raises(LidarpoolError, match="broken"):
+            load_meshes(path)

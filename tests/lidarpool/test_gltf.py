@@ -1,0 +1,239 @@
+"""glTF files: all instances and all ways to store triangles; what is not read says what it is."""
+
+import base64
+import json
+import struct
+
+import numpy as np
+import pytest
+
+from lidarpool.base.errors import LidarpoolError
+from lidarpool.scene.meshfile import load_meshes, read_mesh_file
+
+CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes()
+
+
+def write(path, content):
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+def glb(header, body=b""):
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<II", len(text), 0x4E4F534A) + text
+    if body:
+        chunks += struct.pack("<II", len(body), 0x004E4942) + body
+    return b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks
+
+
+def triangle(body=CORNERS, **accessor):
+    """A glTF of one node 'Sign' with a mesh 'panel' of two primitives, one triangle each."""
+    primitive = {"attributes": {"POSITION": 0}}
+    return {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"name": "Sign", "mesh": 0}],
+        "meshes": [{"name": "panel", "primitives": [primitive, dict(primitive)]}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"} | accessor
+        ],
+        "bufferViews": [{"buffer": 0, "byteLength": len(body)}],
+        "buffers": [{"byteLength": len(body)}],
+    }
+
+
+def load(tmp_path, header, body=CORNERS):
+    """Meshes in the file's own axes."""
+    return load_meshes(write(tmp_path / "m.glb", glb(header, body)), up_axis="z")
+
+
+def test_materials_do_not_split_objects_and_nodes_without_names_are_called_as_their_mesh(tmp_path):
+    header = triangle()
+    header["nodes"].append({"mesh": 0, "translation": [5, 0, 0]})
+    header["scenes"][0]["nodes"] = [0, 1]
+    header["extensionsRequired"] = ["KHR_materials_unlit", "EXT_texture_webp"]
+    meshes = load(tmp_path, header)
+    assert [(mesh.name, len(mesh.faces)) for mesh in meshes] == [("Sign", 2), ("panel", 2)]
+
+
+def test_a_node_with_several_parents_stands_in_each(tmp_path):
+    header = triangle()
+    header["nodes"] += [{"children": [0], "translation": [2 * i, 0, 0]} for i in range(4)]
+    header["scenes"][0]["nodes"] = [1, 2, 3, 4]
+    meshes = load(tmp_path, header)
+    assert [mesh.vertices[:, 0].min() for mesh in meshes] == [0, 2, 4, 6]
+
+
+def test_nodes_that_contain_each_other_end(tmp_path):
+    header = triangle()
+    header["nodes"] = [{"mesh": 0, "children": [1]}, {"children": [0]}]
+    with pytest.raises(LidarpoolError, match="nodes that contain each other, more than 200,000"):
+        load(tmp_path, header)
+
+
+def test_without_scenes_all_nodes_are_read(tmp_path):
+    header = triangle()
+    del header["scenes"], header["scene"]
+    header["nodes"] = [{"children": [1]}, {"mesh": 0, "name": "Sign"}]
+    assert [mesh.name for mesh in load(tmp_path, header)] == ["Sign"]
+
+
+def test_turned_and_scaled_nodes(tmp_path):
+    header = triangle()
+    half = np.sqrt(0.5)
+    header["nodes"][0] |= {"rotation": [0, 0, half, half], "scale": [2, 2, -2]}
+    header["nodes"] += [{"children": [0], "matrix": [*np.eye(4).ravel()[:12], 7, 8, 9, 1]}]
+    header["scenes"][0]["nodes"] = [1]
+    (mesh,) = load(tmp_path, header)
+    corners = mesh.vertices[mesh.faces[0]]
+    np.testing.assert_allclose(corners[::-1], [[7, 8, 9], [7, 10, 9], [5, 8, 9]], atol=1e-6)
+
+
+def test_a_node_scaled_to_nothing_is_skipped_and_said(tmp_path, caplog):
+    header = triangle()
+    header["nodes"].append({"name": "Hidden", "mesh": 0, "scale": [0, 0, 0]})
+    header["scenes"][0]["nodes"] = [0, 1]
+    path = write(tmp_path / "m.glb", glb(header, CORNERS))
+    assert [mesh.name for mesh in load_meshes(path)] == ["Sign"]
+    assert "scaled to nothing, left out: Hidden" in caplog.text
+    assert read_mesh_file(path).skipped == ["Hidden"]
+    header["scenes"][0]["nodes"] = [1]
+    with pytest.raises(LidarpoolError, match="no triangles that are not scaled to nothing"):
+        load(tmp_path, header)
+
+
+@pytest.mark.parametrize("mode", [5, 6])
+def test_strips_and_fans(tmp_path, mode):
+    order = {5: [0, 1, 3, 2], 6: [0, 1, 2, 3]}[mode]
+    square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], "<f4")[order].tobytes()
+    header = triangle(square, count=4)
+    header["meshes"][0]["primitives"] = [{"attributes": {"POSITION": 0}, "mode": mode}]
+    (mesh,) = load(tmp_path, header, square)
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
+    np.testing.assert_array_equal(np.cross(b - a, c - a), [[0, 0, 1]] * 2)
+
+
+def test_normalised_positions(tmp_path):
+    body = np.array([[0, 0, 0], [32767, 0, 0], [0, -32768, 0]], "<i2").tobytes()
+    header = triangle(body, componentType=5122, normalized=True)
+    header["extensionsRequired"] = ["KHR_mesh_quantization"]
+    (mesh,) = load(tmp_path, header, body)
+    np.testing.assert_array_equal(mesh.vertices[:3], [[0, 0, 0], [1, 0, 0], [0, -1, 0]])
+
+
+@pytest.mark.parametrize("base", [True, False])
+def test_sparse_positions(tmp_path, base):
+    body = CORNERS + struct.pack("<H2x3f", 1, 9, 8, 7)
+    header = triangle(body)
+    header["bufferViews"] = [
+        {"buffer": 0, "byteLength": 36},
+        {"buffer": 0, "byteOffset": 36, "byteLength": 2},
+        {"buffer": 0, "byteOffset": 40, "byteLength": 12},
+    ]
+    header["accessors"][0]["sparse"] = {
+        "count": 1,
+        "indices": {"bufferView": 1, "componentType": 5123},
+        "values": {"bufferView": 2},
+    }
+    if not base:
+        del header["accessors"][0]["bufferView"]
+    (mesh,) = load(tmp_path, header, body)
+    np.testing.assert_array_equal(
+        mesh.vertices[:3], [[0, 0, 0], [9, 8, 7], [0, 1, 0] if base else [0, 0, 0]]
+    )
+
+
+def test_interleaved_vertices(tmp_path):
+    rows = np.zeros((3, 5), "<f4")
+    rows[:, 2:] = np.frombuffer(CORNERS, "<f4").reshape(3, 3)
+    header = triangle(rows.tobytes(), byteOffset=8)
+    header["bufferViews"][0]["byteStride"] = 20
+    (mesh,) = load(tmp_path, header, rows.tobytes())
+    np.testing.assert_array_equal(mesh.vertices[:3], rows[:, 2:])
+
+
+def test_draco(tmp_path):
+    draco = pytest.importorskip("DracoPy", reason="the decoder of packed glTF is an extra")
+    points = np.frombuffer(CORNERS, "<f4").reshape(3, 3)
+    body = draco.encode(points, np.array([[0, 1, 2]]))
+    header = triangle(body)
+    del header["accessors"][0]["bufferView"]
+    packed = {"KHR_draco_mesh_compression": {"bufferView": 0, "attributes": {"POSITION": 0}}}
+    header["meshes"][0]["primitives"] = [{"attributes": {"POSITION": 0}, "extensions": packed}]
+    header["extensionsRequired"] = list(packed)
+    (mesh,) = load(tmp_path, header, body)
+    np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), [1, 1, 0], atol=1e-3)
+
+
+def weigh(header, where):
+    header["meshes"][0]["primitives"][0]["targets"] = [{"POSITION": 0}]
+    header[where][0]["weights"] = [0.0, 0.5]
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (lambda h: h.update(asset={"version": "1.0"}), "is glTF 1.0, which is not read: convert"),
+        (lambda h: h.update(nodes={"root": {}}), "is glTF 1.0"),
+        (lambda h: h.update(extensionsRequired=["EXT_meshopt_compression"]), "needs EXT_meshopt"),
+        (lambda h: weigh(h, "nodes"), "morph targets in effect"),
+        (lambda h: weigh(h, "meshes"), "morph targets in effect"),
+        (lambda h: h["nodes"][0].update(skin=0), "skeleton"),
+        (
+            lambda h: h["nodes"][0].update(extensions={"EXT_mesh_gpu_instancing": {}}),
+            "places copies by EXT_mesh_gpu_instancing",
+        ),
+        (lambda h: h["nodes"][0].update(scale=[1, 1]), "broken"),
+        (lambda h: h["nodes"][0].update(translation=[1e999, 0, 0]), "by a matrix that is none"),
+        (lambda h: h["nodes"][0].update(mesh=7), "broken"),
+        (lambda h: h["nodes"][0].update(mesh=-1), "broken"),
+        (lambda h: h["accessors"][0].update(count=9), "9 elements announced, 36 bytes there"),
+        (lambda h: h["accessors"][0].update(count=10**30), "broken"),
+        (lambda h: h["accessors"][0].update(count=-3), "-3 is given as an index or a count"),
+        (lambda h: h["accessors"][0].pop("bufferView"), "accessor 0 has no content"),
+    ],
+)
+def test_what_cannot_be_read_says_what_it_is(tmp_path, edit, message):
+    header = triangle()
+    edit(header)
+    with pytest.raises(LidarpoolError, match=message):
+        load(tmp_path, header)
+
+
+def test_buffers_with_escaped_names_and_in_the_text(tmp_path):
+    header = triangle()
+    (tmp_path / "sub dir").mkdir()
+    buffer = write(tmp_path / "sub dir" / "50%.bin", CORNERS)
+    path = tmp_path / "m.gltf"
+    text = base64.b64encode(CORNERS).decode()
+    for name in (
+        "sub%20dir/50%25.bin",
+        "sub dir/50%.bin",
+        f"data:application/octet-stream;base64,{text}",
+    ):
+        header["buffers"][0]["uri"] = name
+        assert len(load_meshes(write(path, "\ufeff" + json.dumps(header)))) == 1
+    header["buffers"][0]["uri"] = "sub dir/50%.bin"
+    write(path, json.dumps(header))
+    write(buffer, CORNERS[:-1])
+    with pytest.raises(LidarpoolError, match=r"takes 36 bytes from .* cut short: it has 35"):
+        load_meshes(path)
+    buffer.unlink()
+    with pytest.raises(LidarpoolError, match=r"takes data from .* which is not there"):
+        load_meshes(path)
+
+
+@pytest.mark.parametrize(
+    "uri",
+    ["../a.bin", "%2e%2e/a.bin", "/etc/passwd", "file:///etc/passwd", "http://127.0.0.1:9/x", "l"],
+)
+def test_only_files_beside_are_read(tmp_path, uri):
+    (tmp_path / "inner").mkdir()
+    write(tmp_path / "a.bin", CORNERS)
+    (tmp_path / "inner" / "l").symlink_to(tmp_path / "a.bin")
+    header = triangle()
+    header["buffers"][0]["uri"] = uri
+    with pytest.raises(LidarpoolError, match="only files in its own folder are read"):
+        load_meshes(write(tmp_path / "inner" / "m.gltf", json.dumps(header)))

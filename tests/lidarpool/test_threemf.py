@@ -1,0 +1,157 @@
+"""3MF files: every instance of every part, and what is not read says what it is."""
+
+import io
+import zipfile
+
+import numpy as np
+import pytest
+
+from lidarpool.base.errors import LidarpoolError
+from lidarpool.scene import threemf
+from lidarpool.scene.meshfile import load_meshes
+
+MODEL = (
+    '<?xml version="1.0"?>{doctype}'
+    '<model unit="{unit}" xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02"'
+    ' xmlns:b="http://schemas.microsoft.com/3dmanufacturing/beamlattice/2017/02"'
+    ' xmlns:p="http://schemas.microsoft.com/3dmanufacturing/production/2015/06" {more}>'
+    '<resources><object id="1" name="leaf" type="model"><mesh><vertices>'
+    '<vertex x="{x}" y="0" z="0"/><vertex x="1" y="0" z="0"/><vertex x="0" y="1" z="0"/>'
+    '</vertices><triangles><triangle v1="0" v2="1" v3="2"/></triangles>{beams}</mesh></object>'
+    "{objects}</resources><build>{items}</build></model>"
+)
+PARTS = {"doctype": "", "unit": "meter", "more": "", "x": "0", "beams": "", "objects": ""}
+
+
+def model(items='<item objectid="1"/>', **parts):
+    return MODEL.format(**(PARTS | parts), items=items)
+
+
+def packed(files):
+    memory = io.BytesIO()
+    with zipfile.ZipFile(memory, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in files.items():
+            archive.writestr(name, content)
+    return memory.getvalue()
+
+
+def load(tmp_path, files=(), **parts):
+    path = tmp_path / "m.3mf"
+    path.write_bytes(packed({"3D/3dmodel.model": model(**parts), **dict(files)}))
+    return load_meshes(path)
+
+
+def assembly(number, of, count, more=""):
+    """An object of several copies of another, side by side."""
+    copies = "".join(
+        f'<component objectid="{of}" transform="1 0 0 0 1 0 0 0 1 {number}.{i} 0 0"{more}/>'
+        for i in range(count)
+    )
+    return f'<object id="{number}" name="a{number}"><components>{copies}</components></object>'
+
+
+def test_units_and_names(tmp_path):
+    (leaf,) = load(tmp_path, unit="inch")
+    assert leaf.name == "leaf"
+    np.testing.assert_allclose(np.ptp(leaf.vertices, axis=0), [0.0254, 0.0254, 0])
+
+
+def test_nested_components_and_copies_are_all_there(tmp_path):
+    nested = assembly(2, 1, 10) + assembly(3, 2, 10)
+    assert len(load(tmp_path, objects=nested, items='<item objectid="3"/>')) == 100
+    items = '<item objectid="1" partnumber="A"/>' * 2
+    assert [mesh.name for mesh in load(tmp_path, items=items)] == ["A", "A"]
+
+
+@pytest.mark.parametrize(
+    "placed",
+    [
+        [("a", 7)],
+        [("a", 7), ("b", 7)],  # the numbers of a file are its own
+        [("a", 1), ("a", 7), ("b", 1)],  # one is that of an object of the model
+        [("a", 7), ("a", 7)],
+    ],
+)
+def test_parts_in_other_files_are_told_apart(tmp_path, placed):
+    components = "".join(
+        f'<component p:path="/3D/Objects/{file}.model" objectid="{number}"/>'
+        for file, number in placed
+    )
+    assembled = f'<object id="2"><components>{components}</components></object>'
+    # What slicers write: the prefix is not declared.
+    part = "<model><resources>{}</resources><build/></model>"
+    own = model().partition("<resources>")[2].partition("</resources>")[0]
+    files = {
+        f"3D/Objects/{name}.model": part.format(
+            "".join(
+                own.replace('id="1"', f'id="{number}"').replace("leaf", f"{name}{number}")
+                for number in (1, 7)
+            )
+        )
+        for name in "ab"
+    }
+    meshes = load(
+        tmp_path,
+        files.items(),
+        objects=assembled,
+        items='<item objectid="2"/>',
+        more='requiredextensions="p"',
+    )
+    assert [mesh.name for mesh in meshes] == [f"{file}{number}" for file, number in placed]
+
+
+def test_the_model_that_the_package_names_is_built(tmp_path):
+    path = tmp_path / "m.3mf"
+    relation = (
+        '<Relationships><Relationship Target="/3D/other.model" Id="r" '
+        'Type="http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"/></Relationships>'
+    )
+    path.write_bytes(packed({"_rels/.rels": relation, "3D/other.model": model()}))
+    assert [mesh.name for mesh in load_meshes(path)] == ["leaf"]
+
+
+AMPLE = "".join(
+    f'<!ENTITY {name} "{f"&{of};" * 10}">' for of, name in zip("abcdefgh", "bcdefghi", strict=True)
+)
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"more": 'requiredextensions="b"'}, "needs .*beamlattice/2017/02, which is not read"),
+        ({"beams": "<b:beamlattice/>"}, "has a <beamlattice>"),
+        ({"items": '<item objectid="9"/>'}, "object '9' is placed and is not there"),
+        ({"items": '<item objectid="1" transform="1 0 0"/>'}, "broken"),
+        ({"unit": "parsec"}, "parsec"),
+        ({"x": "nan"}, "NaN"),
+        (
+            {"objects": assembly(2, 3, 1) + assembly(3, 2, 1), "items": '<item objectid="2"/>'},
+            "contain each other",
+        ),
+        (
+            {
+                "objects": "".join(assembly(i, i - 1, 2) for i in range(2, 30)),
+                "items": '<item objectid="29"/>',
+            },
+            "contain each other",
+        ),
+        (
+            {
+                "objects": assembly(2, 1, 1, ' p:path="/../../etc/passwd"'),
+                "items": '<item objectid="2"/>',
+            },
+            "no item named",
+        ),
+        ({"doctype": f'<!DOCTYPE model [<!ENTITY a "0000000000">{AMPLE}]>', "x": "&i;"}, "broken"),
+    ],
+    ids=str,
+)
+def test_what_cannot_be_read_says_what_it_is(tmp_path, parts, message):
+    with pytest.raises(LidarpoolError, match=message):
+        load(tmp_path, **parts)
+
+
+def test_an_archive_that_grows_out_of_proportion(tmp_path, monkeypatch):
+    monkeypatch.setattr(threemf, "_LEAST_LIMIT", 2**16)
+    with pytest.raises(LidarpoolError, match="out of all proportion"):
+        load(tmp_path, {"pad": bytes(10**6)}.items())

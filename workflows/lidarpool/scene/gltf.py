@@ -1,0 +1,282 @@
+"""glTF 2.0 files, .glb and .gltf, after the specification by the Khronos Group (2021).
+
+Read here and not by trimesh, which keeps one of several instances of a node, refuses files
+without scenes and with sparse or normalised positions, and opens whatever files a .gltf names;
+nor by assimp, which passes over what it cannot read. Only triangles are looked at: materials and
+pictures are not.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import struct
+from functools import cache
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote, unquote_to_bytes
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .mesh import Mesh
+from .nodes import Content, MeshFileError, Node, fanned, instances, joined, unrolled
+
+# Extensions that change looks, not shapes, or that are read here.
+_READ = re.compile(r"KHR_materials_|\w+_texture_|KHR_texture|KHR_lights|KHR_mesh_quantization")
+_DRACO = "KHR_draco_mesh_compression"
+_INSTANCING = "EXT_mesh_gpu_instancing"
+
+_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+
+
+def read_gltf(data: bytes, path: Path) -> Content:
+    """Read the default scene of a file, or all nodes where it has no scenes.
+
+    Parameters
+    ----------
+    data
+        The whole file.
+    path
+        Where it is: buffers of their own are read from beside it and below.
+
+    Raises
+    ------
+    MeshFileError
+        For what cannot be read, or would be read wrong.
+    Exception
+        What one stumbles over in a file that is broken.
+    """
+    header, body = _chunks(data)
+    _check(header)
+    reader = _Reader(header, body, path)
+    content = instances(_roots(header), reader.node, path.stem)
+    content.unit_m, content.up_axis = 1.0, "y"
+    return content
+
+
+def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """JSON object, and the binary buffer of a .glb."""
+    body = b""
+    if data[:4] == b"glTF" and len(data) >= 20:
+        version, total, size = struct.unpack_from("<III", data, 4)
+        if version == 1:
+            raise MeshFileError(_OLD)
+        if len(data) < total:
+            raise MeshFileError(f"is cut short: {total} bytes announced, {len(data)} there")
+        body = data[28 + size : total]
+        data = data[20 : 20 + size]
+    elif data[:1] not in b"{[ \t\r\n":
+        raise MeshFileError("is not glTF")
+    try:
+        header = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise MeshFileError(f"holds no valid JSON ({error})") from error
+    if not isinstance(header, dict):
+        raise MeshFileError("holds no glTF object")
+    return header, body
+
+
+_OLD = "is glTF 1.0, which is not read: convert it to glTF 2.0"
+
+
+def _check(header: dict[str, Any]) -> None:
+    """Refuse other versions, and what moves vertices besides the places of their nodes."""
+    # Files of version 1.0 name their parts, instead of numbering them.
+    if str(header.get("asset", {}).get("version", "2")).startswith("1") or isinstance(
+        header.get("nodes"), dict
+    ):
+        raise MeshFileError(_OLD)
+    for name in map(str, header.get("extensionsRequired", ())):
+        if not _READ.match(name) and name not in (_DRACO, _INSTANCING):
+            raise MeshFileError(f"needs {name}, which cannot be read: export without it")
+    for node in header.get("nodes", ()):
+        if "mesh" not in node:
+            continue
+        if _INSTANCING in node.get("extensions", {}):
+            raise MeshFileError(
+                f"places copies by {_INSTANCING}, which cannot be read: export them as objects of "
+                "their own"
+            )
+        if "skin" in node:
+            raise MeshFileError(
+                "moves vertices by a skeleton, which is not followed: apply the pose, then export"
+            )
+        mesh = header["meshes"][node["mesh"]]
+        morphs = any("targets" in primitive for primitive in mesh["primitives"])
+        if morphs and any(node.get("weights", mesh.get("weights", ()))):
+            raise MeshFileError(
+                "has morph targets in effect, which are not followed: apply them, then export"
+            )
+
+
+def _roots(header: dict[str, Any]) -> list[int]:
+    """Find the outermost nodes."""
+    nodes = header.get("nodes", ())
+    if scenes := header.get("scenes"):
+        return list(scenes[header.get("scene", 0)].get("nodes", ()))
+    inner = {child for node in nodes for child in node.get("children", ())}
+    return [index for index in range(len(nodes)) if index not in inner]
+
+
+class _Reader:
+    """Nodes, meshes, accessors and buffers by their numbers, each mesh and buffer read once."""
+
+    def __init__(self, header: dict[str, Any], body: bytes, path: Path) -> None:
+        self._header, self._body, self._path = header, body, path
+        self._mesh = cache(self._read_mesh)
+        self._buffer = cache(self._read_buffer)
+
+    def node(self, index: int) -> Node[int]:
+        """Node `index`; one without a name is called as its mesh."""
+        found = self._header["nodes"][_natural(index)]
+        mesh = found.get("mesh")
+        name = str(found.get("name") or "")
+        if mesh is None:
+            return Node(name, _matrix(found), children=found.get("children", ()))
+        name = name or str(self._header["meshes"][mesh].get("name") or "")
+        return Node(name, _matrix(found), lambda: self._mesh(mesh), found.get("children", ()))
+
+    def _read_mesh(self, index: int) -> list[Mesh]:
+        """One mesh of all primitives, which differ by material only."""
+        primitives = self._header["meshes"][_natural(index)]["primitives"]
+        return joined("", (self._primitive(p) for p in primitives if p.get("mode", 4) >= 4))
+
+    def _primitive(self, primitive: dict[str, Any]) -> tuple[NDArray[Any], NDArray[np.int64]]:
+        """Vertices (v, 3) and faces (f, 3)."""
+        position, index = primitive["attributes"].get("POSITION"), primitive.get("indices")
+        packed = primitive.get("extensions", {}).get(_DRACO)
+        if packed and "bufferView" not in self._header["accessors"][position]:
+            return _unpacked(self._view(packed["bufferView"]))
+        if position is None:
+            return np.empty((0, 3)), np.empty((0, 3), np.int64)
+        vertices = self._accessor(position)
+        corners = np.arange(len(vertices))
+        if index is not None:
+            corners = self._accessor(index)[:, 0].astype(np.int64)
+        mode = primitive.get("mode", 4)
+        if mode == 5:
+            return vertices, unrolled(corners)
+        if mode == 6:
+            return vertices, fanned(corners)
+        return vertices, corners[: len(corners) // 3 * 3].reshape(-1, 3)
+
+    def _accessor(self, index: int) -> NDArray[Any]:
+        """Numbers (count, width) of an accessor."""
+        accessor = self._header["accessors"][_natural(index)]
+        count, width = _natural(accessor["count"]), _WIDTHS[accessor["type"]]
+        kind = np.dtype(_TYPES[accessor["componentType"]])
+        if "bufferView" in accessor:
+            numbers = self._array(accessor, kind, count, width)
+        elif sparse := accessor.get("sparse"):
+            if count > 2**31:
+                raise ValueError(f"an accessor of {count} elements without content")
+            numbers = np.zeros((count, width), kind)
+        else:
+            raise ValueError(f"accessor {index} has no content")
+        if sparse := accessor.get("sparse"):
+            changed, values = sparse["indices"], sparse["values"]
+            where = np.dtype(_TYPES[changed["componentType"]])
+            rows = self._array(changed, where, sparse["count"], 1)[:, 0]
+            numbers = numbers.copy()
+            numbers[rows] = self._array(values, kind, sparse["count"], width)
+        if accessor.get("normalized") and kind.kind in "iu":
+            # glTF 2.0, 3.6.2.2
+            return np.maximum(numbers / np.iinfo(kind).max, -1.0)
+        return numbers
+
+    def _array(self, at: dict[str, Any], kind: np.dtype[Any], count: int, width: int) -> Any:
+        """Numbers (count, width) of a buffer view, from `at['byteOffset']` on."""
+        row = kind.itemsize * width
+        stride = self._header["bufferViews"][_natural(at["bufferView"])].get("byteStride", row)
+        view = self._view(at["bufferView"])[at.get("byteOffset", 0) :]
+        if not count:
+            return np.empty((0, width), kind)
+        if stride * (count - 1) + row > len(view):
+            raise ValueError(f"{count:,} elements announced, {len(view):,} bytes there")
+        return np.ndarray((count, width), kind, view, strides=(stride, kind.itemsize))
+
+    def _view(self, index: int) -> bytes:
+        view = self._header["bufferViews"][_natural(index)]
+        begin = view.get("byteOffset", 0)
+        return self._buffer(view["buffer"])[begin : begin + view["byteLength"]]
+
+    def _read_buffer(self, index: int) -> bytes:
+        buffer = self._header["buffers"][_natural(index)]
+        uri = buffer.get("uri")
+        if uri is None:
+            content = self._body
+        elif uri.startswith("data:"):
+            kind, _, text = uri.partition(",")
+            content = unquote_to_bytes(text)
+            content = base64.b64decode(content) if kind.endswith(";base64") else content
+        else:
+            content = _beside(uri, self._path)
+        if len(content) < buffer["byteLength"]:
+            raise MeshFileError(
+                f"takes {buffer['byteLength']:,} bytes from {uri[:80] if uri else 'itself'!r}, "
+                f"which is cut short: it has {len(content):,}"
+            )
+        return content
+
+
+def _natural(number: Any) -> int:
+    """Check a count or an index; a negative one would be taken from the end."""
+    if type(number) is not int or number < 0:
+        raise ValueError(f"{number!r} is given as an index or a count")
+    return number
+
+
+def _matrix(node: dict[str, Any]) -> NDArray[np.float64]:
+    """Matrix (4, 4) of a node, from its columns or from translation, rotation and scale."""
+    if "matrix" in node:
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T
+    rotation = np.array(node.get("rotation", (0, 0, 0, 1)), np.float64)
+    x, y, z, w = rotation / np.linalg.norm(rotation)
+    turn = np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ])  # fmt: skip
+    out = np.eye(4)
+    out[:3, :3] = turn * np.array(node.get("scale", (1, 1, 1)), np.float64)
+    out[:3, 3] = node.get("translation", (0, 0, 0))
+    return out
+
+
+def _unpacked(data: bytes) -> tuple[NDArray[Any], NDArray[np.int64]]:
+    """Vertices and faces that are packed with Draco."""
+    try:
+        import DracoPy
+    except ImportError as error:
+        raise MeshFileError(
+            f"is packed with {_DRACO}: install DracoPy to read it, or export without it"
+        ) from error
+    mesh = DracoPy.decode(data)
+    return np.asarray(mesh.points).reshape(-1, 3), np.asarray(mesh.faces, np.int64).reshape(-1, 3)
+
+
+def _beside(uri: str, path: Path) -> bytes:
+    """Read a buffer that is a file: names are escaped by the standard, by some programs not."""
+    folder = path.parent.resolve()
+    shown = repr(uri[:80])
+    target = folder
+    for name in (uri.strip(), unquote(uri.strip())):
+        target = folder / name
+        scheme = re.match(r"[A-Za-z][A-Za-z0-9+.-]*:", name)
+        if scheme or not target.resolve().is_relative_to(folder):
+            raise MeshFileError(
+                f"takes data from {shown}, but only files in its own folder are read: "
+                "export it as .glb, in one file"
+            )
+        if target.exists():
+            break
+    if not target.exists():
+        raise MeshFileError(
+            f"takes data from {shown}, which is not there: put it beside, or export as .glb"
+        )
+    if not target.is_file():  # a pipe would wait for ever
+        raise MeshFileError(f"takes data from {shown}, which is not a file")
+    return target.read_bytes()

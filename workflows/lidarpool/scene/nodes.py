@@ -1,0 +1,145 @@
+"""Scene graphs of mesh files: nodes that place meshes and other nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterable
+from dataclasses import dataclass, field
+from typing import Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .mesh import Mesh
+
+K = TypeVar("K", bound=Hashable)
+
+MOST_NODES = 200_000  # of a scene, each counted in each place where it stands
+
+
+class MeshFileError(Exception):
+    """What is wrong with a mesh file, as a clause that follows its name."""
+
+
+@dataclass
+class Content:
+    """What a mesh file holds.
+
+    Parameters
+    ----------
+    meshes
+        In the file's unit and axes.
+    unit_m
+        Metres in its unit; None where it states none.
+    up_axis
+        'x', 'y' or 'z'; None where neither the file nor its format states one.
+    skipped
+        Names of objects that were left out, since their nodes scale them to nothing.
+    """
+
+    meshes: list[Mesh]
+    unit_m: float | None = None
+    up_axis: str | None = None
+    skipped: list[str] = field(default_factory=list)
+
+
+@dataclass
+class Node(Generic[K]):
+    """A place for meshes and for other nodes.
+
+    Parameters
+    ----------
+    name
+        Empty where the file has none.
+    matrix
+        float64 (4, 4), from its coordinates to those of its parent.
+    meshes
+        Makes the meshes that stand here, in the node's coordinates; called once for each place
+        of the node. An empty name of a mesh stands for that of the node.
+    children
+        Keys of the nodes in it.
+    """
+
+    name: str
+    matrix: NDArray[np.float64]
+    meshes: Callable[[], Iterable[Mesh]] = list
+    children: Iterable[K] = ()
+
+
+def instances(roots: Iterable[K], node_of: Callable[[K], Node[K]], stem: str) -> Content:
+    """Place all meshes of a scene graph.
+
+    A node may stand in several others; each time is an object of its own, named by the nearest
+    node that has a name.
+
+    Parameters
+    ----------
+    roots
+        Keys of the outermost nodes.
+    node_of
+        Gives the node of a key.
+    stem
+        Name for meshes that have none.
+
+    Raises
+    ------
+    MeshFileError
+        If nodes contain each other without end, or some hundred thousand times.
+    """
+    content = Content([])
+    places = []
+    stack = [(key, np.eye(4), "") for key in reversed(list(roots))]
+    while stack:
+        key, above, name = stack.pop()
+        node = node_of(key)
+        matrix, name = above @ node.matrix, node.name or name
+        places.append((node, matrix, name))
+        stack += [(child, matrix, name) for child in reversed(list(node.children))]
+        # A few lines can make any number of nodes.
+        if len(places) + len(stack) > MOST_NODES:
+            raise MeshFileError(
+                f"has nodes that contain each other, more than {MOST_NODES:,} in all: export it "
+                "again"
+            )
+    for node, matrix, name in places:
+        for mesh in node.meshes():
+            named = name or mesh.name or stem
+            if not np.isfinite(matrix).all() or not np.array_equal(matrix[3], [0, 0, 0, 1]):
+                raise MeshFileError(
+                    f"places {named[:80]!r} by a matrix that is none of a place: {matrix.tolist()}"
+                )
+            if np.linalg.matrix_rank(matrix[:3, :3]) < 2:
+                content.skipped.append(named)
+            else:
+                content.meshes.append(_moved(mesh, named, matrix))
+    return content
+
+
+def _moved(mesh: Mesh, name: str, matrix: NDArray[np.float64]) -> Mesh:
+    """Mesh in the coordinates of the scene, its faces still facing outward."""
+    linear = matrix[:3, :3]
+    faces = mesh.faces[:, ::-1] if np.linalg.det(linear) < 0 else mesh.faces
+    return Mesh(name, mesh.vertices @ linear.T + matrix[:3, 3], faces)
+
+
+def joined(name: str, parts: Iterable[tuple[NDArray[np.float64], NDArray[np.int64]]]) -> list[Mesh]:
+    """One mesh of several (vertices, faces); none where there is no face."""
+    kept = [(vertices, faces) for vertices, faces in parts if len(faces)]
+    if not kept:
+        return []
+    first = np.cumsum([0] + [len(vertices) for vertices, _ in kept[:-1]])
+    vertices = np.concatenate([vertices for vertices, _ in kept])
+    faces = [faces + at for (_, faces), at in zip(kept, first, strict=True)]
+    return [Mesh(name, vertices, np.concatenate(faces))]
+
+
+def unrolled(strip: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Triangles (t, 3) of a strip of corners (t + 2,), all facing the same way."""
+    faces = np.stack([strip[:-2], strip[1:-1], strip[2:]], axis=1)
+    faces[1::2] = faces[1::2, [1, 0, 2]]
+    return faces
+
+
+def fanned(corners: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Triangles (t, 3) of a fan of corners (t + 2,)."""
+    first = np.broadcast_to(corners[:1], len(corners[2:]))
+    return np.stack([first, corners[1:-1], corners[2:]], axis=1)

@@ -1,0 +1,403 @@
+"""Files of one list of vertices and of polygons: .obj, .off, .ply and .stl, with all their digits.
+
+trimesh reads all four, but fills polygons that are not convex beyond their outline, drops what it
+does not understand, and of .obj backward numbers of several objects, of .ply binary files with
+triangles and quadrangles. assimp and Open3D keep single precision. plyfile believes what headers
+announce, and its licence would become that of a program with it.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from array import array
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .mesh import Mesh
+from .nodes import Content, MeshFileError, unrolled
+from .polygons import triangulated
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+
+def _mesh(name: str, vertices: Float, corners: Int, sizes: Int) -> list[Mesh]:
+    """One mesh of polygons, with the vertices that it uses; none where there are no polygons."""
+    faces = triangulated(vertices, corners, sizes)
+    if not len(faces):
+        return []
+    used, own = np.unique(faces, return_inverse=True)
+    return [Mesh(name, vertices[used], own.reshape(-1, 3))]
+
+
+# -- .obj ----------------------------------------------------------------------------------------
+
+
+@dataclass
+class _Part:
+    """Faces of one object: the vertices of all, from 0, and how many corners each has."""
+
+    corners: array[int] = field(default_factory=lambda: array("q"))
+    sizes: array[int] = field(default_factory=lambda: array("q"))
+
+
+def read_obj(data: bytes, path: Path) -> Content:
+    """Read a Wavefront file: an object for each name after 'o', or 'g' where there is no 'o'.
+
+    Objects come in the order in which they begin; materials divide nothing.
+
+    Parameters
+    ----------
+    data
+        The whole file.
+    path
+        Where it is; its name is that of faces that belong to no named object.
+
+    Raises
+    ------
+    ValueError
+        If a vertex has no three numbers, or a face names a vertex that is not there.
+    """
+    text = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    text = text.replace(b"\\\n", b" ").replace(b"\t", b" ")
+    divider = b"o" if re.search(rb"^ *o ", text, re.MULTILINE) else b"g"
+    numbers = array("d")
+    parts = {path.stem: _Part()}
+    part = parts[path.stem]
+    for line in text.split(b"\n"):
+        key, _, rest = line.lstrip(b" ").partition(b" ")
+        if key == b"v":
+            words = rest.partition(b"#")[0].split()[:3]  # a weight or a colour may follow
+            if len(words) < 3:
+                raise ValueError(f"a vertex has {len(words)} numbers, '{_shown(line)}'")
+            numbers.extend(map(float, words))
+        elif key == b"f":
+            corners = _obj_corners(rest.partition(b"#")[0], len(numbers) // 3, line)
+            part.corners.extend(corners)
+            part.sizes.append(len(corners))
+        elif key == divider:
+            part = parts.setdefault(_text(rest.strip()) or path.stem, _Part())
+    vertices = np.frombuffer(numbers, np.float64).reshape(-1, 3)
+    meshes: list[Mesh] = []
+    for name, part in parts.items():
+        polygons = np.frombuffer(part.corners, np.int64), np.frombuffer(part.sizes, np.int64)
+        meshes += _mesh(name, vertices, *polygons)
+    return Content(meshes)
+
+
+def _obj_corners(rest: bytes, count: int, line: bytes) -> list[int]:
+    """Vertices of a face, from 0; `count` are known so far."""
+    words = rest.split()
+    if b"/" in rest:
+        words = [word.partition(b"/")[0] for word in words]
+    numbers = list(map(int, words))
+    if numbers and min(numbers) <= 0:  # rare, and told of by this one look
+        if 0 in numbers or min(numbers) < -count:
+            raise ValueError(f"'{_shown(line)}' names a vertex that is not there")
+        return [number - 1 if number > 0 else count + number for number in numbers]
+    return [number - 1 for number in numbers]
+
+
+def _text(name: bytes) -> str:
+    """Name in UTF-8, or as old programs of the west wrote it."""
+    try:
+        return name.decode("utf-8")
+    except UnicodeDecodeError:
+        return name.decode("latin-1")
+
+
+def _shown(line: bytes) -> str:
+    return _text(line.strip()[:60])
+
+
+# -- .off ----------------------------------------------------------------------------------------
+
+# Normals (N), colours (C) and texture coordinates (ST) may follow the position of a vertex. Some
+# files have their counts right behind the word.
+_OFF = re.compile(rb"(?:ST)?C?N?OFF(?![A-Z])", re.IGNORECASE)
+
+
+def read_off(data: bytes, path: Path) -> Content:
+    """Read an Object File Format file: one mesh, with or without colours.
+
+    Raises
+    ------
+    ValueError
+        If it has fewer or more vertices and faces than announced, or is binary.
+    """
+    text = re.sub(rb"#[^\r\n]*", b"", data).lstrip()
+    found = _OFF.match(text)
+    text = text[found.end() if found else 0 :]
+    if text.lstrip().upper().startswith(b"BINARY"):
+        raise MeshFileError("is binary OFF, which is not read: export it as text, or as .ply")
+    lines = [line.split() for line in text.splitlines() if line.strip()]
+    counts = lines.pop(0) if lines else []
+    if len(counts) < 2 or not all(count.isdigit() for count in counts):
+        raise ValueError("no OFF header with the numbers of vertices and faces")
+    points, polygons = map(int, counts[:2])
+    if len(lines) != points + polygons:
+        # Without colours, by which only lines can be told apart, any white space divides.
+        lines = _rows([word for line in lines for word in line], points, polygons)
+    vertices, corners, sizes = array("d"), array("q"), array("q")
+    for line in lines[:points]:
+        if len(line) < 3:
+            raise ValueError(f"a vertex has {len(line)} numbers")
+        vertices.extend(map(float, line[:3]))
+    for line in lines[points:]:
+        size = int(line[0])
+        if not 0 <= size < len(line):
+            raise ValueError(f"a face of {size} corners has {len(line) - 1}")
+        corners.extend(map(int, line[1 : size + 1]))  # a colour may follow
+        sizes.append(size)
+    places = np.frombuffer(vertices, np.float64).reshape(-1, 3)
+    return Content(
+        _mesh(path.stem, places, np.frombuffer(corners, np.int64), np.frombuffer(sizes, np.int64))
+    )
+
+
+def _rows(words: list[bytes], points: int, polygons: int) -> list[list[bytes]]:
+    """Words of each vertex and each face."""
+    rows = [words[3 * i : 3 * i + 3] for i in range(min(points, len(words)))]
+    at = 3 * points
+    while at < len(words):
+        size = max(int(words[at]), 0) + 1
+        rows.append(words[at : at + size])
+        at += size
+    if len(rows) != points + polygons:
+        raise ValueError(
+            f"{points:,} vertices and {polygons:,} faces announced, and other than that is there"
+        )
+    return rows
+
+
+# -- .stl ----------------------------------------------------------------------------------------
+
+
+def read_stl(data: bytes, path: Path) -> Content:
+    """Read a stereolithography file: one mesh if it is binary, one for each solid if it is text.
+
+    Raises
+    ------
+    MeshFileError, ValueError
+        If it is cut short.
+    """
+    announced = int.from_bytes(data[80:84], "little")
+    # A few more bytes may follow; of a text, the number does not fit.
+    if len(data) >= 84 and 0 <= len(data) - 84 - 50 * announced < 50:
+        rows = np.frombuffer(data, np.uint8, 50 * announced, 84).reshape(-1, 50)
+        corners = np.ascontiguousarray(rows[:, 12:48]).view("<f4").astype(np.float64)
+        return Content(_stl_mesh(path.stem, corners.reshape(-1, 3)))
+    solids = re.split(rb"^[ \t]*solid\b", data, flags=re.MULTILINE | re.IGNORECASE)[1:]
+    if not solids:
+        raise MeshFileError(
+            f"announces {announced:,} triangles and has {max(0, len(data) - 84) // 50:,}: it is "
+            "cut short, or not an .stl file"
+        )
+    meshes: list[Mesh] = []
+    for solid in solids:
+        head, _, body = solid.partition(b"\n")
+        if b"endsolid" not in solid.lower():
+            raise MeshFileError("is cut short: it does not end with 'endsolid'")
+        words = re.findall(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", body, re.IGNORECASE)
+        vertices = np.array([list(map(float, row)) for row in words]).reshape(-1, 3)
+        if len(vertices) != 3 * len(re.findall(rb"\bendfacet", body, re.IGNORECASE)):
+            raise ValueError("a facet is no triangle")
+        meshes += _stl_mesh(_text(head.strip()) or path.stem, vertices)
+    return Content(meshes)
+
+
+def _stl_mesh(name: str, corners: Float) -> list[Mesh]:
+    """One mesh of triangles that share no vertices."""
+    faces = np.arange(len(corners)).reshape(-1, 3)
+    return [Mesh(name, corners, faces)] if len(faces) else []
+
+
+# -- .ply ----------------------------------------------------------------------------------------
+
+_PLY_TYPES = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
+    "float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2",
+    "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8",
+}  # fmt: skip
+_PLY_LISTS = ("vertex_indices", "vertex_index")
+
+
+@dataclass
+class _Element:
+    """What a .ply header says of an element.
+
+    Parameters
+    ----------
+    properties
+        {name: (type of the number, type of the length where it is a list, else '')}
+    """
+
+    name: str
+    count: int
+    properties: dict[str, tuple[str, str]] = field(default_factory=dict)
+
+
+def read_ply_mesh(data: bytes, path: Path) -> Content:
+    """Read a Stanford polygon file: text or binary, faces of any mixture, or strips.
+
+    Raises
+    ------
+    MeshFileError
+        If there are no faces.
+    ValueError
+        If it is no .ply file, or holds more or less than announced.
+    """
+    elements, order, body = _ply_header(data)
+    counts = {element.name: element.count for element in elements}
+    if not counts.get("face") and not counts.get("tristrips"):
+        raise MeshFileError("is a point cloud, it has no faces: make a mesh of it first")
+    rows = _ply_rows(elements, order, body)
+    if missing := [axis for axis in "xyz" if axis not in rows.get("vertex", {})]:
+        raise ValueError(f"its vertices have no {', '.join(missing)}")
+    vertices = np.stack([rows["vertex"][axis][0] for axis in "xyz"], axis=1).astype(np.float64)
+    meshes: list[Mesh] = []
+    for kind in ("face", "tristrips"):
+        if not counts.get(kind):
+            continue
+        name = next((name for name in _PLY_LISTS if name in rows[kind]), None)
+        if name is None:
+            raise ValueError(f"its faces have no {_PLY_LISTS[0]}")
+        numbers, sizes = rows[kind][name]
+        corners = numbers.astype(np.int64)
+        if not np.array_equal(corners, numbers):
+            raise ValueError("faces name vertices by fractions")
+        if kind == "tristrips":
+            corners = _ply_strips(corners, sizes)
+            sizes = np.full(len(corners) // 3, 3)
+        meshes += _mesh(path.stem, vertices, corners, sizes)
+    return Content(meshes)
+
+
+def _ply_header(data: bytes) -> tuple[list[_Element], str, bytes]:
+    """Elements, byte order ('' of text) and what follows the header."""
+    found = re.match(rb"ply[ \t]*\r?\n(.*?\n)??end_header[ \t]*\r?\n", data, re.DOTALL)
+    found = found or re.match(rb"ply\r(.*?\r)??end_header\r", data, re.DOTALL)
+    if not found:
+        raise ValueError("no PLY header, or cut within it")
+    elements: list[_Element] = []
+    order = ""
+    for line in (found[1] or b"").decode("latin-1").splitlines():
+        match line.split():
+            case ["format", kind, *_]:
+                order = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}[kind]
+            case ["element", name, count]:
+                if int(count) < 0:
+                    raise ValueError(f"{count} rows of {name[:20]} announced")
+                elements.append(_Element(name, int(count)))
+            case ["property", "list", length, kind, name]:
+                elements[-1].properties[name] = _PLY_TYPES[kind], _PLY_TYPES[length]
+            case ["property", kind, name]:
+                elements[-1].properties[name] = _PLY_TYPES[kind], ""
+            case [] | ["comment" | "obj_info", *_]:
+                pass
+            case _:
+                raise ValueError(f"'{line[:60]}' is no line of a PLY header")
+    return elements, order, data[found.end() :]
+
+
+# {element: {property: its numbers in all rows, how many each row has}}
+_Rows = dict[str, dict[str, tuple[NDArray[Any], Int]]]
+
+
+def _ply_rows(elements: list[_Element], order: str, body: bytes) -> _Rows:
+    """All rows of all elements.
+
+    Text becomes numbers in double precision first, whatever its header calls them: georeferenced
+    vertices are often called `float` and have more digits.
+    """
+    if not order:
+        words = np.array(list(map(float, body.split())))
+        body = words.tobytes()
+        for element in elements:
+            kinds = element.properties.items()
+            element.properties = {name: ("f8", "f8" * bool(n)) for name, (_, n) in kinds}
+    rows: _Rows = {}
+    at = 0
+    for element in elements:
+        if element.count and not element.properties:
+            raise ValueError(f"rows of {element.name[:20]} announced, without content")
+        rows[element.name], at = _element_rows(element, order or "=", body, at)
+    rest = body[at:].strip(b"\0\r\n\t ") if order else body[at:]
+    if rest:
+        raise ValueError(f"{len(rest):,} bytes more than announced")
+    return rows
+
+
+def _element_rows(
+    element: _Element, order: str, body: bytes, at: int
+) -> tuple[dict[str, tuple[NDArray[Any], Int]], int]:
+    """Numbers and lengths of all properties, and where the rows end."""
+    count, names = element.count, list(element.properties)
+    kinds = {name: np.dtype(order + kind) for name, (kind, _) in element.properties.items()}
+    first, end = (
+        _ply_row(element, kinds, order, body, at) if count else ([(at, 1)] * len(names), at)
+    )
+    row: list[
+        Any
+    ] = []  # dtype of a row as long as the first: mostly all are, and are taken at once
+    for (name, (_, length)), (_, n) in zip(element.properties.items(), first, strict=True):
+        row += [(f"{name} length", order + length, (1,))] if length else []
+        row += [(name, kinds[name], (n,))]
+    if at + (end - at) * count <= len(body):
+        table = np.frombuffer(body, np.dtype(row), count, at)
+        found = {
+            name: (table[name].reshape(-1), np.full(count, n))
+            for name, (_, n) in zip(names, first, strict=True)
+        }
+        lists = [name for name in names if element.properties[name][1]]
+        if all((table[f"{name} length"][:, 0] == found[name][1]).all() for name in lists):
+            return found, at + (end - at) * count
+    rows = []
+    for _ in range(count):
+        each, at = _ply_row(element, kinds, order, body, at)
+        rows.append(each)
+    raw = np.frombuffer(body, np.uint8)
+    found = {}
+    for (name, kind), column in zip(kinds.items(), zip(*rows, strict=True), strict=True):
+        starts, sizes = np.array(column).T
+        # Bytes of all numbers, in order.
+        within = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+        places = np.repeat(starts, sizes) + kind.itemsize * within
+        found[name] = raw[places[:, None] + np.arange(kind.itemsize)].view(kind)[:, 0], sizes
+    return found, at
+
+
+def _ply_row(
+    element: _Element, kinds: dict[str, np.dtype[Any]], order: str, body: bytes, at: int
+) -> tuple[list[tuple[int, int]], int]:
+    """Where the numbers of each property of a row begin, and how many they are; the row's end."""
+    out = []
+    for name, (_, length) in element.properties.items():
+        n = 1
+        if length:
+            (n,) = struct.unpack_from(order + _CODES[length], body, at)
+            if n < 0 or n != int(n):
+                raise ValueError(f"a list has the length {n}")
+            at, n = at + int(length[1]), int(n)
+        out.append((at, n))
+        at += n * kinds[name].itemsize
+    if at > len(body):
+        raise ValueError(f"{element.count:,} rows of {element.name[:20]} announced, and less there")
+    return out, at
+
+
+_CODES = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "f4": "f", "f8": "d"}
+
+
+def _ply_strips(numbers: Int, sizes: Int) -> Int:
+    """Corners of the triangles of strips, which end with each row and at each -1 in it."""
+    faces = [np.empty((0, 3), np.int64)]
+    for row in np.split(numbers, np.cumsum(sizes)[:-1]):
+        strips = np.split(row, np.flatnonzero(row < 0))
+        faces += [unrolled(strip[strip >= 0]) for strip in strips]
+    return np.concatenate(faces).reshape(-1)
