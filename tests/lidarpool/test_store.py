@@ -8,12 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import lidarpool.run.store
 from lidarpool import LidarpoolError, Planning, Scene, Sensor, Survey, remove_run
 from lidarpool.columns.parts import PartColumns, pack
 from lidarpool.plan import run_trial
-from lidarpool.run.identity import Identity
+from lidarpool.run.identity import identity_of
 from lidarpool.run.job import Job
-from lidarpool.run.store import COMMAND_TERMS, RunStore
+from lidarpool.run.store import RunStore
 from lidarpool.scan.messages import Receipt, samples_of_scan, summary_type
 from lidarpool.scene.shapes import seed_objects
 
@@ -129,11 +130,9 @@ def test_an_unfinished_run_is_not_run_over(unfinished):
     with pytest.raises(LidarpoolError) as refused:
         RunStore(JOB, unfinished)
     assert str(refused.value) == (
-        f"{unfinished} holds an unfinished run, 4 of 6 scans: continue it with resume=True, or "
-        "drop it with remove_run()."
+        f"{unfinished} holds an unfinished run, 4 of 6 scans: continue it with --resume (in Python "
+        "resume=True), or drop it with --fresh (in Python remove_run)."
     )
-    with pytest.raises(LidarpoolError, match="continue it with --resume, or drop it with --fresh"):
-        RunStore(JOB, unfinished, terms=COMMAND_TERMS)
     assert names(unfinished) == before
 
 
@@ -172,9 +171,8 @@ def test_another_run_cannot_go_on(other, unfinished):
 
 
 def test_another_version_cannot_go_on(unfinished, monkeypatch):
-    here = Identity.of(JOB)
-    later = replace(here, versions={**here.versions, "numpy": "99.0"})
-    monkeypatch.setattr(Identity, "of", lambda job: later)
+    later = identity_of(JOB) | {"numpy": "99.0"}
+    monkeypatch.setattr(lidarpool.run.store, "identity_of", lambda job: later)
     with pytest.raises(LidarpoolError, match=r"it was written with numpy 2\S+, here it is 99\.0"):
         RunStore(JOB, unfinished, resume=True)
 
@@ -236,56 +234,34 @@ def place(request, tmp_path):
     return f"memory://{request.node.name}-{tmp_path.name}"
 
 
-def test_parts_elsewhere_stay_when_the_run_is_done(folder, place):
+def test_parts_elsewhere_have_a_folder_of_their_own_and_go_with_the_run(folder, place, tmp_path):
+    theirs = RunStore(JOB, tmp_path / "theirs", place)
+    add(theirs, 0, 6)
     store = RunStore(JOB, folder, place)
     add(store, 0, 6)
     assert names(folder) <= {"run.db", "run.db-journal"}
-    points = store.points()
+    store.tidy()
+    assert len(store.points().load()) == 18
     store.remove()
-    assert not folder.exists()
-    assert len(points.load()) == 18
-
-
-def test_a_place_that_holds_others_parts_is_refused(folder, place):
-    store = RunStore(JOB, folder, place)
-    add(store, 0, 6)
-    store.remove()
-    with pytest.raises(LidarpoolError, match=r"holds the parts of another run \(0-0\.npz, …\)"):
-        RunStore(JOB, folder, place)
-    assert store.storage.sizes().keys() == {"0-0.npz"}
-    assert not folder.exists()
-
-
-def test_a_run_that_was_killed_early_does_not_make_others_parts_its_own(folder, place, tmp_path):
-    theirs = RunStore(JOB, tmp_path / "theirs", place)
-    add(theirs, 0, 6)
-    for job in (JOB, OTHERS["scene"]):
-        if folder.exists():
-            remove_run(folder)
-        RunStore(JOB, folder).db.close()  # killed before its first part
-        with pytest.raises(LidarpoolError, match="holds the parts of another run"):
-            RunStore(job, folder, place)
+    assert not folder.exists() and store.storage.sizes() == {}
     assert len(theirs.points().load()) == 18
 
 
-def test_a_run_that_was_killed_early_may_begin_again_in_its_place(folder, place):
-    store = RunStore(JOB, folder, place)
-    store.storage.prepare()
-    store.storage.write("uncommitted.npz", b"")
-    store.db.close()
-    again = RunStore(JOB, folder, place)
-    add(again, 0, 6)
-    again.tidy()
-    assert again.storage.sizes().keys() == {"0-0.npz"}
-
-
-def test_a_run_is_gone_on_with_in_the_place_of_its_parts_only(folder, place):
+def test_a_run_is_gone_on_with_where_its_parts_are(folder, place, tmp_path):
     store = RunStore(JOB, folder, place)
     add(store, 0, 4)
     store.db.close()
-    with pytest.raises(LidarpoolError, match=r"has its parts in .*: give that place, or drop"):
-        RunStore(JOB, folder, resume=True)
-    assert RunStore(JOB, folder, place, resume=True).resumed == 4
+    for elsewhere in (None, place, tmp_path / "other"):
+        again = RunStore(JOB, folder, elsewhere, resume=True)
+        assert again.resumed == 4 and again.storage.url == store.storage.url
+        again.db.close()
+    remove_run(folder)
+    assert store.storage.sizes() == {}
+
+
+def test_parts_that_nobody_would_know_of(place):
+    with pytest.raises(LidarpoolError, match="give a folder for the run as well"):
+        RunStore(JOB, None, place)
 
 
 def test_leftovers_in_the_runs_own_folder_are_cleared_away(folder):
@@ -299,12 +275,13 @@ def test_leftovers_in_the_runs_own_folder_are_cleared_away(folder):
 
 
 def test_an_error_tells_how_to_go_on(folder):
-    store = RunStore(JOB, folder, terms=COMMAND_TERMS)
+    store = RunStore(JOB, folder)
     add(store, 0, 2)
     store.db.frames = 1
     with pytest.raises(KeyboardInterrupt) as caught, store.kept_on_error():
         raise KeyboardInterrupt
-    assert caught.value.__notes__ == [f"2 of 6 scans are kept in {folder}: continue with --resume."]
+    kept = f"2 of 6 scans are kept in {folder}: continue with --resume (in Python resume=True)."
+    assert caught.value.__notes__ == [kept]
     again = RunStore(JOB, folder, resume=True)
     assert (again.resumed, again.db.frames) == (2, 1)
 

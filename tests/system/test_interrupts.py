@@ -72,7 +72,7 @@ def untouched(tmp_path: Path) -> Callable[[], bool]:
     return untouched
 
 
-KEPT = r"[\d,]+ of 360,000 scans are kept in out/run: continue with --resume\.$"
+KEPT = r"[\d,]+ of 360,000 scans are kept in out/run: continue with --resume \(.*\)\.$"
 
 
 def check_interrupted(run: Any, code: int) -> None:
@@ -275,7 +275,7 @@ def test_the_run_after_one_that_was_killed_while_writing(start, untouched, tmp_p
     assert refused.process.wait(300) == 2
     assert refused.said == (
         "lidarpool: out/run holds an unfinished run, 108 of 108 scans: continue it with "
-        "--resume, or drop it with --fresh.\n"
+        "--resume (in Python resume=True), or drop it with --fresh (in Python remove_run).\n"
     )
     run = start(SHORT, "--resume")
     assert run.process.wait(300) == 0, run.said

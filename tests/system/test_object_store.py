@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from hashlib import sha256
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-from lidarpool.columns.parts import unpack
+from lidarpool.columns.parts import PartColumns, unpack
 from lidarpool.columns.storage import Storage
+from lidarpool.run.store import RunStore
 
 pytest.importorskip("s3fs", reason="parts in an object store need s3fs")
 server = pytest.importorskip("moto.server", reason="the object store of these tests is moto's")
@@ -66,33 +66,46 @@ def run(cluster_there, lidarpool, tmp_path) -> Callable[..., Any]:
     return run
 
 
-def check(out: Path, folder: str) -> dict[str, Any]:
-    assert sha256((out / "cloud.ply").read_bytes()).hexdigest() == CLOUD_SHA256
-    report = json.loads((out / "report.json").read_text())
-    storage = Storage.at(f"{BUCKET}/{folder}")
-    parts = [unpack(storage.read(name)) for name in sorted(storage.sizes())]
-    assert [part.first for part in parts[1:]] == [part.stop for part in parts[:-1]]
-    assert (parts[0].first, parts[-1].stop) == (0, 108)
-    assert sum(len(part) for part in parts) == report["points"] == 995
-    assert not (out / "run").exists()
-    return report
+@pytest.fixture
+def check(tmp_path, monkeypatch) -> Callable[[str], dict[str, Any]]:
+    """Check the result, and the parts that there were in a folder of the bucket; the report."""
+    found: dict[str, list[PartColumns]] = {}  # {where: parts, before they went}
+    remove = RunStore.remove
+
+    def look(store: RunStore) -> None:
+        storage = store.storage
+        found[storage.url] = [unpack(storage.read(name)) for name in sorted(storage.sizes())]
+        remove(store)
+        assert storage.sizes() == {}
+
+    monkeypatch.setattr(RunStore, "remove", look)
+
+    def check(folder: str) -> dict[str, Any]:
+        out = tmp_path / "out"
+        assert sha256((out / "cloud.ply").read_bytes()).hexdigest() == CLOUD_SHA256
+        report = json.loads((out / "report.json").read_text())
+        ((url, parts),) = found.items()
+        assert url.startswith(f"{BUCKET}/{folder}/run-")
+        assert [part.first for part in parts[1:]] == [part.stop for part in parts[:-1]]
+        assert (parts[0].first, parts[-1].stop) == (0, 108)
+        assert sum(len(part) for part in parts) == report["points"] == 995
+        assert not (out / "run").exists()
+        return report
+
+    return check
 
 
-def test_parts_go_to_the_bucket_and_stay(run, tmp_path):
+def test_parts_go_to_the_bucket_until_the_result_is_whole(run, check):
     done = run("whole")
     assert (done.code, done.err) == (0, "")
-    check(tmp_path / "out", "whole")
-    # They are not taken for those of another run, nor touched by it.
-    again = run("whole")
-    assert again.code == 2
-    assert "s3://surveys/whole holds the parts of another run" in again.err
-    check(tmp_path / "out", "whole")
+    check("whole")
 
 
 # Ends its worker a moment after the third upload has begun.
 DIES = """
 import os, signal, threading
 from lidarpool.columns.storage import Storage
+from lidarpool.run.store import RunStore
 write, count = Storage.write, []
 def write_and_die(storage, name, data):
     count.append(name)
@@ -103,7 +116,7 @@ Storage.write = write_and_die
 """
 
 
-def test_a_collector_dies_while_it_uploads(run, cluster_there, environment, tmp_path):
+def test_a_collector_dies_while_it_uploads(run, check, cluster_there, environment):
     """The stages begin on the worker with more slots, which dies, and go on on the other."""
     cluster_there.add("LIDAR", slots=8, preload=DIES, **environment)
     cluster_there.wait()
@@ -111,7 +124,7 @@ def test_a_collector_dies_while_it_uploads(run, cluster_there, environment, tmp_
     done = run("died")
     assert (done.code, done.err) == (0, "")
     assert cluster_there.processes.pop(doomed).wait(60) == -9
-    report = check(tmp_path / "out", "died")
+    report = check("died")
     assert report["replayed"] > 0
 
 
@@ -125,7 +138,7 @@ def test_a_place_that_there_cannot_be(place, run, tmp_path):
 
 
 def test_a_bucket_that_the_workers_cannot_reach(
-    lidarpool, cluster, environment, tmp_path, monkeypatch
+    lidarpool, check, cluster, environment, tmp_path, monkeypatch
 ):
     """Parts come to it through the driver."""
     monkeypatch.setattr(Storage, "sees", lambda *_: False)
@@ -135,5 +148,5 @@ def test_a_bucket_that_the_workers_cannot_reach(
         "--scheduler", cluster, "--parts", f"{BUCKET}/far",
     )  # fmt: skip
     assert (done.code, done.err) == (0, "")
-    (note,) = (n for n in check(tmp_path / "out", "far")["notes"] if "cannot see" in n)
-    assert note.startswith(f"LIDAR of partition LIDAR cannot see {BUCKET}/far: parts came to it")
+    (note,) = (n for n in check("far")["notes"] if "cannot see" in n)
+    assert note.startswith(f"LIDAR of partition LIDAR cannot see {BUCKET}/far/run-")

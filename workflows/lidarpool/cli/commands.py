@@ -119,7 +119,7 @@ def demo(out: Path, **shown: Any) -> None:
 @click.option(
     "--parts",
     metavar="PLACE",
-    help="Folder or URL (s3://…) that the points are written to, part by part; they stay there.",
+    help="Folder or URL (s3://…) that LIDAR workers write points to until the result is whole.",
 )
 @click.option(
     "--wait",

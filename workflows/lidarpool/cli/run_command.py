@@ -22,7 +22,7 @@ from ..run.connection import TlsFiles, connected, local_client
 from ..run.job import Job, make_job
 from ..run.result import Result
 from ..run.run import Run, make_result
-from ..run.store import COMMAND_TERMS, RunStore, remove_run
+from ..run.store import RunStore, remove_run
 from ..scan import PATIENCE_S, WAIT_S
 from ..scenario.scenario import Scenario
 from .log_file import LOG, QuietWorkers, logged_to
@@ -41,7 +41,7 @@ class RunOptions:
 
     `resumable` says whether the run is kept in the output folder; without that, `resume` and
     `fresh` mean nothing. `stay` says whether the page of `live` stays when all is done. `only` is
-    "cloud" for a cloud without pictures and page. `parts` is where the parts go, and stay.
+    "cloud" for a cloud without pictures and page. `parts` is where the parts go meanwhile.
     """
 
     out: Path
@@ -159,11 +159,11 @@ def _log(options: RunOptions) -> Path:
 def _store(job: Job, options: RunOptions) -> RunStore:
     """Where the run is kept, with what an earlier one has left if that is to be resumed."""
     if not options.resumable:
-        return RunStore(job, None, options.parts)
+        return RunStore(job)
     path = options.out / RUN_FOLDER
     if options.fresh:
         remove_run(path)
-    store = RunStore(job, path, options.parts, resume=options.resume, terms=COMMAND_TERMS)
+    store = RunStore(job, path, options.parts, resume=options.resume)
     if options.resume and not store.kept:
         store.notes.append(f"there was nothing to resume in {options.out}")
     return store

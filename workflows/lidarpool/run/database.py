@@ -11,9 +11,10 @@ import bisect
 import json
 import sqlite3
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +22,8 @@ from numpy.typing import NDArray
 from ..base.errors import LidarpoolError
 from ..plan import Trial
 from ..scan.messages import Receipt
-from .trial_record import trial_from_json, trial_to_json
 
-FORMAT = 2
+FORMAT = 3
 FILE = "run.db"
 
 _TABLES = """
@@ -86,28 +86,19 @@ class RunDatabase:
             self._set("format", str(FORMAT))
         self._sql.execute("COMMIT")
         self.meta = dict(self._sql.execute("SELECT name, value FROM meta"))
-        if self.meta.get("format") != str(FORMAT):
-            raise sqlite3.DatabaseError(
-                f"is of format {self.meta.get('format', 'unknown')}, and this version reads "
-                f"{FORMAT}"
-            )
+        if (made := self.meta.get("format")) != str(FORMAT):
+            raise sqlite3.DatabaseError(f"it is of format {made}, and this version reads {FORMAT}")
         self.frames = self._frames_written = int(self.meta.get("frames", 0))
         rows = self._sql.execute(
             "SELECT first, stop, name, rows, size, hits, cells, "
             "CASE WHEN stop > ? THEN summaries ELSE x'' END FROM parts ORDER BY first",
             (self.frames,),
         )
-        for row in rows:
-            first, stop, name, count, size, hits, cells, summaries = row
-            self._enter(
-                Receipt(
-                    -1, first, stop, name, count, size, hits, tuple(json.loads(cells)), summaries
-                )
-            )
-        self.trials = [
-            trial_from_json(data.encode())
-            for (data,) in self._sql.execute("SELECT data FROM trials ORDER BY trial")
-        ]
+        for first, stop, name, count, size, hits, cells, summaries in rows:
+            box = tuple(json.loads(cells))
+            self._enter(Receipt(-1, first, stop, name, count, size, hits, box, summaries))
+        trials = self._sql.execute("SELECT data FROM trials ORDER BY trial")
+        self.trials = [_trial_of(json.loads(data)) for (data,) in trials]
 
     # -- what there is -------------------------------------------------------------------
 
@@ -230,7 +221,8 @@ class RunDatabase:
         with self._transaction():
             self._sql.execute(
                 "INSERT OR IGNORE INTO trials VALUES (?, ?)",
-                (trial.trial, trial_to_json(trial).decode()),
+                # To the bit: a float is written with the digits that identify it.
+                (trial.trial, json.dumps(vars(trial), default=np.ndarray.tolist)),
             )
         self.trials.append(trial)
 
@@ -251,12 +243,6 @@ class RunDatabase:
         self._sql.close()
 
     def _enter(self, part: Receipt) -> None:
-        if not 0 <= part.first < part.stop <= self.scan_count:
-            raise sqlite3.DatabaseError(
-                f"holds scans {part.first} to {part.stop - 1} of {self.scan_count}"
-            )
-        if self.committed[part.first : part.stop].any():
-            raise sqlite3.DatabaseError(f"holds scans {part.first} to {part.stop - 1} twice")
         self.parts[part.first] = part
         bisect.insort(self._firsts, part.first)
         self.committed[part.first : part.stop] = True
@@ -292,29 +278,28 @@ class RunDatabase:
         except sqlite3.OperationalError as error:
             if "locked" in str(error):
                 raise LidarpoolError(f"Another run is using {self.path.parent}.") from error
-            if "no such" in str(error):  # table or column
-                raise self._damage(error) from error
             raise LidarpoolError(
                 f"{self.path} cannot be written ({error}): make room on its disk, or give another "
                 "folder."
             ) from error
         except (sqlite3.Error, ValueError, TypeError, KeyError) as error:
-            raise self._damage(error) from error
-
-    def _damage(self, error: Exception) -> LidarpoolError:
-        text = str(error)
-        clause = text if text.startswith(("is of", "holds")) else f"is damaged ({text})"
-        return LidarpoolError(f"{self.path} cannot be continued: it {clause}.")
+            raise LidarpoolError(
+                f"{self.path} is damaged ({error}): drop the run with --fresh, or give another "
+                "folder."
+            ) from error
 
 
-def parts_of(path: Path) -> tuple[str, list[str]]:
-    """Where the parts of a run are, and their names; nothing where that cannot be read."""
-    if not path.is_file():
-        return "", []
-    try:
-        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as sql:
-            names = [name for (name,) in sql.execute("SELECT name FROM parts")]
-            place = sql.execute("SELECT value FROM meta WHERE name = 'parts'").fetchone()
-    except sqlite3.Error:
-        return "", []
-    return (place[0] if place else ""), names
+def _trial_of(data: dict[str, Any]) -> Trial:
+    waypoints = np.array(data.pop("waypoints"), np.float64).reshape(-1, 2)
+    return Trial(waypoints=waypoints, history=np.array(data.pop("history"), np.float32), **data)
+
+
+def parts_place(path: Path) -> str:
+    """Where a run has put its parts, as its database says; empty where that cannot be read."""
+    with (
+        suppress(sqlite3.Error),
+        closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as sql,
+    ):
+        found = sql.execute("SELECT value FROM meta WHERE name = 'parts'").fetchone()
+        return str(found[0]) if found else ""
+    return ""

@@ -2,86 +2,52 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 
 from .._version import __version__
 from ..base.fingerprint import fingerprint
 from .job import Job
 
+_CONTENT = ("scene", "survey", "planning")
 
-@dataclass(frozen=True)
-class Identity:
+
+def identity_of(job: Job) -> dict[str, str]:
     """Fingerprints of the inputs of a run, and the versions of what computes with them.
 
-    Parameters
-    ----------
-    scene, survey, planning
-        Fingerprints; the last is empty where nothing is planned.
-    versions
-        Of this package and of those whose arithmetic shows in the points.
+    Raises
+    ------
+    LidarpoolError
+        If a sensor, column or trajectory holds something that has no fingerprint.
     """
+    scene, survey = job.scene, job.survey
+    return {
+        "lidarpool": __version__,
+        "numpy": version("numpy"),
+        "open3d": _open3d_version(),
+        "scene": fingerprint(
+            scene.vertices, scene.faces, scene.face_object, scene.origin, scene.names
+        ),
+        "survey": fingerprint(
+            survey.sensor,
+            survey.path,
+            survey.steps,
+            survey.keep_every,
+            survey.precision_m,
+            survey.columns,
+        ),
+        "planning": "" if job.planning is None else fingerprint(job.planning),
+    }
 
-    scene: str
-    survey: str
-    planning: str
-    versions: Mapping[str, str]
 
-    @classmethod
-    def of(cls, job: Job) -> Identity:
-        """Identity of a run.
-
-        Raises
-        ------
-        LidarpoolError
-            If a sensor, column or trajectory holds something that has no fingerprint.
-        """
-        scene, survey = job.scene, job.survey
-        return cls(
-            scene=fingerprint(
-                scene.vertices, scene.faces, scene.face_object, scene.origin, scene.names
-            ),
-            survey=fingerprint(
-                survey.sensor,
-                survey.path,
-                survey.steps,
-                survey.keep_every,
-                survey.precision_m,
-                survey.columns,
-            ),
-            planning="" if job.planning is None else fingerprint(job.planning),
-            versions={
-                "lidarpool": __version__,
-                "numpy": version("numpy"),
-                "open3d": _open3d_version(),
-            },
-        )
-
-    def difference(self, other: Identity) -> str:
-        """In what `other` differs, as a clause; empty where it does not."""
-        for name, here in self.versions.items():
-            there = other.versions.get(name, "none")
-            if there != here:
-                return f"it was written with {name} {there}, here it is {here}"
-        for name in ("scene", "survey", "planning"):
-            if getattr(self, name) != getattr(other, name):
+def difference(here: Mapping[str, str], there: Mapping[str, str]) -> str:
+    """In what an earlier run differs from this one, as a clause; empty where it does not."""
+    for name, value in here.items():
+        if there.get(name) != value:
+            if name in _CONTENT:
                 return f"it is of another {name}"
-        return ""
-
-    def to_text(self) -> str:
-        """JSON."""
-        return json.dumps(asdict(self), sort_keys=True)
-
-    @classmethod
-    def from_text(cls, text: str) -> Identity:
-        """Inverse of `to_text`; of anything else, an identity that nothing agrees with."""
-        try:
-            data = json.loads(text)
-            return cls(data["scene"], data["survey"], data["planning"], dict(data["versions"]))
-        except (KeyError, TypeError, ValueError):
-            return cls("", "", "", {})
+            return f"it was written with {name} {there.get(name, 'none')}, here it is {value}"
+    return ""
 
 
 def _open3d_version() -> str:

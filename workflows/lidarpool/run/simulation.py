@@ -79,7 +79,8 @@ def simulate(
         temporary folder as long as the result is in use.
     parts
         Where the points go, part by part: a folder that the workers see, or a URL that fsspec
-        opens, such as ``s3://bucket/survey``. They stay there. By default they go into `folder`.
+        opens, such as ``s3://bucket/survey``. It takes a `folder`, whose database says which
+        parts there are; `remove_run` removes both. By default they go into `folder`.
     resume
         Go on from what an earlier run has left in `folder`; from the beginning if there is
         nothing. `on_frame` gets the frames that it has not had yet, but for those of the last

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
+import secrets
 import shutil
 import tempfile
 import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +21,8 @@ from ..columns.parts import SUFFIX, StoredCloud, read_part, read_tally
 from ..columns.storage import Storage
 from ..scan.messages import Receipt, samples_of_scan, summary_type
 from .checks import AUTO_TAKES
-from .database import FILE, RunDatabase, parts_of
-from .identity import Identity
+from .database import FILE, RunDatabase, parts_place
+from .identity import difference, identity_of
 from .job import Job
 from .progress import Progress
 
@@ -29,17 +30,9 @@ PARTS = "parts"  # the folder of the parts, in the run's folder
 SAMPLE_RAYS = 400  # of the pictures
 TALLIED_PARTS = 2000  # read for the hits of each triangle; of more, an even choice
 
-
-@dataclass(frozen=True)
-class Terms:
-    """How whoever reads the messages is to say it: in Python, or on the command line."""
-
-    resume: str
-    discard: str
-
-
-PYTHON_TERMS = Terms("resume=True", "remove_run()")
-COMMAND_TERMS = Terms("--resume", "--fresh")
+# On the command line, and in Python.
+_RESUME = "--resume (in Python resume=True)"
+_DROP = "--fresh (in Python remove_run)"
 
 
 class RunStore:
@@ -53,17 +46,17 @@ class RunStore:
         Where they are kept; None for a temporary folder that goes with the last user of the
         points.
     parts
-        Another place for the parts, a path or URL, where they stay when the run is done.
+        Another place for the parts, a path or URL, in which they get a folder of their own. A
+        run that is resumed goes on where its parts are.
     resume
         Whether to go on from what is there; if not, there must be nothing.
-    terms
-        How messages name what can be done.
 
     Raises
     ------
     LidarpoolError
         If it holds an unfinished run and that is not to be resumed, or cannot be: it is damaged,
-        of another run, in use, or cast with another backend than is asked for.
+        of another run, in use, or cast with another backend than is asked for; or if there are
+        `parts` without a `folder`, whose database says which parts there are.
     """
 
     def __init__(
@@ -73,23 +66,23 @@ class RunStore:
         parts: str | Path | None = None,
         *,
         resume: bool = False,
-        terms: Terms = PYTHON_TERMS,
     ) -> None:
-        self.job, self.terms = job, terms
+        if parts is not None and folder is None:
+            raise LidarpoolError(
+                "parts are given a place, and nothing would know of them afterwards: give a "
+                "folder for the run as well."
+            )
+        self.job = job
         self.lasting = folder is not None
-        self.keeps_parts = parts is not None
         self.notes: list[str] = []  # what a user should know
         self.on_parts: Callable[[list[Receipt]], None] | None = None  # called with new ones
-        self._identity = Identity.of(job)
         self._gone = False
+        here = identity_of(job)
         if folder is None:
             folder = Path(tempfile.mkdtemp(prefix="lidarpool-"))
             weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
         self.folder = folder
-        self._made = not folder.exists()
-        self.storage = Storage.at(
-            folder / PARTS if parts is None else parts, durable=self.lasting or self.keeps_parts
-        )
+        made = not folder.exists()
         try:
             folder.mkdir(exist_ok=True)
         except OSError as error:
@@ -98,66 +91,53 @@ class RunStore:
                 "one that it lies in first, or give another."
             ) from error
         try:
-            self.db = RunDatabase(folder / FILE, job.survey.scan_count, durable=self.lasting)
+            self.db = self._open(here, parts)
             try:
-                self._begin(resume)
+                self.storage = _storage(folder, self.db.meta["parts"], durable=self.lasting)
+                sizes = self._sizes()  # also an error if the place cannot be opened
+                if self.kept:
+                    self._go_on(here, resume, sizes)
             except BaseException:
                 self.db.close()
                 raise
         except BaseException:
-            self._remove_folder_if_new()
+            if made:
+                shutil.rmtree(folder, ignore_errors=True)
             raise
         self.resumed = self.db.scans_done  # scans whose points are of an earlier run
 
-    def _begin(self, resume: bool) -> None:
-        db, here = self.db, self._identity.to_text()
-        moved = db.meta.get("parts") != self.storage.url
-        if moved and not db.parts:  # else what is there may be of this run
-            self._refuse_strangers()
-        if "identity" not in db.meta:
-            db.set(identity=here, parts=self.storage.url)
-            return
-        difference = self._identity.difference(Identity.from_text(db.meta["identity"]))
-        if difference and not self.kept:
-            db.set(identity=here, parts=self.storage.url, backend="")
-            return
-        if difference:
+    def _open(self, here: dict[str, str], parts: str | Path | None) -> RunDatabase:
+        """Open the database, a new one unless something is committed in that which is there."""
+        path, count = self.folder / FILE, self.job.survey.scan_count
+        if path.exists():
+            db = RunDatabase(path, count, durable=self.lasting)
+            if db.scans_done or db.trials:
+                return db
+            db.close()
+        remove_run(self.folder)
+        self.folder.mkdir(exist_ok=True)
+        db = RunDatabase(path, count, durable=self.lasting)
+        place = "" if parts is None else f"{Storage.at(parts).url}/run-{secrets.token_hex(4)}"
+        db.set(identity=json.dumps(here), parts=place)
+        return db
+
+    def _go_on(self, here: dict[str, str], resume: bool, sizes: dict[str, int]) -> None:
+        """Check that this run may go on from what is there."""
+        if other := difference(here, json.loads(self.db.meta["identity"])):
             raise LidarpoolError(
-                f"The run in {self.folder} cannot be continued, {difference}. Drop it with "
-                f"{self.terms.discard}, or give another folder."
+                f"The run in {self.folder} cannot be continued, {other}. Drop it with {_DROP}, or "
+                "give another folder."
             )
-        if moved and db.parts:
+        if not resume:
             raise LidarpoolError(
-                f"The run in {self.folder} has its parts in {db.meta['parts']}: give that place, "
-                f"or drop the run with {self.terms.discard}."
+                f"{self.folder} holds an unfinished run, {self.kept}: continue it with {_RESUME}, "
+                f"or drop it with {_DROP}."
             )
-        db.set(parts=self.storage.url)
-        if self.kept and not resume:
-            raise LidarpoolError(
-                f"{self.folder} holds an unfinished run, {self.kept}: continue it with "
-                f"{self.terms.resume}, or drop it with {self.terms.discard}."
-            )
-        if self.kept and self.job.backend not in ("auto", self.backend):
+        if self.job.backend not in ("auto", self.backend):
             raise LidarpoolError(
                 f"Backend {self.job.backend!r} is asked for, and the scans in {self.folder} were "
-                f"cast with {self.backend!r}: continue with that, or drop them with "
-                f"{self.terms.discard}."
+                f"cast with {self.backend!r}: continue with that, or drop them with {_DROP}."
             )
-        self._check_parts()
-
-    def _refuse_strangers(self) -> None:
-        """Leave parts alone that are of another run."""
-        there = [name for name in self._sizes() if name.endswith(SUFFIX)]
-        if there and self.keeps_parts:
-            raise LidarpoolError(
-                f"{self.storage.url} holds the parts of another run ({there[0]}, …): give an empty "
-                "place with --parts, or remove them."
-            )
-        self._remove_parts(there)
-
-    def _check_parts(self) -> None:
-        """Look whether the parts are there; those that are not are made again."""
-        sizes = self._sizes()
         absent = [p for p in self.db.ordered if sizes.get(p.name) != p.size]
         if absent:
             self.db.drop(absent)
@@ -208,7 +188,7 @@ class RunStore:
             return AUTO_TAKES
         return (
             f"The scans in {self.folder} were cast with it: continue where it is to be had, or "
-            f"drop them with {self.terms.discard}."
+            f"drop them with {_DROP}."
         )
 
     def progress(self) -> Progress:
@@ -286,25 +266,13 @@ class RunStore:
         """Remove parts that are not of the result: their collectors died, or were not needed."""
         ours = {part.name for part in self.db.parts.values()}
         with suppress(OSError, LidarpoolError):
-            self._remove_parts([n for n in self._sizes() if SUFFIX in n and n not in ours])
-
-    def _remove_parts(self, names: list[str]) -> None:
-        try:
-            self.storage.remove(names)
-        except OSError as error:
-            raise LidarpoolError(
-                f"Parts in {self.storage.url} cannot be removed: {error.strerror or error}."
-            ) from error
+            self.storage.remove([n for n in self._sizes() if SUFFIX in n and n not in ours])
 
     def remove(self) -> None:
-        """Remove all of it but parts that are to stay: the result is where it belongs."""
+        """Remove all of it: the result is where it belongs."""
         self._gone = True
         self.db.close()
-        remove_run(self.folder, parts=not self.keeps_parts)
-
-    def _remove_folder_if_new(self) -> None:
-        if self._made and self.folder.exists():
-            shutil.rmtree(self.folder, ignore_errors=True)
+        remove_run(self.folder)
 
     @contextmanager
     def kept_on_error(self) -> Iterator[None]:
@@ -319,25 +287,24 @@ class RunStore:
             self.db.close()
             if not self.kept:
                 with suppress(LidarpoolError):
-                    remove_run(self.folder, parts=not self.keeps_parts)
+                    remove_run(self.folder)
             elif (self.folder / FILE).exists():
-                error.add_note(
-                    f"{self.kept} are kept in {self.folder}: continue with {self.terms.resume}."
-                )
+                error.add_note(f"{self.kept} are kept in {self.folder}: continue with {_RESUME}.")
             raise
 
 
-def remove_run(folder: str | Path, *, parts: bool = True) -> None:
-    """Remove what a run has kept in a folder; nothing else in it is touched.
+def _storage(folder: Path, place: str, *, durable: bool = True) -> Storage:
+    """Where the parts of a run are: in its folder, or in a place of their own."""
+    return Storage.at(place or folder / PARTS, durable=durable)
 
-    Parts that an unfinished run has put elsewhere go as well: nobody knows of them any more.
+
+def remove_run(folder: str | Path) -> None:
+    """Remove what a run has kept in a folder, and its parts, wherever they are; nothing else.
 
     Parameters
     ----------
     folder
         The run's folder.
-    parts
-        Whether to remove its parts too.
 
     Raises
     ------
@@ -345,16 +312,12 @@ def remove_run(folder: str | Path, *, parts: bool = True) -> None:
         If it cannot be removed.
     """
     folder = Path(folder)
-    storage = Storage.at(folder / PARTS)
+    storage = _storage(folder, parts_place(folder / FILE))
     try:
-        if parts:
-            elsewhere, names = parts_of(folder / FILE)
-            if elsewhere and elsewhere != storage.url:
-                Storage.at(elsewhere).remove(names)
-            storage.remove([n for n in storage.sizes() if SUFFIX in n])
+        storage.remove([name for name in storage.sizes() if SUFFIX in name])
+        storage.remove_folder()
         for name in (FILE, f"{FILE}-journal"):
             (folder / name).unlink(missing_ok=True)
-        storage.remove_folder()
         Storage.at(folder).remove_folder()
     except OSError as error:
         raise LidarpoolError(
