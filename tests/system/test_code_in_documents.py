@@ -33,6 +33,7 @@ import lidarpool.run.simulation
 from lidarpool import Cloud, save_cloud
 from lidarpool.cli.commands import cli
 from lidarpool.scenario.scenario import Scenario
+from lidarpool.sensor.models import SensorModel
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = [ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md"))]
@@ -219,6 +220,8 @@ def test_yaml_is_what_it_is_for(block):
         for key in leaves(data):
             # KeyError where Dask has no such setting; variables of the environment have any name.
             dask.config.get(re.sub(r"(?<=\.pre-spawn-environ)\..*", "", key))
+    elif "beams" in data:
+        SensorModel.model_validate(data)
     else:
         Scenario.from_data(data, source=block.where)
 

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from .scan import Frame
     from .scene.scene import Scene
     from .sensor import Beams, Pose, ScanSpec, Sensor, Spin, Survey
+    from .sensor.models import load_sensor
 
 __all__ = [
     "Beams",
@@ -34,6 +35,7 @@ __all__ = [
     "Spin",
     "Survey",
     "__version__",
+    "load_sensor",
     "read_cloud",
     "remove_run",
     "save_cloud",
@@ -53,6 +55,7 @@ _MODULES = {
     "run.store": ("remove_run",),
     "scan": ("Frame",),
     "scene.scene": ("Scene",),
+    "sensor.models": ("load_sensor",),
     "sensor": ("Beams", "Pose", "ScanSpec", "Sensor", "Spin", "Survey"),
 }
 

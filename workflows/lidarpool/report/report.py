@@ -136,7 +136,7 @@ def _sensor(sensor: Sensor) -> dict[str, Any]:
         if not name.startswith("_") and isinstance(value, (int, float, str))
     }
     return {
-        "kind": type(sensor).__name__,
+        "kind": sensor.name or type(sensor).__name__,
         "channels": sensor.channels,
         "elevation_deg": [round(float(elevations.min()), 6), round(float(elevations.max()), 6)],
         "head": {"kind": type(sensor.head).__name__, **head},

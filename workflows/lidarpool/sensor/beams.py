@@ -69,6 +69,31 @@ class Beams:
         half = np.radians(vertical_fov_deg) / 2
         return cls(np.linspace(-half, half, layers) if layers > 1 else np.zeros(1))
 
+    def turning(self, radians_per_ns: float) -> Beams:
+        """Return the beams of a head that turns on while they are fired one after the other.
+
+        Parameters
+        ----------
+        radians_per_ns
+            What the head turns, counter-clockwise.
+
+        Returns
+        -------
+        Beams
+            The same, each turned by as much as the head is at its time; so the turn within a
+            firing costs nothing when rays are made.
+        """
+        angle = radians_per_ns * self.time_ns
+        x, y, z = self.origin.T
+        cos, sin = np.cos(angle), np.sin(angle)
+        origin = np.column_stack([cos * x - sin * y, sin * x + cos * y, z])
+        return Beams(self.elevation, self.azimuth + angle, self.time_ns, origin)
+
+    def lowest_first(self) -> Beams:
+        """Return the same beams in the order of channels."""
+        order = np.argsort(self.elevation, kind="stable")
+        return Beams(*(a[order] for a in (self.elevation, self.azimuth, self.time_ns, self.origin)))
+
 
 class Head(Protocol):
     """What moves the beams: in one time step it passes some firings, numbered from 0."""
@@ -89,7 +114,7 @@ class Head(Protocol):
 
 @dataclass(frozen=True)
 class Spin:
-    """A head that spins counter-clockwise, seen from above, from the sensor's +x axis.
+    """A head that spins.
 
     Parameters
     ----------
@@ -99,6 +124,10 @@ class Spin:
         Degrees turned in one time step, in (0, 360].
     rate_hz
         Turns a second.
+    clockwise
+        Which way it turns, seen from above.
+    zero_deg
+        Where it looks at firing 0: counter-clockwise from the sensor's +x axis.
 
     Raises
     ------
@@ -115,6 +144,8 @@ class Spin:
     firings_per_turn: float = 1000
     step_deg: float = 10.0
     rate_hz: float = 10.0
+    clockwise: bool = False
+    zero_deg: float = 0.0
 
     def __post_init__(self) -> None:
         checks = (
@@ -164,8 +195,66 @@ class Spin:
 
     def azimuths(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
         """See `Head.azimuths`."""
-        within = np.asarray(firings % self.firings_per_turn, np.float64)
-        return 2 * np.pi * within / self.firings_per_turn
+        turned = 2 * np.pi * self._within(firings) / self.firings_per_turn
+        return np.radians(self.zero_deg) + (-turned if self.clockwise else turned)
+
+    def _within(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Count firings since the turn began; not whole where turns begin between two."""
+        return np.asarray(firings % self.firings_per_turn, np.float64)
+
+    @property
+    def radians_per_ns(self) -> float:
+        """Radians turned in a nanosecond, counter-clockwise."""
+        return 2 * np.pi * self.rate_hz / 1e9 * (-1 if self.clockwise else 1)
+
+
+@dataclass(frozen=True)
+class Mirror(Spin):
+    """A mirror that sweeps the beams over a line, to and fro or always the same way.
+
+    A turn is one cycle of it: two lines of a mirror that swings, one of a polygon's facet.
+    Azimuth 0 is in the middle of a line.
+
+    Parameters
+    ----------
+    motion
+        "sine" and "triangle" swing, "sawtooth" is a polygon.
+    width_deg
+        From one end of a line to the other.
+    duty
+        Of each cycle, the share in which it fires: a polygon's facets see more than is used.
+    """
+
+    motion: str = "triangle"
+    width_deg: float = 60.0
+    duty: float = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks = (
+            ("motion", self.motion in ("sine", "triangle", "sawtooth"), "sine, triangle, sawtooth"),
+            ("width_deg", 0 < self.width_deg <= 360, "above 0, at most 360"),
+            ("duty", 0 < self.duty <= 1, "above 0, at most 1"),
+        )
+        for name, good, allowed in checks:
+            if not good:
+                raise LidarpoolError(f"{name} is {getattr(self, name)}; it must be {allowed}.")
+
+    def times_ns(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
+        """See `Head.times_ns`."""
+        pause = self._within(firings) * (1 - self.duty)
+        return (firings - pause) * (1e9 / (self.rate_hz * self.firings_per_turn))
+
+    def azimuths(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
+        """See `Head.azimuths`."""
+        phase = self._within(firings) / self.firings_per_turn
+        if self.motion == "sine":
+            place = -np.cos(2 * np.pi * phase) / 2
+        elif self.motion == "triangle":
+            place = 0.5 - np.abs(2 * phase - 1)
+        else:
+            place = phase - 0.5
+        return np.radians(self.zero_deg) + np.radians(self.width_deg) * place
 
 
 def _table(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:

@@ -27,6 +27,8 @@ class Sensor:
     min_range_m, max_range_m
         Returns nearer or farther than this, in metres, are not seen. A ray goes on through what
         is nearer.
+    name
+        Of the model, for reports; by default that of the class.
 
     Raises
     ------
@@ -44,6 +46,7 @@ class Sensor:
     head: Head = field(default_factory=Spin)
     min_range_m: float = 0.0
     max_range_m: float = float("inf")
+    name: str = ""
 
     def __post_init__(self) -> None:
         checks = (
@@ -130,14 +133,7 @@ class Sensor:
 
     def directions(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
         """Make the unit directions of firings (k,), in the sensor's axes: (k, channels, 3)."""
-        azimuth, beams = self.head.azimuths(firings)[:, None], self.beams
-        if beams.azimuth.any():
-            azimuth = azimuth + beams.azimuth
-        out = np.empty((len(firings), self.channels, 3))
-        out[..., 0] = np.cos(azimuth) * self._level
-        out[..., 1] = np.sin(azimuth) * self._level
-        out[..., 2] = np.sin(beams.elevation)
-        return out
+        return self._turned(firings, self._ahead)
 
     def origins(self, firings: NDArray[np.int64]) -> NDArray[np.float64] | None:
         """Where the rays of firings (k,) leave, in the sensor's axes: (k, channels, 3), metres.
@@ -146,11 +142,21 @@ class Sensor:
         """
         if not self.beams.origin.any():
             return None
+        return self._turned(firings, self.beams.origin)
+
+    def _turned(
+        self, firings: NDArray[np.int64], vectors: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Turn a vector of each beam (c, 3) with the head: (k, channels, 3).
+
+        Products of what a firing and what a beam has: no trigonometry on each ray.
+        """
         azimuth = self.head.azimuths(firings)[:, None]
-        x, y, z = self.beams.origin.T
+        cos, sin = np.cos(azimuth), np.sin(azimuth)
+        x, y, z = vectors.T
         out = np.empty((len(firings), self.channels, 3))
-        out[..., 0] = np.cos(azimuth) * x - np.sin(azimuth) * y
-        out[..., 1] = np.sin(azimuth) * x + np.cos(azimuth) * y
+        out[..., 0] = cos * x - sin * y
+        out[..., 1] = sin * x + cos * y
         out[..., 2] = z
         return out
 
@@ -160,6 +166,24 @@ class Sensor:
         return np.rint(times).astype(np.int64)
 
     @cached_property
-    def _level(self) -> NDArray[np.float64]:
-        """Part of each beam in the sensor's xy plane, (c,)."""
-        return np.cos(self.beams.elevation)
+    def _ahead(self) -> NDArray[np.float64]:
+        """Unit direction of each beam when the head is at azimuth 0, (c, 3)."""
+        beams = self.beams
+        level = np.cos(beams.elevation)
+        x, y = level * np.cos(beams.azimuth), level * np.sin(beams.azimuth)
+        return np.column_stack([x, y, np.sin(beams.elevation)])
+
+
+@dataclass(frozen=True, eq=False)
+class LineSensor(Sensor):
+    """A sensor whose head turns about its x axis: azimuth 0 looks down, 90 degrees to the left.
+
+    So an airborne scanner flies along x and sweeps across.
+    """
+
+    def _turned(
+        self, firings: NDArray[np.int64], vectors: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        out = super()._turned(firings, vectors)[..., ::-1]
+        out[..., 2] *= -1
+        return out

@@ -1,0 +1,353 @@
+"""Sensors by model and by calibration: angles, times and places as their makers state them."""
+
+from __future__ import annotations
+
+import doctest
+import json
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+import lidarpool.sensor.models
+from lidarpool import LidarpoolError
+from lidarpool.sensor.models import load_sensor, model_names, read_model
+from lidarpool.sensor.rays import ListedSensor, PrismSensor
+
+READY = [name for name in model_names() if not read_model(name).needs_calibration]
+
+
+def angles(directions):
+    """Azimuth and elevation of directions (…, 3), degrees."""
+    x, y, z = np.moveaxis(directions, -1, 0)
+    return np.degrees(np.arctan2(y, x)), np.degrees(np.arcsin(z))
+
+
+def test_examples_in_the_docstrings():
+    found = doctest.testmod(lidarpool.sensor.models)
+    assert found.attempted and not found.failed
+
+
+@pytest.mark.parametrize("name", READY)
+def test_every_model_makes_a_sensor(name):
+    model, sensor = read_model(name), load_sensor(name)
+    assert sensor.name == model.name and all(model.sources.values())
+    assert model.range_m == (sensor.min_range_m, sensor.max_range_m)
+    firings = np.arange(200_000, 200_500)
+    directions, times = sensor.directions(firings), sensor.times_ns(firings)
+    assert directions.shape == (500, sensor.channels, 3)
+    assert np.abs((directions**2).sum(axis=-1) - 1).max() < 1e-14, "rays are not made again"
+    assert (np.diff(sensor.beams.elevation) >= 0).all(), "channel 0 is the lowest"
+    assert (np.diff(times[:, 0]) > 0).all() and (times >= 0).all()
+    assert sensor.firings(35)[1] in (sensor.firings(35)[0] + 1, *range(10, 100_000))
+
+
+# Channels counted from the lowest: elevation, and azimuth offset without the turn in between.
+FIGURES = {
+    "velodyne/vlp16": {0: (-15, 0), 1: (-13, 0), 15: (15, 0)},  # VLP16db.yaml
+    "velodyne/vlp32c": {0: (-25, -1.4), 1: (-15.639, 1.4), 31: (15, 1.4)},  # VLP-32C.yaml
+    "velodyne/hdl32e": {0: (-30.67, 0), 31: (10.67, 0)},  # 32db.yaml
+    "hesai/pandar40p": {0: (-24.569, 1.042), 39: (15.21, 1.042)},  # Pandar40P
+    "hesai/pandarqt": {0: (-52.121, -8.736), 63: (52.133, 7.892)},  # PandarQT
+    "ouster/os1-32": {0: (-21.4764, 4.2521), 31: (20.5477, 4.252)},  # 32U0
+    "ouster/os2-128": {127: (10.76, -2.07), 0: (-11.09, 2.04)},  # OS-2-128-U1
+}
+
+
+@pytest.mark.parametrize(("name", "channels"), FIGURES.items(), ids=FIGURES)
+def test_angles_are_those_of_the_source(name, channels):
+    sensor = load_sensor(name)
+    azimuth, elevation = angles(sensor.directions(np.array([0]))[0])
+    turn = np.degrees(sensor.head.radians_per_ns * sensor.beams.time_ns) + sensor.head.zero_deg
+    off = (azimuth - turn + 180) % 360 - 180
+    for channel, (up, aside) in channels.items():
+        assert elevation[channel] == pytest.approx(up, abs=1e-6)
+        assert off[channel] == pytest.approx(aside, abs=1e-6)
+
+
+@pytest.mark.parametrize("rate_hz", [5.0, 10.0, 20.0])
+def test_a_vlp16_fires_when_it_does_and_turns_meanwhile(rate_hz):
+    sensor = load_sensor("velodyne/vlp16", rate_hz=rate_hz)
+    assert sensor.head.firings_per_turn == pytest.approx(float(Fraction("1e6") / 55.296 / rate_hz))
+    laser = [0, 2, 4, 6, 8, 10, 12, 14, 1, 3, 5, 7, 9, 11, 13, 15]  # of channels from -15 to 15
+    firings = np.array([0, 1, 7, 1_808, 100_000_000])
+    expected = firings[:, None] * 55_296 + np.array(laser) * 2_304
+    times = sensor.times_ns(firings)
+    assert np.array_equal(times, expected)
+    azimuth, elevation = angles(sensor.directions(firings))
+    turned = -360 * rate_hz * expected / 1e9  # clockwise
+    assert np.abs((azimuth - turned + 180) % 360 - 180).max() < 1e-6
+    assert np.allclose(elevation, np.arange(-15, 16, 2), atol=1e-9)
+
+
+def test_an_ouster_gives_the_points_of_its_own_look_up_table():
+    """From ouster-sdk 1.0.1: XYZLut of the metadata that the model is taken from, 20 m."""
+    table = {  # row, counted from the top, and column
+        (0, 0): [-18.67710658794944, -1.3874291852478835, 7.050373499737251],
+        (31, 0): [-18.561278537352962, -1.3788501556112154, -7.280392315250768],
+        (7, 100): [-7.955338630815104, 17.919830608955156, 3.983091216073701],
+        (15, 255): [19.924889276445935, 1.7300827966205, 0.0982296383926407],
+        (20, 511): [-19.780940741574582, -1.716115402289985, -2.364450135396444],
+    }
+    sensor = load_sensor("ouster/os1-32", columns=512)
+    for (row, column), point in table.items():
+        firing, channel = np.array([column]), 31 - row
+        start = sensor.origins(firing)[0, channel]
+        ours = start + sensor.directions(firing)[0, channel] * (20 - 0.015806)
+        assert np.abs(ours - point).max() < 1e-9
+    assert (np.ptp(sensor.times_ns(np.arange(3)), axis=1) == 0).all(), "a column has one time"
+    assert load_sensor("ouster/os1-32").period == 1024
+
+
+def test_an_hdl64_has_beams_that_leave_beside_the_axis(tmp_path):
+    """Points of a laser along the lines that Velodyne's driver computes, at two distances."""
+    vert, rot, up, left = -0.3966, 0.0726, 0.16, -0.026
+    laser = {
+        "laser_id": 0,
+        "vert_correction": vert,
+        "rot_correction": rot,
+        "vert_offset_correction": up,
+        "horiz_offset_correction": left,
+    }
+    file = tmp_path / "unit.yaml"
+    file.write_text(json.dumps({"lasers": [laser], "num_lasers": 1}))
+    model = tmp_path / "one.yaml"
+    model.write_text("{name: One, sources: {all: me}, clockwise: true, firings_per_turn: 360}")
+    sensor = load_sensor(model, calibration=file)
+    assert sensor.name == "One, unit.yaml"
+    firing = np.array([40])
+    start, along = sensor.origins(firing)[0, 0], sensor.directions(firing)[0, 0]
+    turned = np.radians(40) - rot
+    for distance in (0.0, 30.0):
+        level = distance * np.cos(vert) - up * np.sin(vert)
+        right = level * np.sin(turned) - left * np.cos(turned)
+        ahead = level * np.cos(turned) + left * np.sin(turned)
+        high = distance * np.sin(vert) + up * np.cos(vert)
+        assert np.allclose(start + distance * along, [ahead, -right, high], atol=1e-12)
+
+
+@pytest.mark.parametrize(("name", "edge_deg"), [("livox/mid40", 19.2), ("livox/mid70", 35.2)])
+def test_a_livox_fills_its_circle_and_does_not_repeat(name, edge_deg):
+    sensor = load_sensor(name)
+    assert isinstance(sensor, PrismSensor) and sensor.period is None
+    firings = np.arange(100_000)
+    off = np.degrees(np.arccos(np.clip(sensor.directions(firings)[:, 0, 0], -1, 1)))
+    assert off.max() == pytest.approx(edge_deg, abs=0.05) and off[0] < 1e-5
+    assert sensor.times_ns(np.array([0, 1, 99_999])).tolist() == [[0], [10_000], [999_990_000]]
+    frames = sensor.directions(firings).reshape(10, 10_000, 3)
+    assert not np.allclose(frames[0], frames[1], atol=1e-2)
+    # Prisms turn whole turns in 30 s, 3647 and -2332.
+    assert np.allclose(sensor.directions(firings[:9]), sensor.directions(firings[:9] + 3_000_000))
+
+
+def test_refraction_is_that_of_the_scalar_law():
+    """Both thin edges upwards: all stays in the xz plane, where angles can be added."""
+
+    def sine(ratio, degrees):
+        return np.degrees(np.arcsin(ratio * np.sin(np.radians(degrees))))
+
+    sensor = PrismSensor(wedge_deg=18, index=1.5089, rpm=(0, 0), phase_deg=(90, 90))
+    (_, y, z) = sensor.directions(np.array([0]))[0, 0]
+    angle = 18 + sine(1.5089, 0 - 18)  # out of the inclined face of the first
+    angle = -18 + sine(1 / 1.5089, angle + 18)  # into that of the second
+    angle = sine(1.5089, angle)  # out of its flat one
+    assert abs(y) < 1e-15 and np.degrees(np.arcsin(z)) == pytest.approx(angle, abs=1e-12)
+    assert angle == pytest.approx(-19.17279, abs=1e-5), "towards the thick edges"
+
+
+def test_an_airborne_scanner_sweeps_across_below(tmp_path):
+    mirror, polygon = load_sensor("airborne/leica-als50-ii"), load_sensor("airborne/riegl-vq780i")
+    x, y, z = mirror.directions(np.array([0, 1875, 3750, 937]))[:, 0].T
+    assert np.allclose(x, 0) and (z < -0.9).all()
+    assert np.allclose(np.degrees(np.arctan2(y, -z)), [-20, 20, -20, 0], atol=0.02)
+    x, y, z = polygon.directions(np.arange(3333))[:, 0].T
+    across = np.degrees(np.arctan2(y, -z))
+    assert np.allclose(np.diff(across), 60 / 3333) and across[0] == pytest.approx(-30)
+    times = polygon.times_ns(np.arange(3335))[:, 0]
+    assert (np.abs(np.diff(times)[:3332] - 1000) <= 1).all(), "a megahertz while it fires"
+    assert times[3333] == 5_000_000, "the next facet comes after a pause"
+
+
+def test_a_terrestrial_scanner_fires_lines_upwards():
+    sensor = load_sensor("terrestrial/riegl-vz400", step_deg=0.4)
+    azimuth, elevation = angles(sensor.directions(np.arange(2))[..., :])
+    assert np.allclose(elevation[0], np.linspace(-40, 60, 2500))
+    assert azimuth[1, 0] - azimuth[0, 0] == pytest.approx(0.04)
+    assert 0 < azimuth[0, -1] < 0.02, "the head turns while a line is measured"
+    assert np.ptp(sensor.times_ns(np.array([0]))) == 8_330_000
+
+
+# -- units of one's own ------------------------------------------------------------------------
+
+
+def write(tmp_path, name, text):
+    file = tmp_path / name
+    file.write_text(text)
+    return file
+
+
+def hesai(name="hesai/xt32", off=0.1, count=None):
+    table = read_model(name).beams
+    rows = zip(table.elevation_deg, table.azimuth_deg or [0] * 99, strict=False)
+    lines = [f"{i},{up + off:.6f},{-a:.6f}" for i, (up, a) in enumerate(rows, 1)]
+    return "\n".join(["Channel,Elevation,Azimuth", *lines[:count]])
+
+
+def test_a_calibration_finds_its_model(tmp_path):
+    file = write(tmp_path, "pandar.csv", hesai())
+    sensor, nominal = load_sensor(calibration=file), load_sensor("hesai/xt32")
+    assert sensor.name == "Hesai PandarXT-32, pandar.csv"
+    assert np.allclose(np.degrees(sensor.beams.elevation - nominal.beams.elevation), 0.1)
+    assert np.array_equal(sensor.beams.time_ns, nominal.beams.time_ns)
+    assert load_sensor("hesai/xt32", calibration=file).name == sensor.name
+    robosense = write(tmp_path, "angle.csv", "\n".join(f"{-15.2 + 2 * i},{i}" for i in range(16)))
+    sensor = load_sensor(calibration=robosense)
+    assert sensor.name == "RoboSense RS-LiDAR-16, angle.csv"
+    assert np.degrees(sensor.beams.elevation[3]) == pytest.approx(-9.2)
+    assert sensor.beams.time_ns[3] == 3 * 2800 and sensor.max_range_m == 230
+
+
+@pytest.mark.parametrize("new", [False, True])
+def test_ousters_metadata_old_and_new(tmp_path, new):
+    beams = {"beam_altitude_angles": [10.5, 0.0, -10.25], "beam_azimuth_angles": [4.0, 0.0, -1.5]}
+    if new:
+        shift = [1, 0, 0, 16.7, 0, 1, 0, 0, 0, 0, 1, 2.0, 0, 0, 0, 1]
+        pose = [-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 38.195, 0, 0, 0, 1]
+        data = {
+            "beam_intrinsics": {**beams, "beam_to_lidar_transform": shift},
+            "lidar_intrinsics": {"lidar_to_sensor_transform": pose},
+            "lidar_data_format": {"pixels_per_column": 3},
+            "config_params": {"lidar_mode": "512x20"},
+        }
+        columns, rate, origin = 512, 20, [0.0167, 0, 0.040195]
+    else:
+        data = {**beams, "lidar_mode": "2048x10", "lidar_origin_to_beam_origin_mm": 15.806}
+        columns, rate, origin = 2048, 10, [0.015806, 0, 0.03618]
+    sensor = load_sensor(calibration=write(tmp_path, "os.json", json.dumps(data)))
+    assert sensor.channels == 2, "beams that are all zero are not there"
+    assert (sensor.head.firings_per_turn, sensor.head.rate_hz) == (columns, rate)
+    assert np.allclose(np.degrees(sensor.beams.elevation), [-10.25, 10.5])
+    assert np.allclose(np.degrees(sensor.beams.azimuth), [1.5, -4])
+    assert np.allclose(sensor.beams.origin, origin)
+    quick = load_sensor(calibration=tmp_path / "os.json", columns=1024, rate_hz=5, max_range_m=9)
+    assert (quick.period, quick.head.rate_hz, quick.max_range_m) == (1024, 5, 9)
+
+
+def test_a_list_of_rays_of_livox(tmp_path):
+    """The list of a Mid-40 gives its rays back; Livox's own number the rows of a Mid-360."""
+    prisms = load_sensor("livox/mid40")
+    directions = prisms.directions(np.arange(500))[:, 0]
+    azimuth, elevation = angles(directions)
+    rows = [
+        f"{i * 1e-5:.5f},{a:.4f},{90 - e:.4f}"
+        for i, (a, e) in enumerate(zip(azimuth, elevation, strict=True))
+    ]
+    sensor = load_sensor(calibration=write(tmp_path, "mid40.csv", LIVOX + "\n".join(rows)))
+    assert isinstance(sensor, ListedSensor) and sensor.period == 500
+    assert np.abs(sensor.directions(np.arange(500))[:, 0] - directions).max() < 2e-6
+    assert sensor.times_ns(np.array([0, 1, 499, 500]))[:, 0].tolist() == [
+        0,
+        10_000,
+        4_990_000,
+        5_000_000,
+    ]
+    assert sensor.firings(35)[1] == 10_000, "a frame of 0.1 s, which begins the list again"
+    numbered = write(tmp_path, "mid360.csv", LIVOX + "1,268.99,37.838\n2,269.99,38\n3,270,39\n")
+    sensor = load_sensor("livox/mid360", calibration=numbered)
+    assert sensor.times_ns(np.arange(4))[:, 0].tolist() == [0, 5000, 10_000, 15_000]
+    assert sensor.name == "Livox Mid-360, mid360.csv" and sensor.max_range_m == 70
+
+
+def test_a_table_of_beams(tmp_path):
+    file = write(tmp_path, "beams.csv", "azimuth_deg,elevation_deg,time_us\n1,5,2\n0,-5,4\n")
+    sensor = load_sensor(calibration=file, columns=100, rate_hz=20)
+    assert np.allclose(np.degrees(sensor.beams.elevation), [-5, 5])
+    assert sensor.beams.time_ns.tolist() == [4000, 2000]
+    assert sensor.period == 100 and sensor.max_range_m == float("inf")
+
+
+def test_a_sensor_is_added_by_one_file(tmp_path):
+    text = """
+        name: Mine
+        sources: {angles: measured, times: data sheet}
+        firing_us: 50
+        rate_hz: 20
+        range_m: [1, 80]
+        beams:
+          elevation_deg: {first: -10, last: 10, count: 5}
+          time_us: [0, 1, 2, 3, 4]
+          origin_m: [0.1, 0, 0.2]
+    """
+    sensor = load_sensor(write(tmp_path, "mine.yaml", text))
+    assert (sensor.name, sensor.channels, sensor.period) == ("Mine", 5, 1000)
+    assert sensor.origins(np.array([250]))[0, 0] == pytest.approx([0, 0.1, 0.2])
+
+
+LIVOX = "Time/s,Azimuth/deg,Zenith/deg\n"
+GOOD = "name: A\nsources: {}\n"
+VELODYNE = "num_lasers: 2\nlasers: [{laser_id: 0, vert_correction: 0.1, rot_correction: 0.2}"
+BAD = {
+    "field.yaml": (GOOD + "firing_us: 5\nrage_m: [0, 1]", "rage_m: Extra inputs"),
+    "both.yaml": (GOOD + "firing_us: 5\nfirings_per_turn: 5", "either firing_us or"),
+    "kind.yaml": (GOOD + "firing_us: 5\nkind: prisms", "a section prisms goes with"),
+    "zero.yaml": (GOOD + "firing_us: 0\nbeams: {elevation_deg: [0]}", "firing_us: Input should be"),
+    "list.yaml": (GOOD + "firing_us: 5\nbeams: {elevation_deg: [0, .nan]}", "finite number"),
+    "short.yaml": (GOOD + "firing_us: 5\nbeams: {elevation_deg: [0, 1], time_us: [0]}", "Beams"),
+    "yaml.yaml": ("name: [", "is not YAML"),
+    "empty.csv": ("\n", "is empty"),
+    "prose.csv": ("dear reader\n1,2", "'dear reader', is of no known format"),
+    "prose.json": ("{", "Expecting property name"),
+    "other.json": ('{"format": 3}', "no beam_altitude_angles"),
+    "half.json": ('{"beam_altitude_angles": [1, 2]}', "'beam_azimuth_angles' is missing"),
+    "rows.json": ('{"beam_altitude_angles": [1], "beam_azimuth_angles": [1, 2]}', "1 altitude and"),
+    "zeros.json": ('{"beam_altitude_angles": [0], "beam_azimuth_angles": [0]}', "all angles are 0"),
+    "nan.json": ('{"beam_altitude_angles": [NaN], "beam_azimuth_angles": [0]}', "finite numbers"),
+    "missing.yml": (VELODYNE + "]", "1 lasers of 2: laser 1 is missing"),
+    "twice.yml": (VELODYNE.replace("2", "1", 1) + ", {laser_id: 0}]", "one is there twice"),
+    "key.yml": ("lasers: [{laser_id: 0, vert_correction: 1}]", "'rot_correction' is missing"),
+    "lasers.yml": ("scene: seed", "no list of lasers"),
+    "text.yml": ("lasers: [{laser_id: 0, vert_correction: x, rot_correction: 1}]", "float: 'x'"),
+    "gap.csv": ("Channel,Elevation,Azimuth\n1,2,3\n3,2,3", "channels must be 1 to 2"),
+    "word.csv": ("Channel,Elevation,Azimuth\n1,2,x", "'x' to float64 at row 0"),
+    "wide.csv": ("Channel,Elevation,Azimuth\n1,2\n", "lines of 3 numbers"),
+    "ragged.csv": ("Channel,Elevation,Azimuth\n1,2,3\n2,4\n", "number of columns changed"),
+    "nan.csv": ("Channel,Elevation,Azimuth\n1,2,3\n2,nan,3", "line 3 has numbers that are not"),
+    "column.csv": ("elevation_deg,azimut_deg\n1,2", "column 'azimut_deg' is none of"),
+    "plain.csv": ("elevation_deg\n1", "give columns: .* or model:"),
+    "back.csv": (LIVOX + "0,1,2\n2e-5,1,2\n1e-5,1,2\n", "times go back in line 4"),
+    "count.csv": (LIVOX + "1,1,2\n2,1,2\n", "the times of these rays; give model"),
+    "few.csv": (hesai(count=7), "no hesai model has 7 beams like these; give model:"),
+    "binary.csv": (b"\xff\xfe\x00", "is not text"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("file", "text", "message"), [(k, *v) for k, v in BAD.items()], ids=BAD)
+def test_bad_files_are_refused_in_one_line(tmp_path, file, text, message):
+    path = tmp_path / file
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    given = {"model": path} if file.endswith(".yaml") else {"calibration": path}
+    with pytest.raises(LidarpoolError, match=message) as caught:
+        load_sensor(**given)
+    assert file in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, "a model, a calibration, or both"),
+        ({"model": "livox/mid360"}, "Mid-360 has no rays of its own: give calibration: FILE"),
+        ({"model": "velodyne/vlp61"}, "no sensor model 'velodyne/vlp61'.* mean 'velodyne/vlp16'"),
+        ({"model": "velodyne/vlp16", "columns": 1800}, "55.296 µs.* leave columns out"),
+        ({"model": "velodyne/vlp16", "rate_hz": 0}, "rate_hz"),
+        ({"model": "velodyne/vlp16", "calibration": "xt.csv"}, "32 beams, and Velodyne .* has 16"),
+        ({"model": "livox/mid360", "calibration": "xt.csv"}, "does not fit Livox Mid-360"),
+        ({"calibration": "none.csv"}, "none.csv cannot be read: No such file"),
+        ({"model": "none.yaml"}, "none.yaml cannot be read: No such file"),
+    ],
+)
+def test_what_does_not_fit_together(tmp_path, options, message):
+    write(tmp_path, "xt.csv", hesai())
+    if "calibration" in options:
+        options = options | {"calibration": tmp_path / options["calibration"]}
+    with pytest.raises(LidarpoolError, match=message):
+        load_sensor(**options)

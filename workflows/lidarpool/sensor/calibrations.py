@@ -1,0 +1,224 @@
+"""Files that say how one unit differs from its model: angles of beams, or lists of rays."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from ..base.errors import LidarpoolError
+from .beams import Beams
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What a calibration file says.
+
+    Parameters
+    ----------
+    file
+        Its name.
+    maker
+        Whose format it is; None for a plain table of beams.
+    beams
+        Beams in the maker's order, at the times that the file says, if any.
+    rays, shot_ns
+        Instead, unit directions (n, 3) in the order of firing, and when each is fired (n,), if
+        the file says so.
+    head
+        What the file says of the head: fields of `SensorModel`.
+    """
+
+    file: str
+    maker: str | None
+    beams: Beams | None = None
+    rays: NDArray[np.float64] | None = None
+    shot_ns: NDArray[np.float64] | None = None
+    head: dict[str, Any] = field(default_factory=dict)
+
+
+def read_calibration(path: Path) -> Calibration:
+    """Read the calibration file of a unit.
+
+    Parameters
+    ----------
+    path
+        Velodyne's YAML (`lasers:`), Ouster's metadata (.json), or comma-separated: Hesai's
+        angle corrections (Channel, Elevation, Azimuth), RoboSense's angle.csv (vertical and
+        horizontal angle, no header), Livox's list of rays (Time/s, Azimuth/deg, Zenith/deg), or
+        a table of beams with columns elevation_deg and any of azimuth_deg (counter-clockwise),
+        time_us, x_m, y_m, z_m.
+
+    Raises
+    ------
+    LidarpoolError
+        If it is none of these, or numbers are missing, not finite or in the wrong order.
+    """
+    try:
+        text = path.read_text("utf-8-sig")
+    except OSError as error:
+        raise LidarpoolError(f"{path} cannot be read: {error.strerror}.") from error
+    except UnicodeDecodeError as error:
+        raise LidarpoolError(f"{path} is not text, and so no calibration.") from error
+    if not text.strip():
+        raise LidarpoolError(f"{path} is empty.")
+    try:
+        if path.suffix.lower() in (".yaml", ".yml"):
+            return _velodyne(path.name, yaml.safe_load(text))
+        if path.suffix.lower() == ".json":
+            return _ouster(path.name, json.loads(text))
+        return _table(path.name, text)
+    except (yaml.YAMLError, json.JSONDecodeError, ValueError, TypeError, KeyError) as error:
+        words = f"{error} is missing" if isinstance(error, KeyError) else str(error)
+        raise LidarpoolError(f"{path}: {' '.join(words.split())}.") from error
+    except LidarpoolError as error:
+        raise LidarpoolError(f"{path}: {error}") from error
+
+
+def _velodyne(name: str, data: Any) -> Calibration:
+    """Beams of Velodyne's YAML; geometry as in ros-drivers/velodyne, rawdata.cc."""
+    if not isinstance(data, dict) or not isinstance(data.get("lasers"), list):
+        raise ValueError("it has no list of lasers, as Velodyne's calibrations have")
+    lasers = {laser["laser_id"]: laser for laser in data["lasers"]}
+    count = data.get("num_lasers", len(data["lasers"]))
+    missing = sorted(set(range(count)) - set(lasers))
+    if missing or len(data["lasers"]) != count:
+        which = f"laser {missing[0]} is missing" if missing else "one is there twice"
+        raise ValueError(f"it has {len(data['lasers'])} lasers of {count}: {which}")
+    elevation, azimuth, up, left = np.array(
+        [
+            [
+                float(lasers[number]["vert_correction"]),
+                float(lasers[number]["rot_correction"]),
+                float(lasers[number].get("vert_offset_correction", 0)),
+                float(lasers[number].get("horiz_offset_correction", 0)),
+            ]
+            for number in range(count)
+        ]
+    ).T
+    # Offsets at right angles to the beam, upwards and to the left of it.
+    ahead, cos, sin = -up * np.sin(elevation), np.cos(azimuth), np.sin(azimuth)
+    origin = [ahead * cos - left * sin, ahead * sin + left * cos, up * np.cos(elevation)]
+    beams = Beams(elevation, azimuth, origin=np.column_stack(origin))
+    return Calibration(name, "velodyne", beams)
+
+
+def _ouster(name: str, data: Any) -> Calibration:
+    """Beams of Ouster's metadata, old and new; geometry as in its sensor manual.
+
+    Ranges are counted from where the beam leaves, as everywhere here; Ouster's own include the
+    way from the axis.
+    """
+    if not isinstance(data, dict):
+        raise ValueError("it is no metadata of Ouster's")
+    beam = data.get("beam_intrinsics", data)
+    if "beam_altitude_angles" not in beam:
+        raise ValueError("it has no beam_altitude_angles, as Ouster's metadata have")
+    elevation = np.array(beam["beam_altitude_angles"], np.float64)
+    azimuth = np.array(beam["beam_azimuth_angles"], np.float64)
+    layout = data.get("lidar_data_format") or data.get("data_format") or {}
+    rows = layout.get("pixels_per_column", len(elevation))
+    if elevation.shape != azimuth.shape or len(elevation) != rows:
+        raise ValueError(
+            f"it has {elevation.size} altitude and {azimuth.size} azimuth angles of {rows} beams"
+        )
+    there = (elevation != 0) | (azimuth != 0)  # older firmware writes zeros for beams it lacks
+    if not there.any():
+        raise ValueError("all angles are 0")
+    beam_at = np.reshape(beam.get("beam_to_lidar_transform", np.eye(4)), (4, 4))[:3, 3].copy()
+    if "lidar_origin_to_beam_origin_mm" in beam:
+        beam_at[0] = beam["lidar_origin_to_beam_origin_mm"]
+    lidar = data.get("lidar_intrinsics", data)
+    turned = np.diag([-1.0, -1.0, 1.0, 1.0])
+    turned[2, 3] = 36.18
+    pose = np.reshape(lidar.get("lidar_to_sensor_transform", turned), (4, 4))
+    if not np.allclose(pose[:3, :3], turned[:3, :3]) or pose[:2, 3].any():
+        raise ValueError("its lidar_to_sensor_transform is not half a turn and a height")
+    beam_at[2] += pose[2, 3]
+    mode = data.get("config_params", data).get("lidar_mode", "1024x10")
+    columns, rate = (int(number) for number in mode.split("x"))
+    count = int(there.sum())
+    return Calibration(
+        name,
+        "ouster",
+        Beams(
+            np.radians(elevation[there]),
+            -np.radians(azimuth[there]),
+            origin=np.tile(beam_at / 1000, (count, 1)),
+        ),
+        head={
+            "clockwise": True,
+            "zero_deg": 180.0,
+            "firings_per_turn": (columns,),
+            "rate_hz": float(rate),
+        },
+    )
+
+
+def _table(name: str, text: str) -> Calibration:
+    """One of the comma-separated formats, told by the header."""
+    header = [word.strip().lower() for word in text.partition("\n")[0].split(",")]
+    if header == ["time/s", "azimuth/deg", "zenith/deg"]:
+        return _livox(name, _rows(text, 1, 3))
+    if header[1:] == ["elevation", "azimuth"]:
+        rows = _rows(text, 1, 3)
+        if (np.diff(rows[:, 0]) != 1).any() or rows[0, 0] != 1:
+            raise ValueError(f"channels must be 1 to {len(rows)}, each once and in order")
+        elevation, azimuth = np.radians(rows[:, 1:]).T
+        return Calibration(name, "hesai", Beams(elevation, -azimuth))
+    if "elevation_deg" in header:
+        known = ("elevation_deg", "azimuth_deg", "time_us", "x_m", "y_m", "z_m")
+        other = [word for word in header if word not in known]
+        if other:
+            raise ValueError(f"column {other[0]!r} is none of {', '.join(known)}")
+        columns = dict(zip(header, _rows(text, 1, len(header)).T, strict=True))
+        zero = np.zeros(len(columns["elevation_deg"]))
+        beams = Beams(
+            np.radians(columns["elevation_deg"]),
+            np.radians(columns.get("azimuth_deg", zero)),
+            columns.get("time_us", zero) * 1000,
+            np.column_stack([columns.get(axis, zero) for axis in ("x_m", "y_m", "z_m")]),
+        )
+        return Calibration(name, None, beams)
+    try:
+        [float(word) for word in header]
+    except ValueError:
+        raise ValueError(
+            f"its first line, {','.join(header)[:60]!r}, is of no known format"
+        ) from None
+    elevation, azimuth = np.radians(_rows(text, 0, 2)).T
+    return Calibration(name, "robosense", Beams(elevation, -azimuth))
+
+
+def _livox(name: str, rows: NDArray[np.float64]) -> Calibration:
+    """Rays of Livox's list. Zenith is counted from the z axis; Time may only number the rows."""
+    times, azimuth, zenith = rows[:, 0], *np.radians(rows[:, 1:]).T
+    back = np.flatnonzero(np.diff(times) < 0)
+    if len(back):
+        raise ValueError(f"times go back in line {back[0] + 3}")
+    level = np.sin(zenith)
+    rays = np.column_stack([level * np.cos(azimuth), level * np.sin(azimuth), np.cos(zenith)])
+    if len(times) < 2 or (np.diff(times) == 1).all():
+        return Calibration(name, "livox", rays=rays)
+    shot_ns = (times - times[0]) * 1e9
+    every_us = Fraction(float(shot_ns[-1]) / (len(times) - 1) / 1000).limit_denominator(1000)
+    head = {"kind": "list", "firing_us": every_us}
+    return Calibration(name, "livox", rays=rays, shot_ns=shot_ns, head=head)
+
+
+def _rows(text: str, skip: int, columns: int) -> NDArray[np.float64]:
+    """Numbers of the lines after the header, (n, columns); ValueError naming a bad line."""
+    rows = np.loadtxt(io.StringIO(text), delimiter=",", skiprows=skip, ndmin=2)
+    if not len(rows) or rows.shape[1] != columns:
+        raise ValueError(f"it needs lines of {columns} numbers")
+    bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
+    if len(bad):
+        raise ValueError(f"line {bad[0] + skip + 1} has numbers that are not finite")
+    return rows

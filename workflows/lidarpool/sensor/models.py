@@ -1,0 +1,313 @@
+"""Sensors by the name of their model: data files, one a sensor, and what is made of them."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from functools import cache
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+
+from ..base.errors import LidarpoolError
+from ..base.words import did_you_mean
+from .beams import Beams, Mirror, Spin
+from .calibrations import Calibration, read_calibration
+from .rays import ListedSensor, PrismSensor
+from .sensor import LineSensor, Sensor
+
+_BUILT_IN = files("lidarpool.sensor") / "data"
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class _Even(_Part):
+    """Numbers evenly spaced, both ends included."""
+
+    first: float
+    last: float
+    count: Annotated[int, Field(ge=1, le=65_535)]
+
+
+def _numbers(value: Any) -> Any:
+    if isinstance(value, dict):
+        even = _Even.model_validate(value)
+        return np.linspace(even.first, even.last, even.count).tolist()
+    return value
+
+
+Numbers = Annotated[tuple[float, ...], BeforeValidator(_numbers)]
+Place = tuple[float, float, float]
+# 55.296 is no binary number, and 500/9 no decimal one.
+Exact = Annotated[Fraction, BeforeValidator(lambda value: Fraction(str(value)))]
+Positive = Annotated[float, Field(gt=0)]
+
+
+class BeamTable(_Part):
+    """Beams in the maker's order; see `Beams`."""
+
+    elevation_deg: Numbers = ()
+    azimuth_deg: Numbers = ()
+    time_us: Numbers = ()
+    origin_m: Place | tuple[Place, ...] = ()
+
+    def beams(self) -> Beams | None:
+        """Make them; None where a calibration has to say the elevations."""
+        count = len(self.elevation_deg)
+        if not count:
+            return None
+        return Beams(
+            np.radians(self.elevation_deg),
+            np.radians(self.azimuth_deg),
+            np.multiply(self.time_us, 1000.0),
+            self.origins(count),
+        )
+
+    def origins(self, count: int) -> NDArray[np.float64]:
+        """Origins of so many beams: (count, 3), or (0, 3) where there are none."""
+        origin = np.array(self.origin_m, np.float64).reshape(-1, 3)
+        return np.repeat(origin, count, axis=0) if len(origin) == 1 else origin
+
+
+class MirrorPart(_Part):
+    """See `Mirror`."""
+
+    motion: Literal["sine", "triangle", "sawtooth"]
+    width_deg: float
+    duty: float = 1.0
+
+
+class PrismPart(_Part):
+    """See `PrismSensor`."""
+
+    wedge_deg: float
+    index: float
+    rpm: tuple[float, float]
+    phase_deg: tuple[float, float]
+    inclined_first: bool
+
+
+class SensorModel(_Part):
+    """What a data file says of a sensor. `docs/how-to/sensor.md` describes its fields."""
+
+    name: str
+    sources: dict[str, str]
+    kind: Literal["spin", "mirror", "prisms", "list"] = "spin"
+    axis: Literal["z", "x"] = "z"
+    clockwise: bool = False
+    zero_deg: float = 0.0
+    firing_us: Annotated[Exact, Field(gt=0)] | None = None
+    firings_per_turn: Annotated[
+        tuple[Annotated[int, Field(gt=0)], ...],
+        BeforeValidator(lambda value: [value] if isinstance(value, int) else value),
+    ] = ()
+    rate_hz: Positive = 10.0
+    rates_hz: tuple[Positive, Positive] | None = None
+    range_m: tuple[float, float] | None = None
+    mirror: MirrorPart | None = None
+    prisms: PrismPart | None = None
+    beams: BeamTable = BeamTable()
+
+    @model_validator(mode="after")
+    def _whole(self) -> SensorModel:
+        if (self.firing_us is None) != bool(self.firings_per_turn):
+            raise ValueError("give either firing_us or firings_per_turn")
+        for kind in ("mirror", "prisms"):
+            if (self.kind == kind) != (getattr(self, kind) is not None):
+                raise ValueError(f"a section {kind} goes with kind: {kind}")
+        if self.kind == "mirror" and not self.beams.elevation_deg:
+            raise ValueError("a mirror needs beams")
+        self.beams.beams()
+        return self
+
+    @property
+    def needs_calibration(self) -> bool:
+        """Whether its rays are known only from the file of a unit."""
+        return self.kind == "list" or (self.kind == "spin" and not self.beams.elevation_deg)
+
+    def turn(self, rate_hz: float | None, columns: int | None) -> tuple[float, float]:
+        """Return the firings in a turn, and turns a second."""
+        rate = self.rate_hz if rate_hz is None else rate_hz
+        if not rate > 0:
+            raise LidarpoolError(f"rate_hz is {rate}; it must be above 0.")
+        if self.firing_us is None:
+            return columns or self.firings_per_turn[0], rate
+        if columns is not None:
+            raise LidarpoolError(
+                f"{self.name} fires every {float(self.firing_us):g} µs, so its firings a turn "
+                "follow from rate_hz: leave columns out."
+            )
+        return float(1_000_000 / (self.firing_us * Fraction(str(rate)))), rate
+
+
+def model_names() -> tuple[str, ...]:
+    """Names of the models that come with the package, in order."""
+    return tuple(sorted(
+        f"{maker.name}/{entry.name.removesuffix('.yaml')}"
+        for maker in _BUILT_IN.iterdir() if maker.is_dir()
+        for entry in maker.iterdir() if entry.name.endswith(".yaml")
+    ))  # fmt: skip
+
+
+@cache
+def read_model(name: str | Path) -> SensorModel:
+    """Read a model: one that comes with the package by name, or a data file (.yaml).
+
+    Raises
+    ------
+    LidarpoolError
+        If there is none of that name, or the file is not one of a sensor.
+    """
+    if str(name).endswith((".yaml", ".yml")):
+        return _read(Path(name))
+    if str(name) not in model_names():
+        raise LidarpoolError(
+            f"There is no sensor model {str(name)!r}.{did_you_mean(str(name), model_names())} "
+            "lidarpool sensors lists them; one's own is given as a file, such as mine.yaml."
+        )
+    with as_file(_BUILT_IN / f"{name}.yaml") as path:
+        return _read(path)
+
+
+def _read(path: Path) -> SensorModel:
+    try:
+        return SensorModel.model_validate(yaml.safe_load(path.read_text("utf-8")))
+    except OSError as error:
+        raise LidarpoolError(f"{path} cannot be read: {error.strerror}.") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise LidarpoolError(f"{path} is not YAML: {' '.join(str(error).split())}.") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"])) or "as a whole"
+        raise LidarpoolError(f"{path}, {place}: {first['msg']}.") from error
+    except LidarpoolError as error:
+        raise LidarpoolError(f"{path}: {error}") from error
+
+
+def load_sensor(
+    model: str | Path | None = None,
+    *,
+    calibration: str | Path | None = None,
+    columns: int | None = None,
+    rate_hz: float | None = None,
+    step_deg: float = 10.0,
+    min_range_m: float | None = None,
+    max_range_m: float | None = None,
+) -> Sensor:
+    """Make a sensor as its maker specifies it, or as a unit was calibrated.
+
+    Parameters
+    ----------
+    model
+        Name, such as "velodyne/vlp16", or a data file of one's own (.yaml). Where only a
+        calibration is given, the model whose beams are nearest to it.
+    calibration
+        File of the unit: Velodyne YAML, Ouster metadata, Hesai angle corrections, RoboSense
+        angle.csv, Livox list of rays, or a table of beams; see `read_calibration`.
+    columns
+        Firings in a turn, where the model, or a table of beams, leaves a choice.
+    rate_hz
+        Turns, lines or frames a second.
+    step_deg
+        Of a turn, what makes one scan. Ten degrees are 800 rays of a VLP-16 and 3,600 of an
+        OS1-128: enough that a scan costs little by itself, as batches join consecutive scans up
+        to a million rays, and few enough that several workers share a turn.
+    min_range_m, max_range_m
+        In place of the model's.
+
+    Raises
+    ------
+    LidarpoolError
+        If there is no such model, a file cannot be used, or they do not fit together.
+
+    Examples
+    --------
+    >>> sensor = load_sensor("velodyne/vlp16")
+    >>> sensor.name, sensor.channels, round(sensor.head.firings_per_turn, 3)
+    ('Velodyne VLP-16', 16, 1808.449)
+    """
+    unit = None if calibration is None else read_calibration(Path(calibration))
+    if model is not None:
+        described = read_model(model)
+    elif unit is not None:
+        described = _model_of(unit, columns)
+    else:
+        raise LidarpoolError("A sensor needs a model, a calibration, or both.")
+    if unit is not None:
+        described = described.model_copy(update=unit.head)
+    elif described.needs_calibration:
+        raise LidarpoolError(
+            f"{described.name} has no rays of its own: give calibration: FILE, "
+            f"{next(iter(described.sources.values()))}."
+        )
+    firings, rate = described.turn(rate_hz, columns)
+    low, high = described.range_m or (0.0, float("inf"))
+    common: dict[str, Any] = {
+        "min_range_m": low if min_range_m is None else min_range_m,
+        "max_range_m": high if max_range_m is None else max_range_m,
+        "name": described.name if unit is None else f"{described.name}, {unit.file}",
+    }
+    head = Spin(firings, step_deg, rate, described.clockwise, described.zero_deg)
+    if described.prisms is not None:
+        return PrismSensor(head=head, **described.prisms.model_dump(), **common)
+    if unit is not None and unit.rays is not None:
+        each_ns = 1e9 / (firings * rate)
+        times = unit.shot_ns
+        if times is None:
+            times = each_ns * np.arange(len(unit.rays), dtype=np.float64)
+        cycle_ns = float(times[-1]) + each_ns
+        return ListedSensor(head=head, rays=unit.rays, shot_ns=times, cycle_ns=cycle_ns, **common)
+    beams = described.beams.beams() if unit is None else _calibrated(described, unit)
+    assert beams is not None  # those that need a calibration have one
+    if described.mirror is not None:
+        mirror = described.mirror.model_dump()
+        head = Mirror(firings, step_deg, rate, zero_deg=described.zero_deg, **mirror)
+    else:
+        beams = beams.turning(head.radians_per_ns)
+    kind = LineSensor if described.axis == "x" else Sensor
+    return kind(beams.lowest_first(), head, **common)
+
+
+def _model_of(unit: Calibration, columns: int | None) -> SensorModel:
+    """Find the model whose beams are nearest, else take what the file itself says."""
+    best, least = None, 5.0  # degrees: units of one model differ by far less
+    for name in model_names():
+        candidate = read_model(name).beams.elevation_deg
+        if name.startswith(f"{unit.maker}/") and unit.beams and len(candidate) == len(unit.beams):
+            theirs = np.degrees(unit.beams.elevation)
+            off = float(np.abs(np.sort(theirs) - np.sort(candidate)).max())
+            if off < least:
+                best, least = name, off
+    if best is not None:
+        return read_model(best)
+    head = {"firings_per_turn": (columns,)} if columns and unit.maker is None else {}
+    try:
+        return SensorModel(name=(unit.maker or "beams").title(), sources={}, **(unit.head | head))
+    except ValidationError as error:
+        rays = f"{len(unit.beams)} beams like these" if unit.beams else "the times of these rays"
+        raise LidarpoolError(
+            f"{unit.file}: no {unit.maker} model has {rays}; give model: as well."
+            if unit.maker
+            else f"{unit.file}: give columns: (firings in a turn) as well, or model:."
+        ) from error
+
+
+def _calibrated(described: SensorModel, unit: Calibration) -> Beams:
+    """Beams of a unit, fired at the times of its model."""
+    beams, table = unit.beams, described.beams
+    if beams is None or described.kind == "list":
+        raise LidarpoolError(f"{unit.file} does not fit {described.name}: it lists other things.")
+    times = beams.time_ns if beams.time_ns.any() else np.multiply(table.time_us, 1000.0)
+    expected = len(table.elevation_deg) or len(table.time_us)
+    if expected not in (0, len(beams)):
+        raise LidarpoolError(
+            f"{unit.file} has {len(beams)} beams, and {described.name} has {expected}."
+        )
+    origin = beams.origin if beams.origin.any() else table.origins(len(beams))
+    return Beams(beams.elevation, beams.azimuth, times, origin)
