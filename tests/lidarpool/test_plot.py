@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import zipfile
 from itertools import pairwise
 from pathlib import Path
@@ -80,13 +79,6 @@ def result(planned: Pictured, tmp_path: Path) -> Path:
 
 def plot(*arguments: object) -> None:
     cli.main(["plot", *map(str, arguments)], standalone_mode=False)
-
-
-def picture(path: Path) -> Image.Image:
-    with Image.open(path) as image:
-        image.load()
-        assert image.format == "PNG"
-        return image.convert("L")
 
 
 def names(folder: Path) -> set[str]:
@@ -203,30 +195,17 @@ def test_all_pictures_are_drawn_into_the_folder(result, capsys):
     made = [result / f"{name}.png" for name in PICTURES]
     assert names(result) == before | {path.name for path in made}
     assert capsys.readouterr().out.splitlines() == [str(path) for path in made]
-    light = {path: path.read_bytes() for path in made}
-    assert all(np.mean(picture(path)) > 180 for path in made)
-    assert all(picture(path).size == (480, 480) for path in made)
-    plot(result, *SMALL, "--dark")
     for path in made:
-        assert path.read_bytes() == light[path], "the light ones stay"
-        assert np.mean(picture(path.with_stem(f"{path.stem}-dark"))) < 60
+        with Image.open(path) as image:
+            assert (image.format, image.size) == ("PNG", (480, 480))
 
 
 def test_some_are_drawn_to_another_folder(result, tmp_path):
     before = names(result)
     out = tmp_path / "new" / "folder"
-    plot(result, "--only", "path", "--only", "scene", *SMALL, "--out", out, "--format", "pdf")
-    assert names(out) == {"scene.pdf", "path.pdf"}
+    plot(result, "--only", "path", "--only", "scene", *SMALL, "--out", out)
+    assert names(out) == {"scene.png", "path.png"}
     assert names(result) == before
-
-
-def test_a_pdf_is_the_same_each_time_and_has_letters(result, tmp_path):
-    first, second = tmp_path / "a.pdf", tmp_path / "b.PDF"
-    for path in (first, second):
-        plot(result, "--only", "intensity", *SMALL, "--out", path)
-    data = first.read_bytes()
-    assert data == second.read_bytes() and data.startswith(b"%PDF-")
-    assert b"/FontFile2" in data and b"/Type3" not in data and b"/CreationDate" not in data
 
 
 def test_the_cloud_is_needed_for_its_own_picture_only(result):
@@ -240,27 +219,8 @@ def test_a_result_without_a_plan(unplanned, tmp_path):
     result = make(tmp_path / "result", unplanned)
     plot(result, *SMALL, "--out", tmp_path / "out")
     assert names(tmp_path / "out") == {"scene.png", "intensity.png", "cloud.png"}
-    with pytest.raises(LidarpoolError, match=r"no picture 'path'.*scene, intensity, cloud\.$"):
+    with pytest.raises(LidarpoolError, match=r"no picture 'path': its run planned no path"):
         plot(result, "--only", "path")
-
-
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        (["--out", "all.png"], r"all\.png is one file, for 4 pictures: choose one with --only"),
-        (["--only", "path", "--out", "p.png", "--format", "pdf"], r"ends in \.png.*is pdf: drop"),
-        (["--only", "cloud", "--out", "c.JPG"], r"c\.JPG ends in \.jpg, .* ends in \.png or \.pdf"),
-        (["--out", "file/below"], r"file.below cannot be made"),
-        (["--only", "path", "--out", "none/p.png"], r"picture .*p\.png could not be written"),
-    ],
-)
-def test_targets_that_do_not_fit(options, said, result, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "file").write_text("")
-    before = names(tmp_path)
-    with pytest.raises(LidarpoolError, match=said):
-        plot(result, *SMALL, *options)
-    assert names(tmp_path) == before
 
 
 @pytest.mark.parametrize("size", ["big", "480", "480x", "0x0", "479x480", "9000x9000", "1000x480"])
@@ -269,13 +229,11 @@ def test_sizes_that_cannot_be(size, result):
         plot(result, "--size", size)
 
 
-def test_folders_that_hold_no_result(tmp_path):
-    with pytest.raises(LidarpoolError, match="none does not exist: give the folder of a finished"):
+def test_folders_that_cannot_be_used(result, tmp_path):
+    with pytest.raises(
+        LidarpoolError, match=r"none holds no pictures\.npz.*give the folder of a f"
+    ):
         plot(tmp_path / "none")
-    with pytest.raises(LidarpoolError, match=r"holds no pictures\.npz.*give the folder"):
-        plot(tmp_path)
-    (tmp_path / "report.json").write_text(json.dumps({}))
-    with pytest.raises(LidarpoolError, match="by an earlier version; run it again"):
-        plot(tmp_path)
-    with pytest.raises(LidarpoolError, match=r"report\.json is a file: give the folder"):
-        plot(tmp_path / "report.json")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(LidarpoolError, match=r"file.below cannot be made"):
+        plot(result, "--out", tmp_path / "file" / "below")

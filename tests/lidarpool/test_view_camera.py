@@ -55,8 +55,8 @@ def test_points_behind_the_eye_are_nowhere():
     np.testing.assert_allclose(distance, [2, 2, 1])
 
 
-def test_cells_are_whole_pixels_inside_the_image():
+def test_an_image_is_looked_up_by_whole_pixels():
     camera = Camera(np.zeros(3), np.eye(3), 100.0, np.zeros(2), (10, 5))
-    inside, column, row = camera.cells([[0, 0], [9.99, 4.99], [10, 1], [-0.01, 1], [np.nan, 1]])
-    assert inside.tolist() == [True, True, False, False, False]
-    assert column[:2].tolist() == [0, 9] and row[:2].tolist() == [0, 4]
+    places = [[0, 0], [9.99, 4.99], [10, 1], [-0.01, 1], [np.nan, 1]]
+    found = camera.look_up(np.arange(50).reshape(5, 10), places, -1)
+    assert found.tolist() == [0, 49, -1, -1, -1]

@@ -4,11 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from lidarpool.render.cloud_picture import on_shown_surfaces
-from lidarpool.render.overlay import splat, visible, visible_runs
-from lidarpool.render.samples import GROUND, SKY
-from lidarpool.render.shot import take_shot
-from lidarpool.render.theme import LIGHT
+from lidarpool.render.pictures import with_points
+from lidarpool.render.shot import GROUND, SKY, take_shot
 from lidarpool.scene.mesh import Mesh
 from lidarpool.scene.scene import Scene
 
@@ -34,7 +31,7 @@ def row():
 
 @pytest.fixture(scope="module")
 def shot(row):
-    return take_shot(row, size=SIZE, backend="numpy")
+    return take_shot(row, [], size=SIZE, backend="numpy")
 
 
 def closest_hit(scene, eye, ray):
@@ -71,11 +68,11 @@ def test_each_pixel_shows_the_nearest_thing(row, shot):
 
 def test_the_picture_has_the_nearer_boxs_colour(row, shot):
     colours = np.array([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]])[row.face_object]
-    image = shot.paint(colours, LIGHT)
+    image = shot.paint(colours)
     # The far lower corner of the middle box lies behind the near one.
     centre = row.object_bounds[:, :].mean(axis=1)
     hidden = centre[1] + [0, 0, -0.9]
-    (pixel,), (seen,) = visible(shot, hidden[None])
+    (pixel,), (seen,) = shot.visible(hidden[None])
     column, line = pixel.astype(int)
     red, green, blue = image[line, column]
     assert not seen and red > 0.2 and green < 0.05 and blue < 0.05
@@ -84,7 +81,7 @@ def test_the_picture_has_the_nearer_boxs_colour(row, shot):
 def test_points_behind_a_box_are_hidden_and_before_it_seen(row, shot):
     near = row.object_bounds[0].mean(axis=0)
     back = -shot.camera.axes[2]
-    _, seen = visible(shot, np.stack([near + 3 * back, near - 3 * back, near]))
+    _, seen = shot.visible(np.stack([near + 3 * back, near - 3 * back, near]))
     assert seen.tolist() == [True, False, False]
 
 
@@ -92,34 +89,35 @@ def test_a_line_that_passes_behind_a_box_is_broken(row, shot):
     middle = row.object_bounds[1].mean(axis=0)
     middle[2] = row.object_bounds[1, 1, 2] - 0.3
     right = shot.camera.axes[0]
-    runs = visible_runs(shot, np.array([[middle - 3 * right, middle + 3 * right]]))
+    runs = shot.runs(np.array([[middle - 3 * right, middle + 3 * right]]), shot.visible)
     assert len(runs) == 2
     ends, _ = shot.camera.project(np.array([middle - 3 * right, middle + 3 * right]))
     np.testing.assert_allclose(runs[0][0], ends[0], atol=0.5)
     np.testing.assert_allclose(runs[1][1], ends[1], atol=0.5)
     above = middle + np.array([0, 0, 2])
-    whole = visible_runs(shot, np.array([[above - 3 * right, above + 3 * right]]))
+    whole = shot.runs(np.array([[above - 3 * right, above + 3 * right]]), shot.visible)
     assert len(whole) == 1
 
 
-def test_lines_behind_the_camera_or_none_at_all_draw_nothing(shot):
-    behind = shot.camera.eye - shot.camera.axes[2] * 5
-    assert visible_runs(shot, np.array([[behind, behind + 1e-3]])) == []
-    assert visible_runs(shot, np.empty((0, 2, 3))) == []
-
-
-def test_nearer_points_are_drawn_over_farther_ones(shot):
-    camera = shot.camera
-    at = np.array([[160.2, 100.2]])
-    ray = camera.rays(at)[0]
-    points = camera.eye + np.array([[5.0], [9.0]]) * ray
+def test_nearer_points_are_drawn_over_farther_ones(row, shot):
+    place, _ = shot.camera.project(row.object_bounds[0].mean(axis=0)[None])
+    depth = shot.camera.look_up(shot.depth, place, np.inf)
+    points = shot.camera.eye + (depth + np.array([[-0.05], [0.05]])) * shot.camera.rays(place)
     red, blue = np.array([1.0, 0, 0]), np.array([0, 0, 1.0])
-    blank = np.ones((*SIZE[::-1], 3))
+    blank = np.ones((*SIZE[::-1], 3), np.float32)
+    column, line = np.floor(place[0]).astype(int)
     for order in ([0, 1], [1, 0]):
-        image = splat(blank, camera, points[order], np.stack([red, blue])[order], 2.0, np.zeros(3))
-        np.testing.assert_allclose(image[100, 160], red, atol=0.05)
-        assert (image != 1).any(axis=2).sum() < 40
-    assert splat(blank, camera, np.empty((0, 3)), np.empty((0, 3)), 2.0, red) is blank
+        image = with_points(blank, shot, points[order], np.stack([red, blue])[order])
+        np.testing.assert_allclose(image[line, column, 1:], 0, atol=0.05)
+        assert 0 < (image != 1).any(axis=2).sum() < 40
+
+
+def drawn(shot, points):
+    """Whether points, each by itself, leave something in the picture."""
+    blank = np.ones((*SIZE[::-1], 3), np.float32)
+    return np.array(
+        [(with_points(blank, shot, p[None], np.zeros((1, 3))) < 1).any() for p in points]
+    )
 
 
 def room():
@@ -148,21 +146,21 @@ def test_the_inside_of_a_closed_hall_is_shown(group):
     scene = Scene.from_meshes(group(room()))
     poses = np.array([[0, 0.5, 1.5], [1, 6, 1.5]])
     shot = take_shot(scene, poses, size=SIZE, backend="numpy")
-    _, seen = visible(shot, np.concatenate([poses, [[2, -4, 1.85], [-3, -5, 0.35]]]))
+    _, seen = shot.visible(np.concatenate([poses, [[2, -4, 1.85], [-3, -5, 0.35]]]))
     assert seen.all(), "sensors, the crate's top and the floor"
     far_wall, near_wall = shot.camera.axes[2] * 5, -shot.camera.axes[2] * 5
     wall = (
         np.array([np.sign(far_wall[0]) * 5.69, 3.0, 1.5]),
         np.array([np.sign(near_wall[0]) * 5.69, 3.0, 1.5]),
     )
-    assert on_shown_surfaces(shot, np.array(wall)).tolist() == [True, False]
+    assert drawn(shot, np.array(wall)).tolist() == [True, False]
 
 
 def test_the_hall_stays_closed_where_the_sensor_is_outside():
     scene = Scene.from_meshes(room())
     shot = take_shot(scene, [[0, 30, 1.5]], size=SIZE, backend="numpy")
-    roof_seen = visible(shot, np.array([[0, 0, 4.0]]))[1]
-    floor_seen = visible(shot, np.array([[-3, -5, 0.3]]))[1]
+    roof_seen = shot.visible([[0, 0, 4.0]])[1]
+    floor_seen = shot.visible([[-3, -5, 0.3]])[1]
     assert roof_seen.all() and not floor_seen.any()
 
 
@@ -171,7 +169,7 @@ def test_points_lie_on_the_surface_that_is_shown(row, shot):
     corners = row.vertices[row.faces]
     share = rng.dirichlet((1, 1, 1), len(corners))
     points = (share[..., None] * corners).sum(axis=1)
-    shown = on_shown_surfaces(shot, points)
+    shown = drawn(shot, points)
     direct = []
     for point in points:
         offset = point - shot.camera.eye

@@ -416,10 +416,3 @@ def test_the_pictures_of_a_run_are_drawn_again_to_the_bit(demo, lidarpool, tmp_p
     assert (again.code, again.err) == (0, "")
     for name in ("scene.png", "intensity.png", "cloud.png", "path.png"):
         assert (tmp_path / name).read_bytes() == (out / name).read_bytes()
-
-
-def test_pictures_drawn_again_go_with_their_result(made, tmp_path, no_pictures):
-    for name in ("scene-dark.png", "path.pdf", "cloud-dark.pdf", "mine-dark.png"):
-        (tmp_path / name).write_text("an earlier one")
-    write_result(tmp_path, *made)
-    assert {path.name for path in tmp_path.iterdir()} == {*FILES, "mine-dark.png"}

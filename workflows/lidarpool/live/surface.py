@@ -12,9 +12,7 @@ from trimesh.exchange.gltf import export_glb
 
 from raybeam import RayCaster
 
-from ..render.intensity import checked_counts, hit_density
-from ..render.intensity_picture import density_colours, density_range
-from ..render.theme import LIGHT
+from ..render.intensity import density_colours, density_range, hit_density
 from ..scene.scene import Scene
 from .colouring import TURBO, as_bytes, colour_bar
 from .page import LivePage
@@ -73,12 +71,12 @@ class Surface:
 
     def coloured(self, hit_counts: NDArray[Any]) -> tuple[NDArray[np.uint8], str]:
         """Colours (f, 3) by the hits of each triangle of the scene, and a legend."""
-        hits = checked_counts(self._scene, hit_counts)
+        hits = hit_counts.astype(np.float64)
         if self._nearest is not None:
             hits = np.bincount(self._nearest, hits, len(self.corners)).astype(np.float64)
         density = hit_density(self.coarse, hits)
         low, high = density_range(density)
-        colours = density_colours(density, hits > 0, (low, high), TURBO, LIGHT)
+        colours = density_colours(density, hits > 0, (low, high), TURBO)
         middle = (low * high) ** 0.5
         marks = [f"{n:.2g}" if n < 10 else f"{n:,.0f}" for n in (low, middle, high)]
         return as_bytes(colours), colour_bar(TITLE, marks) if density.any() else ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -55,19 +56,12 @@ class Camera:
         pixels = np.stack([side / ahead, -up / ahead], axis=1) * self.focal + self.centre
         return pixels, np.sqrt((offset * offset).sum(axis=1))
 
-    def cells(
-        self, pixels: ArrayLike
-    ) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64]]:
-        """Whether pixel coordinates (n, 2) are in the image, and their column and row.
-
-        Those outside, or NaN, have column and row 0.
-        """
-        place = np.asarray(pixels, dtype=np.float64)
-        inside: NDArray[np.bool_] = np.logical_and.reduce(
-            (place >= 0) & (place < self.size), axis=1
-        )
-        whole = np.where(inside[:, None], place, 0).astype(np.int64)
-        return inside, whole[:, 0], whole[:, 1]
+    def look_up(self, image: NDArray[Any], pixels: ArrayLike, outside: float) -> NDArray[Any]:
+        """Values (n,) of an image at pixel coordinates (n, 2); `outside` beside it, or for NaN."""
+        place = np.asarray(pixels)
+        inside = np.all((place >= 0) & (place < np.array(self.size)), axis=1)
+        column, row = np.where(inside[:, None], place, 0).astype(np.int64).T
+        return np.where(inside, image[row, column], outside)
 
     def footprint(self, distance: ArrayLike) -> Floats:
         """Width in metres that one pixel covers at a distance, seen face on."""
@@ -78,8 +72,8 @@ def fit_camera(
     points: ArrayLike,
     size: tuple[int, int],
     frame: tuple[float, float, float, float],
-    azimuth_deg: float = -60.0,
-    elevation_deg: float = 30.0,
+    azimuth_deg: float,
+    elevation_deg: float,
 ) -> Camera:
     """Place a camera so that points fill a frame within its image.
 

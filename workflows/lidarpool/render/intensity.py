@@ -3,37 +3,22 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from ..base.errors import LidarpoolError
 from ..scene.scene import Scene
+from .theme import UNSEEN, rgb
 
 Floats = NDArray[np.float64]
 
 ENOUGH_HITS = 12  # a density is read off about so many hits
 MOST_ROUNDS = 12
+WIDEST_RANGE = 300.0  # densest to sparsest colour
 
 
-def checked_counts(scene: Scene, hit_counts: ArrayLike) -> Floats:
-    """Hits of each triangle as numbers, (f,); what is not finite or negative counts as none.
-
-    Raises
-    ------
-    LidarpoolError
-        If there is not one count a triangle.
-    """
-    hits = np.asarray(hit_counts, dtype=np.float64)
-    if hits.shape != (len(scene.faces),):
-        raise LidarpoolError(
-            f"Hit counts have shape {hits.shape}; the scene has {len(scene.faces)} triangles, "
-            "and needs one count for each."
-        )
-    return np.where(np.isfinite(hits) & (hits > 0), hits, 0.0)
-
-
-def hit_density(scene: Scene, hits: Floats) -> Floats:
+def hit_density(scene: Scene, hit_counts: NDArray[Any]) -> Floats:
     """Hits per square metre at each triangle, (f,).
 
     Where triangles are so small that most were hit once or never, hits are shared with the
@@ -42,9 +27,10 @@ def hit_density(scene: Scene, hits: Floats) -> Floats:
 
     Parameters
     ----------
-    hits
-        (f,) from `checked_counts`.
+    hit_counts
+        (f,) hits of each triangle.
     """
+    hits = hit_counts.astype(np.float64)
     a, b, c = (scene.vertices[scene.faces[:, k]] for k in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
     for _ in range(_rounds(hits)):
@@ -73,3 +59,30 @@ def _share(faces: NDArray[np.int32], hits: Floats, area: Floats, vertices: int) 
     shared = area * density[faces].sum(axis=1)
     # Triangles without area can hold no density; they keep what they have.
     return np.where(area > 0, shared, hits)
+
+
+def density_range(density: Floats) -> tuple[float, float]:
+    """Choose the ends of a logarithmic scale over densities (f,), leaving strays out."""
+    hit = density[density > 0]
+    low, high = np.percentile(hit, [10, 99.5]) if len(hit) else (1.0, 10.0)
+    low = max(low, high / WIDEST_RANGE)
+    return float(low), float(max(high, 2 * low))
+
+
+def density_colours(
+    density: Floats, hit: NDArray[np.bool_], limits: tuple[float, float], table: Floats
+) -> Floats:
+    """Colours (f, 3) of triangles by density and whether they were hit, both (f,).
+
+    Shared hits fade out to grey; triangles that were hit themselves are never grey.
+
+    Parameters
+    ----------
+    limits, table
+        Ends of the logarithmic scale, and its colours (256, 3).
+    """
+    low, high = limits
+    share = np.log(np.maximum(density, low) / low) / np.log(high / low)
+    colours = table[np.clip(share * 255, 0, 255).astype(np.int64)]
+    seen = np.where(hit, 1.0, np.clip(density / low / 0.6 - 0.3, 0, 1))[:, None]
+    return np.asarray(rgb(UNSEEN) * (1 - seen) + colours * seen)

@@ -1,9 +1,8 @@
-"""Light on a picture's surfaces: how much sky and sun each point sees."""
+"""Light on a picture's surfaces: how much of sky and sun each point sees."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -11,96 +10,48 @@ from numpy.typing import NDArray
 
 from .camera import Camera
 from .cutaway import Cutaway, blocked
-from .surface import Surface, unit
+from .surface import Surface, dot
 
 Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+Reals = NDArray[np.float32]
 
-Bools = NDArray[np.bool_]
-Blocked = Callable[[Floats, Floats], Bools]  # (origins, directions) -> (n,)
-
-PATTERN = 4  # rays are spread over blocks of 4 x 4 pixels, and averaged over as many
-BOUNCED = 0.22  # light from a direction where other surfaces are
-GROUND_GLOW = 0.6  # light from below, off the ground
-
-
-@dataclass(frozen=True)
-class Rig:
-    """How finely light is sampled.
-
-    Parameters
-    ----------
-    stride
-        Light is worked out at every `stride`-th pixel of every `stride`-th row.
-    sky_rays, sun_rays
-        Rays from each such pixel.
-    reach
-        Surfaces farther than this, in metres, cast no shadow.
-    """
-
-    stride: int = 2
-    sky_rays: int = 16
-    sun_rays: int = 4
-    reach: float = np.inf
+STRIDE = 2  # shadows are worked out at every second pixel of every second row
+SKY_LIGHTS, SUN_LIGHTS = 24, 4
+TURNS = 0.12, 0.02  # radians from a grid point's light to its neighbour's, of the sky and the sun
+SUN_RADIUS = 0.045  # radians: ten times the real one, for soft edges
+SUN_SHARE = 0.4  # of the light on level ground in the open
+THIN = 0.5  # openness of what is so thin that no grid point is on it
+AMBIENT, SKY, SUN = 0.24, 0.54, 0.36  # brightness of a surface that faces them
 
 
 @dataclass(frozen=True, eq=False)
 class LightMap:
-    """Light at a grid of pixels, and on which surface each of them lies.
+    """How much light reaches a grid of pixels, and on which surface each of them lies.
 
     Parameters
     ----------
-    stride
-        Distance of grid points in pixels.
-    sky, sun
-        (rows, columns) in 0 to 1: share of the sky that is seen, and of the sun's disc.
+    sun
+        (3,) unit vector towards the sun.
+    openness
+        (rows, columns) in 0 to 1: the share of the light that nothing keeps off.
     position, normal
         (rows, columns, 3); NaN where there is no surface.
     """
 
-    stride: int
-    sky: Floats
     sun: Floats
-    position: Floats
-    normal: Floats
+    openness: Reals
+    position: Reals
+    normal: Reals
 
-    def smoothed(self, tolerance: Floats) -> LightMap:
-        """Return the map with each point averaged over a block around it, on its own surface.
-
-        A block holds each of the pattern's directions once, so this takes the grain out.
-
-        Parameters
-        ----------
-        tolerance
-            (rows, columns) metres; points farther than this from the plane of the middle one
-            are another surface.
-        """
-        reach = PATTERN // 2
-        rows, columns = self.sky.shape
-        light = np.stack([self.sky, self.sun], axis=-1)
-        total = np.full((rows, columns), 1e-9)
-        summed = 1e-9 * light
-        for down, right in product(range(-reach, reach + 1), repeat=2):
-            # Half of each outermost row and column: the block is PATTERN points wide.
-            share = (0.5 if abs(down) == reach else 1.0) * (0.5 if abs(right) == reach else 1.0)
-            here = _overlap(rows, down), _overlap(columns, right)
-            there = _overlap(rows, -down), _overlap(columns, -right)
-            weight = share * _alike(
-                self.position[here],
-                self.normal[here],
-                self.position[there],
-                self.normal[there],
-                tolerance[here],
-            )
-            total[here] += weight
-            summed[here] += weight[..., None] * light[there]
-        sky, sun = np.moveaxis(summed / total[..., None], -1, 0)
-        return replace(self, sky=sky, sun=sun)
-
-    def at(self, pixels: Floats, position: Floats, normal: Floats, tolerance: Floats) -> Floats:
-        """Sky and sun at points, (2, n), between the four grid points around each.
-
-        Grid points on another surface than the point count for little.
+    def brightness(
+        self,
+        pixels: Floats,
+        position: Reals,
+        normal: Reals,
+        tolerance: Reals,
+        ground: NDArray[np.bool_],
+    ) -> Reals:
+        """Brightness (n,) of points: Lambert's law for the sun, and the open part of the sky.
 
         Parameters
         ----------
@@ -109,136 +60,116 @@ class LightMap:
         position, normal
             (n, 3).
         tolerance
-            (n,) metres, see `smoothed`.
+            (n,) metres, see `alike`.
+        ground
+            bool (n,): whether they are of the ground, whose colour in the open is as it is.
         """
-        rows, columns = self.sky.shape
-        start = (pixels - self.stride // 2 - 0.5) / self.stride
+        openness = self._openness_at(pixels, position, normal, tolerance)
+        facing = np.clip(normal @ self.sun.astype(np.float32), 0, None)
+        lit = AMBIENT + openness * (SKY * (0.6 + 0.4 * normal[:, 2]) + SUN * facing)
+        return np.asarray(np.where(ground, 0.6 + 0.4 * openness, lit))
+
+    def _openness_at(
+        self, pixels: Floats, position: Reals, normal: Reals, tolerance: Reals
+    ) -> Reals:
+        """Interpolate openness (n,) between the nine grid points around that are on the surface."""
+        rows, columns = self.openness.shape
+        start = ((pixels - 0.5) / STRIDE - 0.5).astype(np.float32) - (STRIDE // 2) / STRIDE
         cell = np.floor(start).astype(np.int64)
         part = start - cell
-        total = np.full(len(pixels), 1e-9)
-        summed = np.full((2, len(pixels)), 1e-9)
-        for down, right in product(range(2), repeat=2):
+        # The mean of two by two, which the lights' turns are for, interpolated.
+        shares = 1 - part, np.ones_like(part), part
+        total = np.full(len(pixels), 1e-3, np.float32)
+        summed = np.full(len(pixels), 1e-3 * THIN, np.float32)
+        for down, right in product(range(3), repeat=2):
             row = np.clip(cell[:, 1] + down, 0, rows - 1)
             column = np.clip(cell[:, 0] + right, 0, columns - 1)
-            spot = self.position[row, column]
-            weight = _alike(position, normal, spot, self.normal[row, column], tolerance)
-            weight = np.where(np.isfinite(spot[:, 0]), weight + 1e-3, 0.0)
-            weight *= np.abs(1 - down - part[:, 1]) * np.abs(1 - right - part[:, 0])
+            weight = alike(
+                position, normal, self.position[row, column], self.normal[row, column], tolerance
+            )
+            weight *= shares[down][:, 1] * shares[right][:, 0]
             total += weight
-            summed += weight * np.stack([self.sky[row, column], self.sun[row, column]])
-        return np.asarray(summed / total)
+            summed += weight * self.openness[row, column]
+        return summed / total
 
 
-def _alike(
-    position: Floats, normal: Floats, spot: Floats, facing: Floats, tolerance: Floats
-) -> Floats:
-    """How much points (..., 3) are on one surface with spots (..., 3): 0 for not, to 0.4."""
+def alike(position: Reals, normal: Reals, spot: Reals, facing: Reals, tolerance: Reals) -> Reals:
+    """How much points (n, 3) are on one surface with spots (n, 3): 0 for not, to 0.4.
+
+    Those on it lie within `tolerance` (n,), in metres, of each other's plane.
+    """
     with np.errstate(invalid="ignore"):
-        near = np.abs(((spot - position) * normal).sum(axis=-1)) < tolerance
-        return np.where(near, np.clip((facing * normal).sum(axis=-1) - 0.6, 0, None), 0.0)
-
-
-def _overlap(length: int, shift: int) -> slice:
-    """Return the indices `n` of a row for which `n + shift` is in the row too."""
-    return slice(max(0, -shift), min(length, length - shift))
+        near = np.abs(dot(spot - position, normal)) < tolerance
+        return np.where(near, np.clip(dot(facing, normal) - 0.6, 0, None), 0)
 
 
 def sun_direction(camera: Camera) -> Floats:
     """Towards the sun, (3,): over the camera's left shoulder, so that shadows fall right."""
     back = -camera.axes[2] * np.array([1.0, 1.0, 0.0])
-    back /= np.linalg.norm(back)
-    sun = 0.4 * back - 0.55 * camera.axes[0] + np.array([0.0, 0.0, 0.95])
+    sun = 0.4 * back / np.linalg.norm(back) - 0.55 * camera.axes[0] + np.array([0.0, 0.0, 0.95])
     return sun / np.linalg.norm(sun)
 
 
-def measure_light(
-    surface: Surface | None,
+def make_light_map(
+    surface: Surface,
     cutaway: Cutaway | None,
-    rig: Rig,
     camera: Camera,
-    position: Floats,
-    normal: Floats,
+    position: Reals,
+    normal: Reals,
+    reach: float,
 ) -> LightMap:
-    """Cast rays to sky and sun from a grid of surface points.
+    """Cast rays from a grid of surface points to lights all over the sky, many of them the sun.
+
+    The same lights for all points: steps in brightness are too small to be seen, and need not
+    be smoothed as the grain of random directions would.
 
     Parameters
     ----------
-    surface
-        What casts shadows; None for nothing.
     cutaway
-        What is taken away and casts none.
+        What is taken away and casts no shadow.
     position, normal
         (rows, columns, 3); NaN where there is no surface.
+    reach
+        Surfaces farther than this, in metres, cast no shadow.
     """
-    shape = position.shape[:2]
-    sky, sun = np.ones(shape), np.ones(shape)
+    sun = sun_direction(camera)
     there = np.isfinite(position[..., 0])
-    if surface is not None and there.any():
-        row, column = np.nonzero(there)
-        turn = _turns(row, column)
-        at, facing = position[there], normal[there]
-        # Rays start half a pixel off the surface, so that it does not shade itself.
-        away = 0.5 * camera.footprint(np.linalg.norm(at - camera.eye, axis=1))
-        at = at + away[:, None] * facing
-
-        def dark(where: Floats, rays: Floats) -> Bools:
-            return blocked(surface, cutaway, where, rays, rig.reach)
-
-        sky[there] = _sky(dark, rig.sky_rays, at, facing, turn)
-        sun[there] = _sun(dark, rig.sun_rays, at, facing, turn, sun_direction(camera))
-    distance = np.linalg.norm(position - camera.eye, axis=-1)
-    light = LightMap(rig.stride, sky, sun, position, normal)
-    return light.smoothed(plane_tolerance(rig.stride, camera, distance))
-
-
-def plane_tolerance(stride: int, camera: Camera, distance: Floats) -> Floats:
-    """How far apart in metres points of one surface may be from each other's planes."""
-    return 3 * stride * camera.footprint(distance)
+    at, facing = position[there].astype(np.float64), normal[there].astype(np.float64)
+    # Rays start half a pixel off the surface, so that it does not shade itself.
+    at += 0.5 * camera.footprint(np.linalg.norm(at - camera.eye, axis=1))[:, None] * facing
+    # Neighbours turn the lights differently, and are averaged: so there are four times as many.
+    row, column = np.nonzero(there)
+    number = row % 2 + 2 * (column % 2)
+    full, open_ = np.full(len(at), 1e-9), np.full(len(at), 1e-9)
+    for (x, y, z), strength, turn in zip(*_lights(sun), strict=True):
+        cos, sin = np.cos(turn * np.arange(4))[number], np.sin(turn * np.arange(4))[number]
+        towards = np.stack([cos * x - sin * y, sin * x + cos * y, np.full_like(cos, z)], axis=1)
+        falls = strength * np.clip(dot(facing, towards), 0, None)
+        lit = np.flatnonzero(falls)
+        free = lit[~blocked(surface, cutaway, at[lit], towards[lit], reach)]
+        full += falls
+        open_[free] += falls[free]
+    openness = np.ones(there.shape, np.float32)
+    openness[there] = open_ / full
+    return LightMap(sun, openness, position, normal)
 
 
-def _sky(dark: Blocked, rays: int, at: Floats, facing: Floats, turn: Floats) -> Floats:
-    """Share of the cosine-weighted hemisphere over points (n, 3) that is sky."""
-    side, other = _frame(facing)
-    total = np.zeros(len(at))
-    for n in range(rays):
-        angle = 2 * np.pi * (turn + 0.6180339887 * n)
-        squared = (n + 0.5 + 0.9 * (turn * 7 % 1 - 0.5)) / rays
-        across = np.sqrt(squared)[:, None]
-        ray = (
-            across * np.cos(angle)[:, None] * side
-            + across * np.sin(angle)[:, None] * other
-            + np.sqrt(1 - squared)[:, None] * facing
-        )
-        glow = np.where(ray[:, 2] >= 0, 1.0, GROUND_GLOW)
-        total += np.where(dark(at, ray), BOUNCED, glow)
-    return total / rays
+def _lights(sun: Floats) -> tuple[Floats, Floats, Floats]:
+    """Directions (k, 3) of lights, even over the sky and in the sun's disc, strengths and turns.
 
-
-def _sun(dark: Blocked, rays: int, at: Floats, facing: Floats, turn: Floats, sun: Floats) -> Floats:
-    """Share of the sun's disc that points (n, 3) see; 1 on sides turned away, which is dark."""
-    lit = np.flatnonzero(facing @ sun > 0)
-    side, other = (axis[0] for axis in _frame(sun[None]))
-    total = np.zeros(len(lit))
-    for n in range(rays):
-        angle = 2 * np.pi * (turn[lit] + n / rays)
-        radius = 0.045 * np.sqrt((n + 0.5) / rays)
-        ray = unit(
-            sun + radius * np.cos(angle)[:, None] * side + radius * np.sin(angle)[:, None] * other
-        )
-        total += ~dark(at[lit], ray)
-    out = np.ones(len(at))
-    out[lit] = total / rays
-    return out
-
-
-def _turns(row: Ints, column: Ints) -> Floats:
-    """Return one of 16 angles, as fractions of a turn, for each pixel of a 4 x 4 block."""
-    order = np.array([0, 8, 2, 10, 12, 4, 14, 6, 3, 11, 1, 9, 15, 7, 13, 5])  # Bayer's matrix
-    return np.asarray((order[(row % 4) * 4 + column % 4] + 0.5) / 16)
-
-
-def _frame(normal: Floats) -> tuple[Floats, Floats]:
-    """Two unit vectors (n, 3) at right angles to normals (n, 3) and each other."""
-    helper = np.where(np.abs(normal[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
-    side = unit(np.cross(helper, normal))
-    return side, np.cross(normal, side)
+    The strengths (k,) of sky and sun together are 1 on level ground; turns (k,) in radians.
+    """
+    n = np.arange(SKY_LIGHTS)
+    turn, up = 2 * np.pi * 0.6180339887 * n, (n + 0.5) / SKY_LIGHTS
+    level = np.sqrt(1 - up * up)
+    sky = np.stack([level * np.cos(turn), level * np.sin(turn), up], axis=1)
+    n = np.arange(SUN_LIGHTS)
+    turn, radius = 2 * np.pi * 0.6180339887 * n, SUN_RADIUS * np.sqrt((n + 0.5) / SUN_LIGHTS)
+    side = np.cross(sun, [0.0, 0.0, 1.0])
+    side /= np.linalg.norm(side)
+    disc = np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * np.cross(side, sun)
+    counts = [SKY_LIGHTS, SUN_LIGHTS]
+    strengths = np.repeat(
+        [2 * (1 - SUN_SHARE) / SKY_LIGHTS, SUN_SHARE / sun[2] / SUN_LIGHTS], counts
+    )
+    return np.concatenate([sky, sun + radius[:, None] * disc]), strengths, np.repeat(TURNS, counts)

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import os
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import IO
+from typing import Any
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import ListedColormap, LogNorm, Normalize
@@ -21,221 +19,238 @@ from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from ..base.errors import LidarpoolError
-from .labels import axis_labels
-from .overlay import visible, visible_runs
+from . import theme
 from .shot import Shot
-from .theme import Theme
 
 Floats = NDArray[np.float64]
 
 DPI = 200
 FONT = "DejaVu Sans"  # comes with matplotlib
 MANY_POSES = 40  # more than this are drawn as small dots
-MOST_POSES = 800
 LEGEND_ROWS = 30
 LEGEND_LETTERS = 18
+# Of the numbers along the axes, in pixels of a picture 1600 wide.
+TICK = 7.0  # length of a tick mark
+BESIDE, BELOW = 14.0, 24.0  # from an edge to the numbers right or left of it, and under it
+LETTER = 12.0  # width of a digit
+TITLE = 32.0  # from the numbers to the title
+APART = 34.0  # numbers stand at least this far apart
+SHORTEST_AXIS = 36.0  # a shorter height axis has no room for numbers
 
 
 class Page:
-    """One picture being put together.
+    """One picture being put together; its size is (width, height) in pixels."""
 
-    Parameters
-    ----------
-    size
-        Width and height in pixels.
-    theme
-        Its colours.
-    """
-
-    def __init__(self, size: tuple[int, int], theme: Theme) -> None:
-        self.theme = theme
+    def __init__(self, size: tuple[int, int]) -> None:
         self.size = size
-        self.figure = Figure(figsize=(size[0] / DPI, size[1] / DPI), dpi=DPI, facecolor=theme.page)
-        FigureCanvasAgg(self.figure)
+        self.figure = Figure(figsize=(size[0] / DPI, size[1] / DPI), dpi=DPI, facecolor=theme.PAGE)
         self.unit = size[0] / 1600  # fonts and lines grow with the picture
 
-    def show(self, shot: Shot, image: Floats) -> Axes:
-        """Fill the page with a painted shot and put numbers along its axes.
+    def show(self, shot: Shot, image: NDArray[np.floating]) -> Axes:
+        """Fill the page with a painted shot, its ground's grid, its axes and its sensors.
 
         The axes that come back have the shot's pixels as coordinates.
         """
+        self.figure.figimage(np.round(255 * image).astype(np.uint8), zorder=-1)
         axes = self.figure.add_axes((0, 0, 1, 1))
         axes.set_axis_off()
-        width, height = shot.camera.size
-        axes.imshow(image, extent=(0, width, height, 0), interpolation="bilinear", aspect="auto")
-        axes.set(xlim=(0, width), ylim=(height, 0))
-        labels, lines = axis_labels(shot.stage, shot.camera)
-        marks = [label.mark for label in labels if label.mark is not None]
-        corners = shot.stage.corners
-        border = visible_runs(shot, np.stack([corners, np.roll(corners, -1, axis=0)], axis=1), 5.0)
-        for drawn, colour in ((border, self.theme.line), ([*marks, *lines], self.theme.muted)):
-            axes.add_collection(LineCollection(drawn, colors=colour, linewidths=0.6 * self.unit))
-        for label in labels:
-            title = label.mark is None
-            axes.text(
-                float(label.place[0]), float(label.place[1]), label.text,
-                rotation=label.angle_deg, ha="center", va="center",
-                fontsize=(7.2 if title else 6.6) * self.unit,
-                color=self.theme.ink if title else self.theme.muted, family=FONT,
-            )  # fmt: skip
+        axes.set(xlim=(0, self.size[0]), ylim=(self.size[1], 0))
+        grid = shot.runs(_grid(shot), shot.on_ground)
+        axes.add_collection(LineCollection(grid, colors=theme.LINE, linewidths=0.6 * self.unit))
+        self._label_axes(axes, shot)
+        self._sensors(axes, shot)
         return axes
 
-    def title(self, text: str, detail: str = "") -> None:
-        """Write a title at the top left, and a line of detail under it."""
-        line = 0.05 * self.size[0] / self.size[1] / 1.6
-        self.figure.text(
-            0.03, 1 - line, text, fontsize=11 * self.unit, fontweight="bold",
-            color=self.theme.ink, va="center", family=FONT,
-        )  # fmt: skip
-        self.figure.text(
-            0.03, 1 - 1.84 * line, detail, fontsize=7.2 * self.unit, color=self.theme.muted,
-            va="center", family=FONT,
+    def _label_axes(self, axes: Axes, shot: Shot) -> None:
+        """Write numbers and titles along the ground's near edges and up from its left corner."""
+        taken: list[Floats] = []
+        for k, (start, end, outward) in enumerate(_axis_edges(shot)):
+            axis = shot.stage.axes[k]
+            ends, _ = shot.camera.project([start, end])
+            if k == 2 and np.linalg.norm(ends[1] - ends[0]) < SHORTEST_AXIS * self.unit:
+                return
+            clear = BESIDE * abs(outward[0]) + BELOW * abs(outward[1])
+            places = np.repeat(start[None], len(axis.ticks), axis=0)
+            places[:, k] = axis.ticks
+            lines = [ends] if k == 2 else []
+            for pixel, text in zip(shot.camera.project(places)[0], axis.labels, strict=True):
+                wide = LETTER / 2 * len(text) * abs(outward[0])
+                place = pixel + (clear + wide) * self.unit * outward
+                apart = (APART + 4 * max(0, len(text) - 3)) * (0.7 if k == 2 else 1.0) * self.unit
+                if all(np.linalg.norm(place - other) >= apart for other in taken):
+                    taken.append(place)
+                    lines.append(np.stack([pixel, pixel + TICK * self.unit * outward]))
+                    self._text(axes, place, text, 6.6, theme.MUTED)
+            axes.add_collection(
+                LineCollection(lines, colors=theme.MUTED, linewidths=0.6 * self.unit)
+            )
+            along = ends[1] - ends[0]
+            angle = (90 - math.degrees(math.atan2(along[1], along[0]))) % 180 - 90
+            widest = max((len(text) for text in axis.labels), default=0)
+            away = (clear + TITLE + LETTER * widest * abs(outward[0])) * self.unit
+            place = ends.mean(axis=0) + away * outward
+            self._text(axes, place, axis.title, 7.2, theme.INK, 90.0 if k == 2 else angle)
+
+    def _text(
+        self, axes: Axes, place: Floats, text: str, size: float, colour: Any, angle: float = 0.0
+    ) -> None:
+        axes.text(
+            float(place[0]), float(place[1]), text, rotation=angle, ha="center", va="center",
+            fontsize=size * self.unit, color=colour, family=FONT,
         )  # fmt: skip
 
-    def sensors(self, axes: Axes, shot: Shot, poses: Floats) -> None:
-        """Mark sensor positions (p, 3), hollow where something hides them, each on a stem."""
+    def _sensors(self, axes: Axes, shot: Shot) -> None:
+        """Mark the sensors, hollow where something hides them, each on a stem."""
+        poses = shot.sensors
         many = len(poses) > MANY_POSES
-        poses = poses[np.linspace(0, len(poses) - 1, min(len(poses), MOST_POSES)).astype(int)]
-        pixels, seen = visible(shot, poses)
+        pixels, seen = shot.visible(poses)
         if not many:
-            feet = poses.copy()
-            feet[:, 2] = shot.stage.level
-            self.lines(axes, shot, np.stack([poses, feet], axis=1), self.theme.sensor, 0.8, 0.7)
-        looks = (
-            (seen, self.theme.sensor, self.theme.page),
-            (~seen & np.isfinite(pixels).all(axis=1), "none", self.theme.sensor),
-        )
-        for which, face, edge in looks:
+            feet = np.column_stack([poses[:, :2], np.full(len(poses), shot.stage.level)])
+            self.lines(axes, shot, np.stack([poses, feet], axis=1), 0.8, 0.7)
+        for which, face, edge in ((seen, theme.SENSOR, theme.PAGE), (~seen, "none", theme.SENSOR)):
             axes.scatter(
                 pixels[which, 0], pixels[which, 1], s=(5 if many else 20) * self.unit**2,
                 facecolors=face, edgecolors=edge, linewidths=(0.2 if many else 0.7) * self.unit,
                 zorder=5,
             )  # fmt: skip
 
-    def lines(
-        self, axes: Axes, shot: Shot, segments: Floats, colour: str, width: float, alpha: float
-    ) -> None:
-        """Draw the parts of segments (n, 2, 3) that nothing hides."""
+    def lines(self, axes: Axes, shot: Shot, segments: Floats, width: float, alpha: float) -> None:
+        """Draw the parts of segments (n, 2, 3) that nothing hides, in the sensors' colour."""
+        runs = shot.runs(segments, shot.visible)
         axes.add_collection(
             LineCollection(
-                visible_runs(shot, segments), colors=colour, linewidths=width * self.unit,
-                alpha=alpha, capstyle="round", zorder=4,
+                runs, colors=theme.SENSOR, linewidths=width * self.unit, alpha=alpha, zorder=4
             )
+        )
+
+    def title(self, text: str, detail: str) -> None:
+        """Write a title at the top left, and a line of detail under it."""
+        line = 0.05 * self.size[0] / self.size[1] / 1.6
+        self.figure.text(
+            0.03, 1 - line, text, fontsize=11 * self.unit, weight="bold", color=theme.INK,
+            va="center", family=FONT,
+        )  # fmt: skip
+        self.figure.text(
+            0.03, 1 - 1.84 * line, detail, fontsize=7.2 * self.unit, color=theme.MUTED,
+            va="center", family=FONT,
         )  # fmt: skip
 
-    def legend(self, entries: Sequence[tuple[str, object]], sensors: bool = False) -> None:
-        """Name colours in the page's right margin.
-
-        Parameters
-        ----------
-        entries
-            (name, colour); what does not fit is counted in a last line.
-        sensors
-            Whether a line for the sensor marker is added.
-        """
-        rows = [(name, colour, "s") for name, colour in entries[:LEGEND_ROWS]]
-        if sensors:
-            rows.append(("Sensor", self.theme.sensor, "o"))
+    def legend(self, entries: Sequence[tuple[str, Any]]) -> None:
+        """Name colours, as (name, colour), in the right margin; many are counted in a last line."""
+        rows = [("s", name, colour) for name, colour in entries[:LEGEND_ROWS]]
+        rows.append(("o", "Sensor", theme.SENSOR))
         if len(entries) > LEGEND_ROWS:
-            rows.append((f"and {len(entries) - LEGEND_ROWS:,} more", "none", "s"))
-        size = min(7.4, 175 / max(len(rows), 1))
+            rows.append(("", f"and {len(entries) - LEGEND_ROWS:,} more", theme.MUTED))
+        size = min(7.4, 175 / len(rows))
         self.key(
             [
                 Line2D([], [], ls="", marker=marker, color=colour, ms=0.85 * size * self.unit,
-                       mec="none", label=shortened(name))
-                for name, colour, marker in rows
+                       mec="none", label=_shortened(name))
+                for marker, name, colour in rows
             ],
             size,
         )  # fmt: skip
 
     def key(self, handles: list[Line2D], size: float) -> None:
-        """Put a legend of handles into the page's right margin; `size` of the font in points."""
-        if handles:
-            legend = self.figure.legend(
-                handles, ["x"] * len(handles), loc="center left", bbox_to_anchor=(0.842, 0.5),
-                frameon=False, labelcolor=self.theme.ink, labelspacing=0.55, handletextpad=0.5,
-                borderpad=0, handlelength=1.4, prop={"family": FONT, "size": size * self.unit},
-            )  # fmt: skip
-            # Names come from files: matplotlib leaves out those that begin with an underscore,
-            # and stumbles over what looks like a formula and is none ("$\\frac{x$").
-            for text, handle in zip(legend.get_texts(), handles, strict=True):
-                text.set_parse_math(False)
-                text.set_text(str(handle.get_label()))
+        """Put a legend of handles into the right margin; `size` of the font in points."""
+        legend = self.figure.legend(
+            handles, ["x"] * len(handles), loc="center left", bbox_to_anchor=(0.842, 0.5),
+            frameon=False, labelcolor=theme.INK, labelspacing=0.55, handletextpad=0.5,
+            borderpad=0, handlelength=1.4, prop={"family": FONT, "size": size * self.unit},
+        )  # fmt: skip
+        # Names come from files: matplotlib leaves out those that begin with an underscore,
+        # and stumbles over what looks like a formula and is none ("$\\frac{x$").
+        for text, handle in zip(legend.get_texts(), handles, strict=True):
+            text.set_parse_math(False)
+            text.set_text(str(handle.get_label()))
 
     def colour_bar(self, colours: Floats, norm: Normalize, title: str) -> None:
         """Draw a colour bar of colours (n, 3) in the right margin, its title beside it."""
         axes = self.figure.add_axes((0.862, 0.27, 0.014, 0.46))
         bar = self.figure.colorbar(ScalarMappable(norm, ListedColormap(colours)), cax=axes)
         bar.outline.set_visible(False)
-        bar.set_label(title, fontsize=7.6 * self.unit, color=self.theme.ink, family=FONT)
+        bar.set_label(title, fontsize=7.6 * self.unit, color=theme.INK, family=FONT)
         axes.tick_params(
-            which="both", labelsize=6.6 * self.unit, color=self.theme.muted, width=0.6 * self.unit,
-            labelcolor=self.theme.muted, labelfontfamily=FONT, length=2.5 * self.unit,
+            which="both", labelsize=6.6 * self.unit, color=theme.MUTED, width=0.6 * self.unit,
+            labelcolor=theme.MUTED, labelfontfamily=FONT, length=2.5 * self.unit,
         )  # fmt: skip
-        axes.tick_params(which="minor", length=1.5 * self.unit)
         if isinstance(norm, LogNorm):
             axes.yaxis.set_major_formatter(lambda value, _: f"{value:,.12g}")
             axes.yaxis.set_minor_formatter(lambda value, _: "")
 
     def note(self, axes: Axes, text: str) -> None:
         """Write a remark into the middle of the picture."""
-        halo = [withStroke(linewidth=3 * self.unit, foreground=self.theme.page)]
+        halo = [withStroke(linewidth=3 * self.unit, foreground=theme.PAGE)]
         axes.text(
             0.43, 0.5, text, transform=axes.transAxes, ha="center", va="center",
-            fontsize=9 * self.unit, color=self.theme.muted, path_effects=halo, family=FONT,
+            fontsize=9 * self.unit, color=theme.MUTED, path_effects=halo, family=FONT,
         )  # fmt: skip
 
-    def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write the page under a temporary name in the same folder, then rename it.
-
-        It is a PDF where the name says so, and else a PNG.
+    def save(self, path: Path) -> None:
+        """Write the page as a PNG.
 
         Raises
         ------
         LidarpoolError
-            If the folder is not there or cannot be written to. A file that was there before is
-            left as it was.
+            If the folder is not there or cannot be written to.
         """
-        target = Path(path)
         try:
-            handle, name = tempfile.mkstemp(
-                prefix=f".{target.stem}-", suffix=target.suffix, dir=target.parent
-            )
+            self.figure.savefig(path, dpi=DPI)
         except OSError as error:
-            raise cannot_write(target, error) from error
-        temporary = Path(name)
-        try:
-            with os.fdopen(handle, "wb") as file:
-                self._write(file, "pdf" if target.suffix.lower() == ".pdf" else "png")
-            temporary.chmod(0o644)
-            temporary.replace(target)
-        except OSError as error:
-            raise cannot_write(target, error) from error
-        finally:
-            temporary.unlink(missing_ok=True)
-        return target
-
-    def _write(self, file: IO[bytes], kind: str) -> None:
-        """Write the page as "png" or "pdf"."""
-        # No versions and no date in the file: the same picture is the same bytes.
-        silent = ("Software",) if kind == "png" else ("Creator", "Producer", "CreationDate")
-        # Journals ask for fonts of type 42, which can be edited; the default is 3.
-        with matplotlib.rc_context({"pdf.fonttype": 42}):
-            self.figure.savefig(file, format=kind, dpi=DPI, metadata=dict.fromkeys(silent))
+            raise LidarpoolError(
+                f"The picture {path} could not be written: {error.strerror or error}. "
+                "Choose a folder that exists, can be written to and has room."
+            ) from error
 
 
-def cannot_write(target: Path, error: OSError) -> LidarpoolError:
-    """Say why a picture could not be written."""
-    return LidarpoolError(
-        f"The picture {target} could not be written: {error.strerror or error}. "
-        "Choose a folder that exists, can be written to and has room."
+def _grid(shot: Shot) -> Floats:
+    """Lines (n, 2, 3) of the ground: its border, and one at each tick."""
+    (x0, y0), (x1, y1) = shot.stage.ground.tolist()
+    level = shot.stage.level
+    across, along = (axis.ticks.tolist() for axis in shot.stage.axes[:2])
+    return np.array(
+        [((x, y0, level), (x, y1, level)) for x in (x0, *across, x1)]
+        + [((x0, y, level), (x1, y, level)) for y in (y0, *along, y1)]
     )
 
 
-def shortened(name: str) -> str:
+def _axis_edges(shot: Shot) -> list[tuple[Floats, Floats, Floats]]:
+    """For x, y and z: two ends (3,) in the scene, and the outward direction (2,) in the picture."""
+    corners = shot.stage.corners
+    flat, _ = shot.camera.project(corners)
+    middle, _ = shot.camera.project(corners.mean(axis=0)[None])
+    out = []
+    for sides in (((0, 1), (3, 2)), ((0, 3), (1, 2))):  # corners along x and along y
+        a, b = max(sides, key=lambda side: float(flat[list(side), 1].mean()))  # the nearer one
+        along = flat[b] - flat[a]
+        outward = np.array([along[1], -along[0]]) / np.linalg.norm(along)
+        outward *= np.sign(outward @ ((flat[a] + flat[b]) / 2 - middle[0]))
+        out.append((corners[a], corners[b], outward))
+    foot = corners[np.argmin(flat[:, 0])]
+    top = np.array([*foot[:2], shot.stage.bounds[1, 2]])
+    return [*out, (foot, top, np.array([-1.0, 0.0]))]
+
+
+def _shortened(name: str) -> str:
     """Cut a long name in its middle, so that it fits the legend; control characters show."""
     name = "".join(letter if letter.isprintable() else "\ufffd" for letter in name)
     if len(name) <= LEGEND_LETTERS:
         return name
     keep = LEGEND_LETTERS - 1
     return f"{name[: keep - keep // 2]}…{name[-(keep // 2) :]}"
+
+
+def without_common_prefix(names: Sequence[str]) -> list[str]:
+    """Leave out the words that all names begin with, where there are at least three names.
+
+    Examples
+    --------
+    >>> without_common_prefix(["site_a_Wall", "site_a_Floor", "site_a_Lamp_1"])
+    ['Wall', 'Floor', 'Lamp_1']
+    """
+    if len(names) < 3:
+        return list(names)
+    prefix = os.path.commonprefix(list(names))  # noqa: RUF071 - of letters, as is wanted
+    end = max(prefix.rfind(mark) for mark in "_./: -") + 1
+    shorter = [name[end:] for name in names]
+    return shorter if all(shorter) else list(names)

@@ -2,62 +2,102 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..base.errors import LidarpoolError
-from ..scene.scene import Scene, local_origin
+from ..scene.scene import Scene
+from . import theme
 from .camera import Camera, fit_camera
-from .cutaway import Cutaway, cast_through, plan_cutaway
-from .light import LightMap, Rig, measure_light, sun_direction
-from .samples import GROUND, SKY, Samples, look
-from .stage import Stage, robust_bounds
+from .cutaway import cast_through, plan_cutaway
+from .light import STRIDE, LightMap, alike, make_light_map
+from .stage import Stage
 from .surface import Surface
-from .theme import Theme
 
 Floats = NDArray[np.float64]
+Reals = NDArray[np.float32]
+Bools = NDArray[np.bool_]
 
 SIZE = (1600, 1000)  # pixels of a finished picture
 # Where the scene is: the title is above it, legend and colour bar are right of it.
 FRAME = (0.08, 0.115, 0.79, 0.91)
-FINER_MOST = 1_500_000  # samples of edges; with more, each gets half as many
+SKY, GROUND = -1, -2  # in place of a triangle
+STEPS = 700  # places along a line where it is tested for being seen
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """What rays of the camera met; every array has one row a ray.
+
+    Parameters
+    ----------
+    triangle
+        int64 (n,) or SKY, GROUND.
+    distance
+        float32 (n,) metres, infinite for the sky.
+    position, normal
+        float32 (n, 3), NaN for the sky.
+    light
+        float32 (n,) brightness: 1 on open ground.
+    """
+
+    triangle: NDArray[np.int64]
+    distance: Reals
+    position: Reals
+    normal: Reals
+    light: Reals
+
+    def paint(self, face_colours: Floats, contrast: float) -> Reals:
+        """Colours (n, 3) of the samples; see `Shot.paint`."""
+        surface = self.triangle >= 0
+        shade = np.where(surface, 1 - contrast * (1 - self.light), self.light)
+        table = np.vstack([face_colours, theme.rgb(theme.GROUND), theme.rgb(theme.PAGE)])
+        shade[self.triangle == SKY] = 1
+        return table[self.triangle] * shade[:, None]  # GROUND and SKY are the last two rows
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A scene on its ground, seen by a camera.
+    """A scene on its ground with sensors in it, seen by a camera.
 
     Parameters
     ----------
+    scene
+        What is seen.
+    sensors
+        (p, 3) metres, local coordinates.
     stage
         Ground and axes.
     camera
-        Of the rendered pixels, of which there may be fewer than in the finished picture.
-    samples
-        What is seen, some pixels having several samples.
-    depth
-        (height, width) metres from the eye to what each pixel sees, infinite for nothing.
-    scene
-        What was seen; None for the bare ground.
+        Its pixels are those of the picture.
+    whole
+        What is seen through the middle of each pixel.
+    edges, finer
+        int64 (e,) pixels that show the edge of something, and several samples of each in turn.
     """
 
+    scene: Scene
+    sensors: Floats
     stage: Stage
     camera: Camera
-    samples: Samples
-    depth: Floats
-    scene: Scene | None
+    whole: Samples
+    edges: NDArray[np.int64]
+    finer: Samples
 
-    def paint(self, face_colours: Floats, theme: Theme, contrast: float = 1.0) -> Floats:
+    @property
+    def depth(self) -> Reals:
+        """Metres (height, width) from the eye to what each pixel shows, infinite for nothing."""
+        return self.whole.distance.reshape(self.camera.size[::-1])
+
+    def paint(self, face_colours: Floats, contrast: float = 1.0) -> Reals:
         """Give the shot colours.
 
         Parameters
         ----------
         face_colours
             (f, 3) in 0 to 1.
-        theme
-            Colours of page and ground.
         contrast
             0 for flat colours, 1 for full light and shade.
 
@@ -65,27 +105,54 @@ class Shot:
         -------
         (height, width, 3) in 0 to 1
         """
-        seen = self.samples
-        colour = np.empty((len(seen.pixel), 3))
-        colour[seen.triangle == SKY] = theme.rgb["page"]
-        surface = seen.triangle >= 0
-        shade = 1 - contrast * (1 - seen.light[surface])
-        colour[surface] = face_colours[seen.triangle[surface]] * shade[:, None]
-        ground = seen.triangle == GROUND
-        colour[ground] = theme.rgb["ground"] * seen.light[ground, None]
-        line = seen.line[..., None] * np.where(surface, 0.35, 1.0)[:, None]
-        colour += line * (theme.rgb["line"] * seen.light[:, None] - colour)
-        width, height = self.camera.size
-        return seen.average(np.clip(colour, 0, 1), width * height).reshape(height, width, 3)
+        image = self.whole.paint(face_colours, contrast)
+        finer = self.finer.paint(face_colours, contrast)
+        if len(self.edges):
+            image[self.edges] = finer.reshape(len(self.edges), -1, 3).mean(axis=1)
+        return np.clip(image, 0, 1).reshape(*self.camera.size[::-1], 3)
+
+    def visible(self, points: ArrayLike) -> tuple[Floats, Bools]:
+        """Pixel coordinates (n, 2) of points (n, 3), local metres, and whether they can be seen."""
+        pixels, distance = self.camera.project(points)
+        depth = self.camera.look_up(self.depth, pixels, -np.inf)
+        return pixels, distance <= depth + 2 * self.camera.footprint(distance)
+
+    def on_ground(self, points: ArrayLike) -> tuple[Floats, Bools]:
+        """Pixel coordinates of points of the ground, and whether nothing stands on or before it."""
+        pixels, _ = self.camera.project(points)
+        bare = (self.whole.triangle < 0).reshape(self.depth.shape)
+        return pixels, self.camera.look_up(bare, pixels, False)
+
+    def runs(
+        self, segments: Floats, seen: Callable[[Floats], tuple[Floats, Bools]]
+    ) -> list[Floats]:
+        """Split line segments (n, 2, 3) into the pieces that are seen.
+
+        Parameters
+        ----------
+        seen
+            `visible` or `on_ground`.
+
+        Returns
+        -------
+        list of (2, 2)
+            Pixel coordinates of the ends of each piece.
+        """
+        # Steps of equal length in the picture: interpolate 1 / depth, which is linear there.
+        near, far = ((segments[:, end] - self.camera.eye) @ self.camera.axes[2] for end in (0, 1))
+        s = np.linspace(0, 1, STEPS)[None]
+        share = s * near[:, None] / (far[:, None] * (1 - s) + s * near[:, None])
+        path = segments[:, :1] + share[..., None] * (segments[:, 1:] - segments[:, :1])
+        pixels, shown = seen(path.reshape(-1, 3))
+        out = []
+        for line, there in zip(pixels.reshape(-1, STEPS, 2), shown.reshape(-1, STEPS), strict=True):
+            turns = np.flatnonzero(np.diff(there, prepend=False, append=False))
+            out += [line[[first, last - 1]] for first, last in turns.reshape(-1, 2)]
+        return out
 
 
 def take_shot(
-    scene: Scene | None,
-    poses: ArrayLike = (),
-    *,
-    points: ArrayLike = (),
-    size: tuple[int, int] = SIZE,
-    backend: str = "auto",
+    scene: Scene, poses: ArrayLike, *, size: tuple[int, int] = SIZE, backend: str = "auto"
 ) -> Shot:
     """Look at a scene from a place that shows it well.
 
@@ -95,72 +162,64 @@ def take_shot(
     Parameters
     ----------
     scene
-        What to show; None for the bare ground.
+        What to show.
     poses
         (p, 3) sensor positions, world coordinates.
-    points
-        (n, 3) world coordinates, what to show where there is no scene.
     size
-        Width and height in pixels of the finished picture; the NumPy ray caster renders at
-        less than that.
+        Width and height of the picture in pixels.
     backend
         Ray caster, see `raybeam.RayCaster`.
     """
-    if min(size) < 16:
-        raise LidarpoolError(
-            f"A picture of {size[0]} x {size[1]} pixels is too small; 16 is least."
-        )
-    shown, sensors = finite_points(points), finite_points(poses)
-    origin = _origin(scene, shown, sensors)
-    sensors = sensors - origin
-    stage = _stage(scene, sensors, shown - origin, origin)
-    surface = None if scene is None else Surface.of(scene, backend)
-    rig, scale = Rig(), 1.0
-    if surface is not None and surface.caster.backend == "numpy":
-        rig, scale = Rig(stride=3, sky_rays=6, sun_rays=2), 1.0
-    camera = _camera(stage, (round(size[0] * scale), round(size[1] * scale)), 33.0)
-    cutaway = None
-    if surface is not None:
-        cutaway = plan_cutaway(surface, sensors, camera.eye)
-        if cutaway is not None:
-            # From higher up more of the floor is seen between what stands on it.
-            camera = _camera(stage, camera.size, 42.0)
-            cutaway = replace(cutaway, eye=camera.eye)
-            rig = replace(rig, reach=0.15 * stage.size)
-    return _expose(stage, surface, camera, cutaway, rig)
+    sensors = np.asarray(poses, dtype=np.float64).reshape(-1, 3) - scene.origin
+    stage = _stage(scene, sensors)
+    surface = Surface.of(scene, backend)
+    camera, reach = _camera(stage, size, 33.0), np.inf
+    cutaway = plan_cutaway(surface, sensors, camera.eye)
+    if cutaway is not None:
+        # From higher up more of the floor is seen between what stands on it.
+        camera, reach = _camera(stage, size, 42.0), 0.15 * stage.size
+        cutaway = replace(cutaway, eye=camera.eye)
+
+    def see(pixels: Floats) -> Samples:
+        """Look through places (n, 2) of the picture, in pixels; all is lit."""
+        directions = camera.rays(pixels)
+        distance, triangle, u, v = cast_through(surface, cutaway, camera.eye, directions)
+        normal = np.full((len(pixels), 3), np.nan, np.float32)
+        hit = triangle >= 0
+        normal[hit] = surface.normals(triangle[hit], u[hit], v[hit], directions[hit])
+        ground = _ground_distance(stage, camera.eye, directions)
+        nearer = ground < distance
+        distance[nearer], triangle[nearer], normal[nearer] = ground[nearer], GROUND, (0, 0, 1)
+        with np.errstate(invalid="ignore"):
+            position = (camera.eye + distance[:, None] * directions).astype(np.float32)
+        position[triangle == SKY] = np.nan
+        lit = np.ones(len(pixels), np.float32)
+        return Samples(triangle, distance.astype(np.float32), position, normal, lit)
+
+    width, height = size
+    grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
+    centres = np.asarray(grid.reshape(-1, 2) + 0.5)
+    whole = see(centres)
+    coarse = (slice(STRIDE // 2, None, STRIDE),) * 2
+    light = make_light_map(
+        surface, cutaway, camera, whole.position.reshape(height, width, 3)[coarse],
+        whole.normal.reshape(height, width, 3)[coarse], reach,
+    )  # fmt: skip
+    edges = np.flatnonzero(_edges(whole, scene, camera))
+    corners = np.array([[-0.125, -0.375], [0.375, -0.125], [-0.375, 0.125], [0.125, 0.375]])
+    places = (centres[edges, None] + corners).reshape(-1, 2)
+    whole = _lit(whole, light, centres, camera)
+    finer = _lit(see(places), light, places, camera)
+    return Shot(scene, sensors, stage, camera, whole, edges, finer)
 
 
-def finite_points(points: ArrayLike) -> Floats:
-    """Rows of (n, 3) that are finite; n may be 0."""
-    array = np.asarray(points, dtype=np.float64)
-    if not array.size:
-        return np.empty((0, 3))
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise LidarpoolError(f"Points to draw have shape {array.shape}; expected (n, 3).")
-    return array[np.isfinite(array).all(axis=1)]
-
-
-def _origin(scene: Scene | None, points: Floats, sensors: Floats) -> Floats:
-    """World coordinates of the local origin: the scene's, or else that of what is shown."""
-    if scene is not None:
-        return scene.origin
-    for some in (points, sensors):
-        if len(some):
-            return local_origin(some)
-    return np.zeros(3)
-
-
-def _stage(scene: Scene | None, sensors: Floats, points: Floats, origin: Floats) -> Stage:
-    """Choose the box to show: the scene or the points, and the sensors that are near them."""
-    bounds = scene.bounds if scene is not None else robust_bounds(points)
-    if bounds is None:
-        bounds = robust_bounds(sensors)
-    if bounds is None:
-        bounds = np.zeros((2, 3))
-    reach = 2 * max(float(np.linalg.norm(bounds[1] - bounds[0])), 1e-3)
-    near = sensors[((sensors > bounds[0] - reach) & (sensors < bounds[1] + reach)).all(axis=1)]
-    shown = np.concatenate([bounds, near])
-    return Stage.around(np.stack([shown.min(axis=0), shown.max(axis=0)]), origin)
+def _stage(scene: Scene, sensors: Floats) -> Stage:
+    """Choose the box to show: the scene, and the sensors that are near it."""
+    low, high = scene.bounds
+    reach = 2 * max(float(np.linalg.norm(high - low)), 1e-3)
+    near = sensors[((sensors > low - reach) & (sensors < high + reach)).all(axis=1)]
+    shown = np.concatenate([scene.bounds, near])
+    return Stage.around(np.stack([shown.min(axis=0), shown.max(axis=0)]), scene.origin)
 
 
 def _camera(stage: Stage, size: tuple[int, int], elevation_deg: float) -> Camera:
@@ -174,53 +233,51 @@ def _camera(stage: Stage, size: tuple[int, int], elevation_deg: float) -> Camera
     return fit_camera(corners, size, FRAME, -62.0 if wide else -28.0, elevation_deg)
 
 
-def _expose(
-    stage: Stage, surface: Surface | None, camera: Camera, cutaway: Cutaway | None, rig: Rig
-) -> Shot:
-    """Cast one ray through each pixel, light the surfaces, and look closer along edges."""
+def _ground_distance(stage: Stage, eye: Floats, directions: Floats) -> Floats:
+    """Metres (n,) from the eye to the ground's rectangle along directions (n, 3)."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = (stage.level - eye[2]) / directions[:, 2]
+        place = eye[:2] + distance[:, None] * directions[:, :2]
+    inside = ((place >= stage.ground[0]) & (place <= stage.ground[1])).all(axis=1)
+    return np.where(inside & (distance > 0), distance, np.inf)
 
-    def see(pixels: Floats) -> Samples:
-        """Look through places (n, 2) of the picture, in pixels."""
-        directions = camera.rays(pixels)
-        hits = None
-        if surface is not None:
-            hits = cast_through(surface, cutaway, camera.eye, directions)
-        return look(stage, camera, surface, pixels, directions, hits)
 
+def _edges(whole: Samples, scene: Scene, camera: Camera) -> Bools:
+    """Whether each pixel shows another object or surface than one beside it, (pixels,)."""
     width, height = camera.size
-    column, row = np.meshgrid(np.arange(width), np.arange(height))
-    centres = np.stack([column.ravel(), row.ravel()], axis=1).astype(np.float64) + 0.5
-    whole = see(centres)
-    light = _light_map(surface, cutaway, camera, whole, rig)
-    edges = _edges(whole.triangle.reshape(height, width))
-    corners = np.array([[-0.125, -0.375], [0.375, -0.125], [-0.375, 0.125], [0.125, 0.375]])
-    if len(corners) * np.count_nonzero(edges) > FINER_MOST:  # a scene full of edges
-        corners = corners[[0, 3]]
-    finer = see((centres[edges][:, None] + corners).reshape(-1, 2))
-    samples = whole.select(~edges).join(finer)
-    lit = samples.lit(light, camera, sun_direction(camera))
-    depth = whole.distance.reshape(height, width)
-    return Shot(stage, camera, lit, depth, None if surface is None else surface.scene)
+    kind = np.append(scene.face_object, [GROUND, SKY])[whole.triangle]
+    number = np.arange(width * height).reshape(height, width)
+    edge = np.zeros(width * height, np.bool_)
+    tolerance = _tolerance(whole.distance, camera, 1)
+    for here, beside in ((number[:, :-1], number[:, 1:]), (number[:-1], number[1:])):
+        a, b = here.ravel(), beside.ravel()
+        with np.errstate(invalid="ignore"):
+            same = (
+                alike(
+                    whole.position[a],
+                    whole.normal[a],
+                    whole.position[b],
+                    whole.normal[b],
+                    tolerance[a],
+                )
+                > 0.3
+            )
+        differs = (kind[a] != kind[b]) | ~same & (kind[a] != SKY)
+        edge[a[differs]] = edge[b[differs]] = True
+    return edge
 
 
-def _light_map(
-    surface: Surface | None, cutaway: Cutaway | None, camera: Camera, whole: Samples, rig: Rig
-) -> LightMap:
-    """Light at every few pixels of the full set of samples, which is one a pixel."""
-    width, height = camera.size
-    grid = (slice(rig.stride // 2, None, rig.stride),) * 2
-    position = whole.position.reshape(height, width, 3)[grid]
-    normal = whole.normal.reshape(height, width, 3)[grid]
-    return measure_light(surface, cutaway, rig, camera, position, normal)
+def _lit(samples: Samples, light: LightMap, pixels: Floats, camera: Camera) -> Samples:
+    """Return samples at pixels (n, 2) with their brightness."""
+    there = np.flatnonzero(samples.triangle != SKY)
+    out = samples.light.copy()
+    out[there] = light.brightness(
+        pixels[there], samples.position[there], samples.normal[there],
+        _tolerance(samples.distance[there], camera, STRIDE), samples.triangle[there] == GROUND,
+    )  # fmt: skip
+    return replace(samples, light=out)
 
 
-def _edges(triangle: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Whether each pixel shows another triangle than one beside it: (height * width,)."""
-    edge = np.zeros(triangle.shape, dtype=np.bool_)
-    across = triangle[:, 1:] != triangle[:, :-1]
-    down = triangle[1:] != triangle[:-1]
-    edge[:, 1:] |= across
-    edge[:, :-1] |= across
-    edge[1:] |= down
-    edge[:-1] |= down
-    return edge.ravel()
+def _tolerance(distance: Reals, camera: Camera, stride: int) -> Reals:
+    """How far in metres points of one surface, `stride` pixels apart, may be from its plane."""
+    return (3 * stride * camera.footprint(distance)).astype(np.float32)

@@ -45,11 +45,9 @@ class Surface:
         a, b, c = (scene.vertices[scene.faces[:, k]] for k in range(3))
         doubled = np.cross(b - a, c - a)
         at_vertices = np.zeros_like(scene.vertices)
-        for corner in range(3):
+        for corner in scene.faces.T:
             for k in range(3):
-                at_vertices[:, k] += np.bincount(
-                    scene.faces[:, corner], weights=doubled[:, k], minlength=len(at_vertices)
-                )
+                at_vertices[:, k] += np.bincount(corner, doubled[:, k], len(at_vertices))
         caster = RayCaster(scene.vertices, scene.faces, backend=backend)
         return cls(scene, caster, unit(doubled), unit(at_vertices))
 
@@ -71,15 +69,19 @@ class Surface:
         smooth = np.zeros_like(flat)
         for corner, weight in enumerate((1 - u - v, u, v)):
             normal = self.vertex_normals[corners[:, corner]]
-            creased = (normal * flat).sum(axis=1) < CREASE_COSINE
+            creased = dot(normal, flat) < CREASE_COSINE
             smooth += weight[:, None] * np.where(creased[:, None], flat, normal)
         smooth = unit(smooth)
-        away = (flat * towards).sum(axis=1) > 0
-        smooth[away] *= -1
+        smooth[dot(flat, towards) > 0] *= -1
         return smooth
+
+
+def dot(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Scalar products (...,) of vectors (..., 3)."""
+    return np.asarray(np.einsum("...i,...i->...", a, b))
 
 
 def unit(vectors: Floats) -> Floats:
     """Scale vectors (n, 3) to length one; those of no length stay zero."""
-    length = np.sqrt((vectors * vectors).sum(axis=1, keepdims=True))
+    length = np.sqrt(dot(vectors, vectors))[:, None]
     return vectors / np.where(length > 0, length, 1.0)

@@ -1,10 +1,8 @@
-"""Colours of the pictures: light and dark pages, one colour an object, colour maps."""
+"""Colours of the pictures."""
 
 from __future__ import annotations
 
 import colorsys
-from dataclasses import dataclass
-from functools import cached_property
 
 import matplotlib
 import numpy as np
@@ -13,61 +11,21 @@ from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
 
-# Distinct on light and on dark pages, also for most colour-blind readers (after Paul Tol's
-# "bright" and "muted" sets, 2021, in an order that keeps neighbours apart).
+PAGE, GROUND, LINE = "#ffffff", "#f1f3f5", "#c3cad3"
+INK, MUTED = "#1c2430", "#5d6876"
+CLAY, UNSEEN, SENSOR = "#d9dde2", "#c9ccd1", "#e0182d"
+
+# Distinct also for most colour-blind readers (after Paul Tol's "bright" and "muted" sets, 2021,
+# in an order that keeps neighbours apart).
 OBJECT_COLOURS = (
     "#4477aa", "#ee7733", "#44aa77", "#cc6677", "#66b8d9", "#ccaa33",
     "#8a63b0", "#997755", "#88aa44", "#cc77b8", "#336688", "#b0574f",
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Theme:
-    """Colours of one page, as matplotlib names them."""
-
-    page: str
-    ground: str
-    line: str
-    ink: str
-    muted: str
-    clay: str
-    unseen: str
-    sensor: str
-    ray: str
-
-    @cached_property
-    def rgb(self) -> dict[str, Floats]:
-        """Every colour as float64 (3,) in 0 to 1, by name."""
-        return {name: np.array(to_rgb(value)) for name, value in vars(self).items() if value}
-
-
-LIGHT = Theme(
-    page="#ffffff",
-    ground="#f1f3f5",
-    line="#c3cad3",
-    ink="#1c2430",
-    muted="#5d6876",
-    clay="#d9dde2",
-    unseen="#c9ccd1",
-    sensor="#e0182d",
-    ray="#e0182d",
-)
-DARK = Theme(
-    page="#0e131a",
-    ground="#19212b",
-    line="#3a4655",
-    ink="#e8edf3",
-    muted="#9aa7b5",
-    clay="#4a545f",
-    unseen="#59616b",
-    sensor="#ff4d5e",
-    ray="#ff6b78",
-)
-
-
-def theme_for(dark: bool) -> Theme:
-    """Return the page's theme."""
-    return DARK if dark else LIGHT
+def rgb(colour: str) -> Floats:
+    """Return a colour as (3,) in 0 to 1."""
+    return np.array(to_rgb(colour))
 
 
 def object_colours(count: int) -> Floats:

@@ -16,9 +16,8 @@ from typing import Any
 
 from ..base.errors import LidarpoolError
 from ..base.interrupts import deferred_interrupts
-from ..export.ply import read_positions, save_cloud
+from ..export.ply import save_cloud
 from ..plan import Planning
-from ..render.cloud_picture import MOST_POINTS
 from ..run.picture_file import PICTURE_FILE, PICTURES, Pictured
 from ..run.result import Result
 from ..scene.scene import Scene
@@ -36,8 +35,6 @@ ROOM_BYTES = 32 << 20  # what pictures and report may take; the cloud is checked
 CLOUD, PAGE, REPORT = "cloud.ply", "report.html", "report.json"
 _IMAGES = tuple(f"{name}.png" for name in PICTURES)
 FILES = (CLOUD, *_IMAGES, PICTURE_FILE, PAGE, REPORT)
-# What `lidarpool plot` leaves there, of a result that is replaced.
-_DRAWN_AGAIN = ("{}-dark.png", "{}.pdf", "{}-dark.pdf")
 
 # Folders within the output folder: a result being made, and one that is whole and on its way
 # into place. A run that was killed leaves one behind; the next run removes or finishes it.
@@ -157,8 +154,8 @@ def _pictures(
 ) -> dict[str, Callable[[Path], object]]:
     """Functions that write each picture, and what they are drawn from, into a folder."""
     shown = Pictured.of(result, scene, survey, planning)
-    # Drawn from the file, as `lidarpool plot` does, so that both draw the same.
-    makers = picture_makers(shown, lambda: read_positions(folder / CLOUD, MOST_POINTS))
+    # The cloud is drawn from its file, as by `lidarpool plot`, so that both draw the same.
+    makers = picture_makers(shown, folder / CLOUD)
     return {
         **{f"{name}.png": draw for name, draw in makers.items()},
         PICTURE_FILE: shown.save,
@@ -176,9 +173,6 @@ def _publish(whole: Path, folder: Path) -> None:
         if (whole / name).exists():
             (folder / name).unlink(missing_ok=True)
     _flush(folder)
-    for name in PICTURES:
-        for drawn in _DRAWN_AGAIN:  # they would pass for this one's
-            (folder / drawn.format(name)).unlink(missing_ok=True)
     for name in FILES:
         if name not in files:  # a path of an earlier run would pass for this one's, too
             (folder / name).unlink(missing_ok=True)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from poolpart.wording import counted
 
 from ...plan import Plan, Trial
-from ...render.captions import without_common_prefix
+from ...render.page import without_common_prefix
 from ...render.stage import nice_step
 from .words import share
 

@@ -1,0 +1,156 @@
+"""The pictures of a scene: its objects, how densely it was hit, and the points of a cloud."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.colors import LogNorm, Normalize
+from numpy.typing import NDArray
+
+from poolpart.wording import counted
+
+from ..scene.scene import Scene
+from . import theme
+from .intensity import density_colours, density_range, hit_density
+from .page import Page, without_common_prefix
+from .shot import Shot
+
+Floats = NDArray[np.float64]
+
+MOST_POINTS = 1_000_000  # of a cloud are drawn; a picture has a few more pixels
+MOST_RAYS = 600
+TURBO = theme.mapped("turbo", np.linspace(0.07, 0.95, 256))  # its very ends are nearly black
+# An object that covers this much of the ground, and has the scene in it, is a floor or a hall.
+SURROUNDING = 0.6
+
+
+def draw_scene(path: Path, shot: Shot) -> None:
+    """Draw a scene, each object in its own colour, and the sensors.
+
+    Raises
+    ------
+    LidarpoolError
+        If the file cannot be written, as all functions here.
+    """
+    scene = shot.scene
+    colours = _object_colours(scene)
+    page = Page(shot.camera.size)
+    page.show(shot, shot.paint(colours[scene.face_object]))
+    page.legend(list(zip(without_common_prefix(scene.names), colours, strict=True)))
+    page.title(
+        "Scene", f"{counted(len(scene.names), 'object')} · {counted(len(scene.faces), 'triangle')}"
+    )
+    page.save(path)
+
+
+def draw_intensity(
+    path: Path, shot: Shot, hit_counts: NDArray[np.int64], sample_rays: NDArray[np.floating]
+) -> None:
+    """Draw a scene coloured by hits per square metre, with the sensors and sample rays.
+
+    Parameters
+    ----------
+    hit_counts
+        (f,) hits of each triangle.
+    sample_rays
+        (n, 2, 3) start and end of rays, metres, local coordinates; some of them are drawn.
+    """
+    density = hit_density(shot.scene, hit_counts)
+    low, high = density_range(density)
+    colours = density_colours(density, hit_counts > 0, (low, high), TURBO)
+    page = Page(shot.camera.size)
+    axes = page.show(shot, shot.paint(colours, 0.5))
+    some = np.linspace(0, len(sample_rays) - 1, min(len(sample_rays), MOST_RAYS)).astype(int)
+    page.lines(axes, shot, sample_rays[some].astype(np.float64), 0.45, 0.5)
+    if density.any():
+        page.colour_bar(TURBO, LogNorm(low, high), "hits per square metre")
+    else:
+        page.note(axes, "no ray hit the scene")
+    hits = counted(int(hit_counts.sum()), "hit")
+    page.title("Ray intensity", f"{hits} · {_positions(shot)} · grey: hit by no ray")
+    page.save(path)
+
+
+def draw_cloud(path: Path, shot: Shot, positions: Floats, count: int) -> None:
+    """Draw points of a cloud coloured by height, over the scene drawn pale.
+
+    Parameters
+    ----------
+    positions
+        (n, 3) metres, world coordinates; those that the scene hides are left out.
+    count
+        Points of the whole cloud, of which `positions` are a choice.
+    """
+    image = shot.paint(np.tile(theme.rgb(theme.CLAY), (len(shot.scene.faces), 1)), 0.55)
+    page = Page(shot.camera.size)
+    if len(positions):
+        low, high = np.percentile(positions[:, 2], [0.5, 99.5])  # strays are left out
+        high = max(high, low + 1e-3 * shot.stage.size)
+        share = np.clip((positions[:, 2] - low) / (high - low), 0, 1)
+        image = with_points(
+            image, shot, positions - shot.scene.origin, TURBO[(share * 255).astype(np.int64)]
+        )
+        page.colour_bar(TURBO, Normalize(low, high), "height z (m)")
+    axes = page.show(shot, image)
+    if not len(positions):
+        page.note(axes, "no points")
+    page.title("Point cloud", f"{counted(count, 'point')} · {_positions(shot)}")
+    page.save(path)
+
+
+def _positions(shot: Shot) -> str:
+    return counted(len(shot.sensors), "sensor position")
+
+
+def _object_colours(scene: Scene) -> Floats:
+    """Colours of a scene's objects, (objects, 3) in 0 to 1.
+
+    Floors and halls are grey, so that what stands in them is what one sees.
+    """
+    width = scene.object_bounds[:, 1] - scene.object_bounds[:, 0]
+    whole = np.maximum(scene.bounds[1] - scene.bounds[0], 1e-9)
+    share = np.where(np.isfinite(width), width, 0.0)[:, :2].prod(axis=1) / whole[:2].prod()
+    grey = (share >= SURROUNDING) & (len(scene.names) > 1)
+    colours = np.empty((len(scene.names), 3))
+    colours[~grey] = theme.object_colours(int((~grey).sum()))
+    steps = np.linspace(0, 0.22, max(int(grey.sum()), 1))[: int(grey.sum()), None]
+    colours[grey] = theme.rgb(theme.CLAY) * (1 - steps) + theme.rgb(theme.MUTED) * steps
+    return colours
+
+
+def with_points(
+    image: NDArray[np.float32], shot: Shot, points: Floats, colours: Floats
+) -> NDArray[np.float32]:
+    """Draw points (n, 3) as discs over an image, nearer ones over farther ones.
+
+    Only those are drawn that lie on what their pixel shows: points behind it are hidden, those
+    before it lie on a wall that was taken away. They have the light of what they lie on.
+    """
+    pixels, distance = shot.camera.project(points)
+    # Range noise up to one per cent of the scene's size is let pass.
+    slack = 0.01 * shot.stage.size + 2 * shot.camera.footprint(distance)
+    shown = np.zeros(len(points), np.bool_)
+    # A point at a silhouette may fall into the pixel beside the one that shows its surface.
+    for beside in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)):
+        depth = shot.camera.look_up(shot.depth, pixels + beside, np.inf)
+        shown |= np.abs(distance - depth) <= slack
+    order = np.flatnonzero(shown)
+    order = order[np.argsort(-distance[order])]
+    light = shot.camera.look_up(shot.whole.light.reshape(shot.depth.shape), pixels[order], 1.0)
+    shaded = np.round(255 * colours[order] * (0.5 + 0.5 * light)[:, None].clip(0, 1))
+    # Discs are drawn at twice the resolution and averaged down, so that their edges are smooth.
+    width, height = shot.camera.size
+    fine = np.round(255 * image).astype(np.uint8).repeat(2, axis=0).repeat(2, axis=1)
+    radius = max(min(320 / np.sqrt(len(points) + 1), 5.2) * width / 1600, 1.5)
+    reach = int(radius)
+    disc = [
+        (dx, dy)
+        for dy in range(-reach, reach + 1)
+        for dx in range(-reach, reach + 1)
+        if dx * dx + dy * dy <= radius * radius
+    ]
+    cells = (np.floor(2 * pixels[order])[:, None] + disc).astype(np.int64)
+    column, row = np.clip(cells, 0, (2 * width - 1, 2 * height - 1)).T
+    fine[row.T, column.T] = shaded[:, None]  # the last, which is nearest, stays
+    return fine.reshape(height, 2, width, 2, 3).mean(axis=(1, 3), dtype=np.float32) / 255
