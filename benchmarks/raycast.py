@@ -22,7 +22,6 @@ from typing import Any
 
 import numpy as np
 
-from . import raycast_moving
 from .raycast_engines import Cast, Engine
 from .raycast_peers import ENGINES
 from .raycast_scenes import Job, jobs
@@ -146,21 +145,6 @@ def environment(threads: int, clock: str) -> dict[str, Any]:
     }
 
 
-def moving(chosen: argparse.Namespace) -> int:
-    """Measure what poses cost; 2 where it cannot be measured."""
-    if reason := raycast_moving.missing():
-        print(f"Nothing was measured: {reason}", file=sys.stderr)
-        return 2
-    sizes = (2_000, 2_000, 2) if chosen.quick else (100_000, 115_200, 3 * chosen.rounds)
-    rows = raycast_moving.measure(*sizes, CLOCKS[chosen.clock])
-    for row in rows:
-        raycast_moving.show(row)
-    if chosen.json:
-        report = {"environment": environment(1, chosen.clock), "moving": rows}
-        chosen.json.write_text(json.dumps(report, indent=1) + "\n")
-    return 0
-
-
 def _processor() -> str:
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
@@ -183,14 +167,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--threads", type=int, default=1, help="CPU threads of those that can")
     parser.add_argument("--clock", choices=CLOCKS, default="wall")
     parser.add_argument("--without", action="append", default=[], help="leave this engine out")
-    parser.add_argument(
-        "--moving", action="store_true", help="only what poses cost, see raycast_moving.py"
-    )
     parser.add_argument("--json", type=Path, help="write the results here")
     chosen = parser.parse_args(arguments)
     quick = chosen.quick
-    if chosen.moving:
-        return moving(chosen)
     makers = jobs(2_000 if quick else chosen.rays, chosen.mesh, quick, chosen.large)
     unknown = set(chosen.scene or ()) - set(makers)
     if unknown:

@@ -1,7 +1,7 @@
-"""What poses cost: scans of a still and of a moving lidar, beside Embree's bare cast.
+"""What poses cost: `python -m benchmarks.raycast_moving`.
 
-`python -m benchmarks.raycast --moving` runs it. Three things are timed in turns, for lidars of
-several numbers of beams, each with the same rays and one thread:
+Three things are timed in turns, for lidars of several numbers of beams, each with the same rays
+and one thread:
 
 - bare: directions rotated in float32 by BLAS, into an array made before, and Open3D's cast_rays;
 - still: `RayCaster.scan` from one pose with a rotation, of whose hits every fifth is kept;
@@ -10,7 +10,11 @@ several numbers of beams, each with the same rays and one thread:
 
 from __future__ import annotations
 
+import argparse
+import json
+import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,6 +25,7 @@ from raybeam.embree_backend import EmbreeBackend
 from raybeam.mesh import local_mesh
 
 from .cuda_scenes import city
+from .raycast import CLOCKS, environment
 
 Float = NDArray[np.float64]
 
@@ -141,6 +146,26 @@ def show(row: dict[str, Any]) -> None:
     )
 
 
-def missing() -> str:
-    """Why it cannot run here; "" when it can."""
-    return available_backends()["embree"]
+def main(arguments: list[str] | None = None) -> int:
+    """Run from the command line; 2 where Embree is not there."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--quick", action="store_true", help="toy sizes, two rounds")
+    parser.add_argument("--rounds", type=int, default=21)
+    parser.add_argument("--clock", choices=CLOCKS, default="wall")
+    parser.add_argument("--json", type=Path, help="write the results here")
+    chosen = parser.parse_args(arguments)
+    if reason := available_backends()["embree"]:
+        print(f"Nothing was measured: {reason}", file=sys.stderr)
+        return 2
+    sizes = (2_000, 2_000, 2) if chosen.quick else (100_000, 115_200, chosen.rounds)
+    rows = measure(*sizes, CLOCKS[chosen.clock])
+    for row in rows:
+        show(row)
+    if chosen.json:
+        report = {"environment": environment(1, chosen.clock), "moving": rows}
+        chosen.json.write_text(json.dumps(report, indent=1) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -73,33 +73,3 @@ def test_shuffled_rays_are_the_same_rays(engine):
     found = engine(1).prepare(job)()
     assert 0 < found < job.rays
     assert engine(1).prepare(job.shuffled())() == found
-
-
-def row(**rates):
-    """One row of a report; names that start with `peer` are peers."""
-    return {
-        "engines": {
-            name: {"peer": name.startswith("peer"), "ours": False, "mrays_s": values}
-            for name, values in rates.items()
-        }
-    }
-
-
-def test_ratios_are_within_rounds():
-    """A machine that is slow for a round is slow for both."""
-    made = row(a=[10, 1, 10, 12], peer_b=[5, 0.5, 5, 6], peer_c=[1, 1, 1, 1])
-    assert raycast.ratio(made, "a", "peer_b") == 2
-    assert raycast.best_peer(made) == "peer_b"
-    assert raycast.best_peer(row(a=[1])) is None
-
-
-def test_ten_million_triangles_only_when_asked_for():
-    usual, large = (list(jobs(2_000, [], quick=False, large=large)) for large in (False, True))
-    assert usual == ["survey", "city-1e5", "city-1e6", "terrain-2e6"]
-    assert set(large) - set(usual) == {"city-1e7"}
-
-
-def test_unknown_scene(capsys):
-    with pytest.raises(SystemExit):
-        raycast.main(["--quick", "--scene", "moon"])
-    assert "there is no scene moon: survey, city-2e3, terrain-2e3" in capsys.readouterr().err

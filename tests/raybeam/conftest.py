@@ -16,21 +16,13 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from benchmarks.cuda_scenes import grid_faces
 
 from raybeam import RayCaster, available_backends, cuda_backend, cuda_build, registry
 from raybeam.cuda_backend import CudaBackend
 
 HERE = Path(__file__).parent
 STACK = 256
-
-
-def pytest_collection_modifyitems(config, items):
-    """Leave out slow tests unless markers are chosen on the command line."""
-    if config.option.markexpr:
-        return
-    for item in items:
-        if item.path.is_relative_to(HERE) and item.get_closest_marker("slow"):
-            item.add_marker(pytest.mark.skip(reason="slow: run with -m slow"))
 
 
 class Array(np.ndarray):
@@ -194,24 +186,36 @@ def source_backend(tmp_path_factory):
     return SourceBackend
 
 
-@pytest.fixture(params=["numpy", "source", "embree", pytest.param("cuda", marks=pytest.mark.gpu)])
-def backend(request, monkeypatch):
-    """Name of a backend that can be used here, for ``RayCaster(..., backend=backend)``."""
-    name = request.param
+CUDA = pytest.param("cuda", marks=pytest.mark.gpu)
+
+
+def usable(name, request):
+    """Make a backend known to `RayCaster` for a test; skips where it cannot be used."""
     if name == "source":
         made = request.getfixturevalue("source_backend")
-        monkeypatch.setattr(registry, "_BACKENDS", (*registry._BACKENDS, made))
+        patch = request.getfixturevalue("monkeypatch")
+        patch.setattr(registry, "_BACKENDS", (*registry._BACKENDS, made))
     elif reason := available_backends()[name]:
         pytest.skip(f"{name}: {reason}")
     return name
 
 
-@pytest.fixture
-def exact_backend(backend):
-    """A backend that decides in float64: all but embree."""
-    if backend == "embree":
-        pytest.skip("embree decides in float32")
-    return backend
+@pytest.fixture(params=["numpy", "source", "embree", CUDA])
+def backend(request):
+    """Name of a backend that can be used here, for ``RayCaster(..., backend=backend)``."""
+    return usable(request.param, request)
+
+
+@pytest.fixture(params=["source", CUDA])
+def kernels(request):
+    """Name of a backend whose rays intersect.cu casts."""
+    return usable(request.param, request)
+
+
+@pytest.fixture(params=["numpy", "source", CUDA])
+def exact_backend(request):
+    """Name of a backend that decides in float64: all but embree."""
+    return usable(request.param, request)
 
 
 @pytest.fixture
@@ -224,15 +228,6 @@ def caster(backend):
 def exact_caster(exact_backend):
     """Make a `RayCaster` with the backend under test, when it decides in float64."""
     return lambda vertices, faces, **more: RayCaster(vertices, faces, exact_backend, **more)
-
-
-def _grid_faces(rows, columns, closed):
-    """Two triangles for each cell of a grid of vertices; `closed` joins the last column on."""
-    i = np.arange(rows - 1)[:, None] * columns
-    j = np.arange(columns if closed else columns - 1)[None, :]
-    k = (j + 1) % columns
-    quad = np.stack(np.broadcast_arrays(i + j, i + k, i + columns + k, i + columns + j), axis=-1)
-    return np.concatenate([quad[..., [0, 1, 2]], quad[..., [0, 2, 3]]]).reshape(-1, 3)
 
 
 def _cube():
@@ -250,7 +245,7 @@ def _sphere(rows=40, columns=60, radius=1.0):
     ring = np.sin(polar)
     ring[[0, -1]] = 0
     points = np.broadcast_arrays(ring * np.cos(around), ring * np.sin(around), np.cos(polar))
-    return radius * np.stack(points, axis=-1).reshape(-1, 3), _grid_faces(rows, columns, True)
+    return radius * np.stack(points, axis=-1).reshape(-1, 3), grid_faces(rows, columns, wrap=True)
 
 
 def _vase(rows=80, columns=80):
@@ -269,7 +264,7 @@ def _terrain_box(cells=60):
     points = ground.reshape(-1, 3)
     lid = points * [1, 1, 0] + [0, 0, 1]
     n = cells + 1
-    faces = _grid_faces(n, n, False)
+    faces = grid_faces(n, n)
     rim = np.concatenate([
         np.arange(n), np.arange(1, n) * n + n - 1,
         (n - 1) * n + np.arange(n - 2, -1, -1), np.arange(n - 2, 0, -1) * n,

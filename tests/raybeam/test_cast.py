@@ -65,7 +65,7 @@ def test_agrees_with_brute_force(caster, backend, shapes, kind, offset):
     vertices, faces = shapes["soup"](kind)
     vertices = vertices + offset
     rng = np.random.default_rng(1)
-    n = 400
+    n = 200
     origins = rng.uniform(-60, 60, (n, 3)) + offset
     weights = rng.dirichlet([1, 1, 1], n)  # most rays are aimed at a triangle
     targets = (vertices[faces[rng.integers(len(faces), size=n)]] * weights[..., None]).sum(axis=1)
@@ -79,26 +79,10 @@ def test_agrees_with_brute_force(caster, backend, shapes, kind, offset):
         assert sure > 0.8 * n  # else the comparison says little
 
 
-def test_sphere_is_hit_where_it_is(caster, shapes):
-    rows, columns = 200, 300
-    vertices, faces = shapes["sphere"](rows, columns)
-    rng = np.random.default_rng(2)
-    directions = rng.normal(size=(5000, 3))
-    hits = caster(vertices + np.array([7, 8, 9]), faces).cast([7.1, 8.2, 9.3], directions)
-    # A chord between neighbours is at most 1 - cos(step / 2) inside the sphere.
-    sag = 1 - np.cos(2 * np.pi / columns) ** 2
-    points = np.array([0.1, 0.2, 0.3]) + hits.distance[:, None] * (
-        directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    )
-    radius = np.linalg.norm(points, axis=1)
-    assert (radius < 1 + 1e-9).all()
-    assert (radius > 1 - sag).all()
-
-
 def test_cube_from_inside_and_outside(caster, shapes):
     cube = caster(*shapes["cube"]())
     axes = np.concatenate([np.eye(3), -np.eye(3)])
-    inside = cube.cast([0.25, 0.5, -0.5], axes)
+    inside = cube.cast([0.25, 0.5, -0.5], axes)  # on the backs of its triangles
     np.testing.assert_allclose(inside.distance, [0.75, 0.5, 1.5, 1.25, 1.5, 0.5], rtol=1e-15)
     outside = cube.cast(10 * axes + [0.1, 0.2, 0.3], -axes)
     np.testing.assert_allclose(outside.distance, [9.1, 9.2, 9.3, 8.9, 8.8, 8.7], rtol=1e-14)
@@ -131,13 +115,6 @@ def test_length_of_direction_does_not_matter(caster, shapes):
         np.testing.assert_allclose(got.distance, want.distance, rtol=1e-12)
 
 
-def test_both_faces_count(caster):
-    hits = caster(*TRIANGLE).cast([[1, 1, 2], [1, 1, -2]], [[0, 0, -1], [0, 0, 1]])
-    np.testing.assert_array_equal(hits.distance, 2)
-    np.testing.assert_allclose(hits.u, 0.25)
-    np.testing.assert_allclose(hits.v, 0.25)
-
-
 def test_limits_count_on_both_ends(exact_caster, shapes):
     cube = exact_caster(*shapes["cube"]())
     ray = [-4, 0.25, 0.5], [[1, 0, 0]]
@@ -148,15 +125,6 @@ def test_limits_count_on_both_ends(exact_caster, shapes):
     assert cube.cast(*ray, t_max=3).distance == 3
     assert not cube.cast(*ray, t_max=np.nextafter(3, 0)).hit
     assert not cube.cast(*ray, t_min=3.5, t_max=4.5).hit
-
-
-def test_limits_within_rounding(caster, shapes):
-    cube = caster(*shapes["cube"]())
-    ray = [-4, 0.25, 0.5], [[1, 0, 0]]
-    assert cube.cast(*ray, t_min=2.999).distance == pytest.approx(3)
-    assert cube.cast(*ray, t_min=3.001).distance == pytest.approx(5)
-    assert cube.cast(*ray, t_max=3.001).distance == pytest.approx(3)
-    assert not cube.cast(*ray, t_min=3.001, t_max=4.999).hit
 
 
 def test_limits_agree_with_brute_force(caster, backend, shapes):
@@ -176,11 +144,6 @@ def test_start_on_a_surface(exact_caster, shapes):
     assert cube.cast(start, [[1, 0, 0]]).distance == 0
     assert cube.cast(start, [[-1, 0, 0]], t_min=1e-9).distance == 2
     assert not cube.cast(start, [[1, 0, 0]], t_min=1e-9).hit
-
-
-def test_start_on_a_surface_within_rounding(caster, shapes):
-    hits = caster(*shapes["cube"]()).cast([1, 0.25, 0.5], [[-1, 0, 0]], t_min=1e-4)
-    assert hits.distance == pytest.approx(2)
 
 
 @pytest.mark.parametrize("t_min", [0.0, 1.0])
@@ -300,25 +263,14 @@ def test_any_unit_of_length(exact_caster, shapes, size):
     np.testing.assert_allclose(got.distance / size, want.distance, rtol=1e-12)
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 5])
-def test_few_triangles(caster, count):
-    vertices = np.concatenate([np.array([[0, 0, k], [1, 0, k], [0, 1, k]]) for k in range(count)])
-    hits = caster(vertices, np.arange(3 * count).reshape(-1, 3)).cast(
-        [[0.2, 0.2, -1], [0.2, 0.2, 9]], [[0, 0, 1], [0, 0, -1]]
-    )
-    np.testing.assert_allclose(hits.distance, [1, 10 - count])
-    assert hits.triangle.tolist() == [0, count - 1]
-
-
 def test_types_of_input(caster):
     vertices, faces = TRIANGLE
-    for real in (np.float16, np.float32, np.float64, np.int32):
-        for whole in (np.int8, np.uint32, np.int64):
-            hits = caster(vertices.astype(real), faces.astype(whole)).cast(
-                np.array([1, 1, 2], real), np.array([[0, 0, -1]], real)
-            )
-            assert hits.distance == 2
-            assert hits.distance.dtype == np.float64
-            assert hits.triangle.dtype == np.int32
+    for real, whole in ((np.float16, np.int8), (np.float32, np.uint32), (np.int32, np.int64)):
+        hits = caster(vertices.astype(real), faces.astype(whole)).cast(
+            np.array([1, 1, 2], real), np.array([[0, 0, -1]], real)
+        )
+        assert (hits.distance, hits.u, hits.v) == (2, 0.25, 0.25)
+        assert hits.distance.dtype == np.float64
+        assert hits.triangle.dtype == np.int32
     hits = RayCaster(vertices.tolist(), faces.tolist(), "numpy").cast([1, 1, 2], [0, 0, -1])
     assert hits.distance.shape == (1,)

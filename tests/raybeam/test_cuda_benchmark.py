@@ -9,36 +9,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from benchmarks import cuda_kernel, cuda_limits, cuda_scenes, cuda_warp
+from benchmarks import cuda_kernel, cuda_limits
 
-from raybeam import RayCaster, available_backends
-
-
-@pytest.mark.parametrize("triangles", [500, 20_000])
-def test_city(triangles):
-    vertices, faces = cuda_scenes.city(triangles)
-    assert 0.5 < len(faces) / triangles < 1.5
-    np.testing.assert_array_equal(cuda_scenes.city(triangles)[0], vertices)
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    assert low[2] == 0
-    rng = np.random.default_rng(0)
-    above = rng.uniform(low + 0.01, high - 0.01, (500, 3)) * [1, 1, 0] + [0, 0, high[2] + 1]
-    down = RayCaster(vertices, faces, "numpy").cast(above, np.tile([0, 0, -1], (500, 1)))
-    assert down.hit.all()
-    assert 0.1 < (down.distance < high[2]).mean() < 0.9  # roofs, and streets between them
-
-
-def test_six_objects_are_closed():
-    vertices, faces = cuda_scenes.six_objects()
-    directions = np.random.default_rng(1).normal(size=(2000, 3))
-    assert RayCaster(vertices, faces, "numpy").cast([5, 5, 1], directions).hit.all()
-    assert len(faces) == 6 * 79 * 80 * 2
-
-
-def test_revolution():
-    directions = cuda_scenes.revolution(1280, layers=128)
-    assert directions.shape == (1280, 3)
-    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1)
+from raybeam import available_backends
 
 
 def test_says_so_without_a_device(capsys):
@@ -94,15 +67,3 @@ def test_runs_at_toy_size(source_backend, monkeypatch, tmp_path, capsys):
         assert row["coherent"]["hit_share"] == row["shuffled"]["hit_share"] > 0
         assert row["differences"]["hits"] > 0
     assert "differences from numpy: none" in capsys.readouterr().out
-
-
-def test_warp_casts_the_same_rays():
-    """On the CPU, where Warp falls back to its own builder: the hits must be the same."""
-    pytest.importorskip("warp", reason="Warp is not installed")
-    mesh, origin = cuda_scenes.city(2000), np.array([10.0, 10.0, 2.0])
-    directions = cuda_scenes.revolution(1280)
-    hits = int(RayCaster(*mesh, backend="numpy").cast(origin, directions).hit.sum())
-    rows = cuda_warp.casts(mesh, origin, {"coherent": directions}, 1, device="cpu")
-    assert rows
-    assert all(abs(row["coherent"]["hits"] - hits) <= 3 for row in rows)
-    assert cuda_warp.best(rows, "coherent") > 0

@@ -8,13 +8,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from raybeam import Pattern, RayCaster, cuda_backend, cuda_build, ploc
+from raybeam import Pattern, cuda_backend, cuda_build, ploc
+from raybeam.cuda_backend import CudaBackend
 from raybeam.layout import lay_out
 from raybeam.mesh import local_mesh
 from raybeam.scan import check_scan
 
 pytest.importorskip("hypothesis")
-from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import HealthCheck, given, reject, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -29,15 +30,10 @@ fine = st.integers(1, 40).flatmap(
 )
 
 
-@pytest.fixture(params=["source", pytest.param("cuda", marks=pytest.mark.gpu)])
-def built(request):
+@pytest.fixture
+def built(kernels, source_backend):
     """Build a mesh with build.cu: arrays by name."""
-    if request.param == "source":
-        library = request.getfixturevalue("source_backend")._library()
-    else:
-        library = pytest.importorskip("cupy", reason="CuPy is not installed")
-        if not library.is_available():
-            pytest.skip("there is no CUDA device")
+    library = source_backend._library() if kernels == "source" else CudaBackend._library()
 
     def build(mesh):
         tables = cuda_build.build(library, 0, mesh)
@@ -58,7 +54,9 @@ def assert_same_as_numpy(built, mesh):
 
 @pytest.mark.parametrize("name", ["cube", "sphere", "vase", "terrain box"])
 def test_shapes(built, shapes, name):
-    assert_same_as_numpy(built, local_mesh(*shapes[name]()))
+    points, faces = shapes[name]()
+    for offset in (0, np.array([5e5, 4e6, 100])):
+        assert_same_as_numpy(built, local_mesh(points + offset, faces))
 
 
 @pytest.mark.parametrize("kind", ["random", "sliver", "huge", "tiny"])
@@ -73,11 +71,6 @@ def test_with_any_number_of_clusters_left_to_the_host(built, shapes, monkeypatch
     monkeypatch.setattr(ploc, "_ENOUGH", left)
     assert_same_as_numpy(built, local_mesh(*shapes["soup"]("random", count=3000)))
     assert_same_as_numpy(built, local_mesh(*shapes["vase"]()))
-
-
-def test_far_away_and_many(built, shapes):
-    points, faces = shapes["vase"](150, 150)
-    assert_same_as_numpy(built, local_mesh(points + np.array([5e5, 4e6, 100]), faces))
 
 
 @pytest.mark.parametrize("copies", [2, 5, 64, 1000])
@@ -103,15 +96,11 @@ def test_chain_of_ever_better_partners(built):
 )
 @given(points=st.one_of(coarse, fine))
 def test_any_triangles(built, points):
-    a, b, c = points.reshape(-1, 3, 3).transpose(1, 0, 2)
-    assume(np.cross(b - a, c - a).any())
-    assert_same_as_numpy(built, local_mesh(points, np.arange(len(points)).reshape(-1, 3)))
-
-
-def test_same_on_every_run(built, shapes):
-    mesh = local_mesh(*shapes["soup"]("random", count=3000))
-    one, other = built(mesh), built(mesh)
-    assert all(one[name].tobytes() == other[name].tobytes() for name in TABLES)
+    try:
+        mesh = local_mesh(points, np.arange(len(points)).reshape(-1, 3))
+    except ValueError:  # no triangle has an area
+        reject()
+    assert_same_as_numpy(built, mesh)
 
 
 @pytest.mark.parametrize(("triangles", "called"), [(3, 0), (12, 1)])
@@ -132,20 +121,6 @@ def test_host_builds_where_only_the_tables_fit(source_backend, shapes, monkeypat
     monkeypatch.setattr(runtime, "memGetInfo", lambda: (need, 1 << 35))
     monkeypatch.setattr(cuda_build, "build", None)
     assert len(source_backend(mesh)._faces) == len(mesh.corners)
-
-
-def test_casts_do_not_depend_on_who_builds(source_backend, shapes, monkeypatch):
-    mesh = shapes["soup"]("random", count=2000)
-    directions = np.random.default_rng(0).normal(size=(3000, 3))
-    want = RayCaster(*mesh, backend="numpy").cast([0, 0, 0], directions)
-    local = local_mesh(*mesh)
-    from raybeam.rays import check_rays
-
-    for least in (1, 10_000):
-        monkeypatch.setattr(source_backend, "device_build", least)
-        got = source_backend(local).cast(check_rays([0, 0, 0], directions, 0, np.inf))
-        np.testing.assert_array_equal(got.distance, want.distance)
-        np.testing.assert_array_equal(got.triangle, want.triangle)
 
 
 @pytest.mark.parametrize("least", [1, 1 << 20], ids=["device builds", "host builds"])

@@ -12,7 +12,8 @@ import pytest
 from raybeam import cuda_backend, cuda_build
 from raybeam.cuda_module import source
 
-CARDS = [75, 80, 86, 89, 90, 100, 120]
+# The oldest and the newest in the fast tests.
+CARDS = [75, 120, *(pytest.param(card, marks=pytest.mark.slow) for card in (80, 86, 89, 90, 100))]
 AS_CUPY = "-ftz=true"  # what it adds of itself
 FLAGS = {
     "intersect.cu": (*cuda_backend.flags(64), AS_CUPY),

@@ -10,21 +10,12 @@ from raybeam import RayCaster
 SHEETS = [0.0, 1e-300, 1e-12, 1e-9, 1e-7, 3e-7, 1e-6, 4e-6, 1e-5, 1e-3]
 
 
-@pytest.fixture(params=["source", pytest.param("cuda", marks=pytest.mark.gpu)])
-def same_as_numpy(request, monkeypatch):
+@pytest.fixture
+def same_as_numpy(kernels):
     """Cast with the kernels and with NumPy; all bits must be equal. Returns the hits."""
-    if request.param == "source":
-        from raybeam import registry
-
-        made = request.getfixturevalue("source_backend")
-        monkeypatch.setattr(registry, "_BACKENDS", (*registry._BACKENDS, made))
-    elif not pytest.importorskip("cupy", reason="CuPy is not installed").is_available():
-        pytest.skip("there is no CUDA device")
 
     def cast(mesh, *rays):
-        want, got = (
-            RayCaster(*mesh, backend=name).cast(*rays) for name in ("numpy", request.param)
-        )
+        want, got = (RayCaster(*mesh, backend=name).cast(*rays) for name in ("numpy", kernels))
         for name in ("triangle", "distance", "u", "v"):
             np.testing.assert_array_equal(getattr(got, name), getattr(want, name), err_msg=name)
         return want
@@ -53,18 +44,17 @@ def rays_down(count, tilt, seed=0):
     return origins, np.column_stack([tilt * rng.normal(size=(count, 2)), np.full(count, -1.0)])
 
 
-@pytest.mark.parametrize("tilt", [0.0, 0.3])
-@pytest.mark.parametrize("slope", [0.0, 30.0])
 @pytest.mark.parametrize("gap", SHEETS)
-def test_sheets_close_together(same_as_numpy, gap, slope, tilt):
-    hits = same_as_numpy(sheets([gap] * 12, slope), *rays_down(400, tilt))
-    assert hits.hit.sum() > 100
+def test_sheets_close_together(same_as_numpy, gap):
+    for slope, tilt in ((0.0, 0.0), (0.0, 0.3), (30.0, 0.0), (30.0, 0.3)):
+        hits = same_as_numpy(sheets([gap] * 12, slope), *rays_down(400, tilt))
+        assert hits.hit.sum() > 100
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_sheets_at_all_distances(same_as_numpy, seed):
-    gaps = np.random.default_rng(seed).permutation(SHEETS * 3)
-    same_as_numpy(sheets(gaps), *rays_down(600, 0.2, seed))
+def test_sheets_at_all_distances(same_as_numpy):
+    for seed in range(3):
+        gaps = np.random.default_rng(seed).permutation(SHEETS * 3)
+        same_as_numpy(sheets(gaps), *rays_down(600, 0.2, seed))
 
 
 def test_limits_at_the_surfaces(same_as_numpy):
@@ -92,22 +82,6 @@ def test_grazing_rays(same_as_numpy):
         [np.ones(800), 0.1 * rng.normal(size=800), -rng.choice([1e-9, 1e-7, 1e-5, 1e-3], 800)]
     )
     same_as_numpy(sheets([0.0, 1e-7, 1e-6, 1e-4]), origins, directions)
-
-
-def test_rays_from_far_away(same_as_numpy):
-    rng = np.random.default_rng(4)
-    directions = rng.normal(size=(600, 3))
-    targets = np.column_stack([rng.uniform(-1, 1, (600, 2)), np.zeros(600)])
-    same_as_numpy(sheets([0.0, 1e-6, 1e-3], slope=0.2), targets - 1e5 * directions, directions)
-
-
-def test_soups_with_limits(same_as_numpy, shapes):
-    rng = np.random.default_rng(5)
-    for kind in ("random", "sliver", "huge", "tiny"):
-        mesh = shapes["soup"](kind, count=500)
-        middles = mesh[0].reshape(-1, 3, 3).mean(axis=1)
-        origins = rng.uniform(-25, 25, (500, 3))
-        same_as_numpy(mesh, origins, middles - origins, 3.0, 40.0)
 
 
 @pytest.mark.parametrize("power", range(14, 24))

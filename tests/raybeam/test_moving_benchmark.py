@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-import time
+import json
 
 import numpy as np
 import pytest
 from benchmarks import raycast_moving
 
+from raybeam import available_backends
 
-def test_all_numbers_of_beams(capsys):
-    if reason := raycast_moving.missing():
-        pytest.skip(reason)
-    rows = raycast_moving.measure(2_000, 2_000, 2, time.perf_counter)
+
+def test_all_numbers_of_beams(tmp_path, capsys):
+    if reason := available_backends()["embree"]:
+        pytest.skip(f"embree: {reason}")
+    out = tmp_path / "out.json"
+    assert raycast_moving.main(["--quick", "--json", str(out)]) == 0
+    rows = json.loads(out.read_text())["moving"]
     assert [row["beams"] for row in rows] == [40, 40, 64, 64, 128, 128]
     for row in rows:
-        raycast_moving.show(row)
         assert row["hit_share"] > 0.1
         assert all(len(seconds) == 2 for seconds in row["seconds"].values())
         assert row["still_to_bare"] > 0
