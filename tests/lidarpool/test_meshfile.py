@@ -141,10 +141,10 @@ def test_a_wall_keeps_its_door_open(tmp_path, suffix):
 
 def test_solids_without_names_are_called_as_their_file(tmp_path):
     text = trimesh.creation.box().export(file_type="stl_ascii")
-    path = write(
-        tmp_path / "part.stl", f"\ufeff{text}\n{text}\n{text.replace('solid', 'solid lid')}"
-    )
-    assert Scene.load(path).names == ("part", "part.2", "lid")
+    text = f"\ufeff{text}\n{text}\n{text.replace('solid', 'solid lid')}"
+    for ends in ("\n", "\r\n", "\r"):
+        path = write(tmp_path / "part.stl", text.replace("\n", ends))
+        assert Scene.load(path).names == ("part", "part.2", "lid")
 
 
 def test_a_binary_stl_with_a_few_bytes_more_or_a_wrong_number(tmp_path):
@@ -161,21 +161,13 @@ def test_a_binary_stl_with_a_few_bytes_more_or_a_wrong_number(tmp_path):
     ("content", "message"),
     [
         (gzip.compress(b"v 0 0 0\n", mtime=0), "is packed"),
-        (b"PK\3\4", "is a ZIP archive"),
-        (b"<!DOCTYPE html>", "is a page of the web"),
+        (b"\n<!DOCTYPE html>", "is a page of the web"),
         (b"version https://git-lfs.github.com/spec/v1\n", "git lfs pull"),
-        (b"glTF\2\0\0\0", "is a .glb file"),
-        (PLY.encode(), "is a .ply file"),
-        (b"solid a\n facet normal 0 0 1\n", "is a .stl file"),
-        (b"OFF 3 1 0\n", "is a .off file"),
-        (b'<?xml version="1.0"?><COLLADA>', "is a .dae file"),
-        (b'{"asset": {"version": "2.0"}}', "is a .gltf file"),
     ],
 )
-def test_a_file_of_another_kind_is_recognised(tmp_path, content, message):
-    for suffix in (".obj", ".stl" if ".stl" not in message else ".dae"):
-        with pytest.raises(LidarpoolError, match=message):
-            load_meshes(write(tmp_path / f"m{suffix}", content))
+def test_what_is_no_mesh_is_recognised(tmp_path, content, message):
+    with pytest.raises(LidarpoolError, match=message):
+        load_meshes(write(tmp_path / "m.obj", content))
 
 
 def test_a_scene_farther_than_anything_on_earth(tmp_path):

@@ -301,6 +301,30 @@ def test_a_broken_mesh_is_named(scenario, tmp_path):
         scenario("scene: m.stl").build_scene()
 
 
+def test_the_folder_of_a_user_who_is_not_known(scenario):
+    with pytest.raises(LidarpoolError, match=r"'~nosuchuser/x\.stl' has no place"):
+        scenario('scene: {files: ["~nosuchuser/x.stl"]}').build_scene()
+
+
+def test_what_is_left_out_of_a_scene_is_in_the_advice(scenario, tmp_path):
+    nodes = "".join(
+        f'<node name="N{i}">{"<scale>0 0 0</scale>" * i}<instance_geometry url="#g"/></node>'
+        for i in (0, 1)
+    )
+    (tmp_path / "m.dae").write_text(
+        '<COLLADA><library_geometries><geometry id="g"><mesh><source id="p"><float_array id="a">'
+        '0 0 0 1 0 0 0 1 0</float_array><technique_common><accessor source="#a" count="3" '
+        'stride="3"/></technique_common></source><vertices id="v"><input semantic="POSITION" '
+        'source="#p"/></vertices><triangles><input semantic="VERTEX" source="#v"/><p>0 1 2</p>'
+        "</triangles></mesh></geometry></library_geometries><library_visual_scenes><visual_scene>"
+        f"{nodes}</visual_scene></library_visual_scenes></COLLADA>"
+    )
+    read = scenario("scene: m.dae")
+    scene = read.build_scene()
+    assert scene.names == ("N0",)
+    assert "m.dae scales N1 to nothing: left out" in read.advice(scene)[0]
+
+
 YAML_VALUES = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
     lambda inner: (

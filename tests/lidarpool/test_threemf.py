@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from lidarpool.base.errors import LidarpoolError
-from lidarpool.scene import threemf
 from lidarpool.scene.meshfile import load_meshes
 
 MODEL = (
@@ -149,9 +148,3 @@ AMPLE = "".join(
 def test_what_cannot_be_read_says_what_it_is(tmp_path, parts, message):
     with pytest.raises(LidarpoolError, match=message):
         load(tmp_path, **parts)
-
-
-def test_an_archive_that_grows_out_of_proportion(tmp_path, monkeypatch):
-    monkeypatch.setattr(threemf, "_LEAST_LIMIT", 2**16)
-    with pytest.raises(LidarpoolError, match="out of all proportion"):
-        load(tmp_path, {"pad": bytes(10**6)}.items())

@@ -27,11 +27,6 @@ def test_matrix():
     np.testing.assert_array_equal(Transform.from_matrix(matrix).apply(np.ones((1, 3))), [[5, 7, 9]])
 
 
-def test_mirrors():
-    assert Transform.place(scale=(-1, 1, 1)).mirrors
-    assert not Transform.place(scale=(-1, -1, 1)).mirrors
-
-
 @pytest.mark.parametrize(
     ("make", "message"),
     [

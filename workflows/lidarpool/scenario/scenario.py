@@ -16,7 +16,7 @@ from ..base.words import did_you_mean
 from ..plan import Planning
 from ..scene.floor import floor_under
 from ..scene.mesh import Mesh
-from ..scene.meshfile import SUFFIXES, UNITLESS, read_mesh_file
+from ..scene.meshfile import SUFFIXES, UNITLESS, load_meshes
 from ..scene.scene import Scene
 from ..scene.shapes import seed_objects
 from ..sensor import Pose, Survey
@@ -266,18 +266,20 @@ class Scenario(Section):
                 seed=section.seed,
             )
 
-    def _read(self, entry: MeshFile) -> list[Mesh]:
+    def _read(self, entry: MeshFile) -> tuple[Mesh, ...]:
         with self._named():
             try:
                 path = self._folder / Path(entry.file).expanduser()
             except RuntimeError as error:  # of a user who is not known
                 raise LidarpoolError(f"the file {entry.file!r} has no place: {error}") from error
             transform = entry.transform()
-        content = read_mesh_file(path, unit=entry.unit, up_axis=entry.up_axis, transform=transform)
-        if content.skipped:
-            names = ", ".join(content.skipped[:3]) + ", …" * (len(content.skipped) > 3)
-            self._notes.append(f"{entry.file} scales {names} to nothing: left out")
-        return content.meshes
+        return load_meshes(
+            path,
+            unit=entry.unit,
+            up_axis=entry.up_axis,
+            transform=transform,
+            tell=self._notes.append,
+        )
 
     def _world_poses(
         self, scene: Scene

@@ -132,17 +132,18 @@ class _Reader:
     def node(self, index: int) -> Node[int]:
         """Node `index`; one without a name is called as its mesh."""
         found = self._header["nodes"][_natural(index)]
-        mesh = found.get("mesh")
-        name = str(found.get("name") or "")
-        if mesh is None:
-            return Node(name, _matrix(found), children=found.get("children", ()))
+        name, children = str(found.get("name") or ""), found.get("children", ())
+        if "mesh" not in found:
+            return Node(name, _matrix(found), children=children)
+        mesh = found["mesh"]
         name = name or str(self._header["meshes"][mesh].get("name") or "")
-        return Node(name, _matrix(found), lambda: self._mesh(mesh), found.get("children", ()))
+        return Node(name, _matrix(found), lambda: self._mesh(mesh), children)
 
     def _read_mesh(self, index: int) -> list[Mesh]:
         """One mesh of all primitives, which differ by material only."""
-        primitives = self._header["meshes"][_natural(index)]["primitives"]
-        return joined("", (self._primitive(p) for p in primitives if p.get("mode", 4) >= 4))
+        mesh = self._header["meshes"][_natural(index)]
+        surfaces = [p for p in mesh["primitives"] if p.get("mode", 4) >= 4]
+        return joined(str(mesh.get("name") or self._path.stem), map(self._primitive, surfaces))
 
     def _primitive(self, primitive: dict[str, Any]) -> tuple[NDArray[Any], NDArray[np.int64]]:
         """Vertices (v, 3) and faces (f, 3)."""

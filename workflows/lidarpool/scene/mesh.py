@@ -17,7 +17,7 @@ class Mesh:
     Parameters
     ----------
     name
-        What the object is called; never empty.
+        What the object is called.
     vertices
         float64 (v, 3), metres, Z-up, finite.
     faces
@@ -50,6 +50,11 @@ class Mesh:
                 f"there are {len(self.vertices)}, counted from 0."
             )
         object.__setattr__(self, "faces", np.ascontiguousarray(faces, dtype=np.int64))
+
+    def moved(self, name: str, linear: NDArray[np.float64], offset: NDArray[np.float64]) -> Mesh:
+        """Return it under a name and at p -> linear @ p + offset, its faces facing outward."""
+        faces = self.faces[:, ::-1] if np.linalg.det(linear) < 0 else self.faces
+        return Mesh(name, self.vertices @ linear.T + offset, faces)
 
 
 def points_array(name: str, points: ArrayLike) -> NDArray[np.float64]:

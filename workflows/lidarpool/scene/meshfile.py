@@ -50,12 +50,13 @@ def load_meshes(
     unit: str | None = None,
     up_axis: str | None = None,
     transform: Transform | None = None,
+    tell: Callable[[str], None] = _log.warning,
 ) -> tuple[Mesh, ...]:
     """Read all objects of a mesh file.
 
     Every instance of a scene graph is a mesh of its own, named by its node; files without
     names give one object named by the file. Objects that their nodes scale to nothing are left
-    out, and named in a warning of this module's logger.
+    out.
 
     Parameters
     ----------
@@ -68,6 +69,8 @@ def load_meshes(
         .gltf, Z-up for .3mf), else Z-up.
     transform
         Placement in the world, in metres, after unit and up axis.
+    tell
+        Called with a line on what was left out; by default a warning of this module's logger.
 
     Returns
     -------
@@ -79,20 +82,6 @@ def load_meshes(
     LidarpoolError
         If the file cannot be read whole, or there are no triangles in it.
     """
-    content = read_mesh_file(path, unit=unit, up_axis=up_axis, transform=transform)
-    if content.skipped:
-        _log.warning("%s: scaled to nothing, left out: %s", path, ", ".join(content.skipped))
-    return tuple(content.meshes)
-
-
-def read_mesh_file(
-    path: str | Path,
-    *,
-    unit: str | None = None,
-    up_axis: str | None = None,
-    transform: Transform | None = None,
-) -> Content:
-    """Read as `load_meshes` does; what is left out is only in the result."""
     path = Path(path)
     if unit is not None and unit not in UNITS_M:
         raise LidarpoolError(f"unit is {unit!r}; it must be one of {', '.join(UNITS_M)}.")
@@ -104,21 +93,22 @@ def read_mesh_file(
         unit_m = UNITS_M[unit] if unit else content.unit_m or 1.0
         upright = Transform(UP_AXES[up_axis or content.up_axis or "z"] * unit_m, np.zeros(3))
         try:
-            content.meshes = [
-                _placed(mesh, path.stem, upright, transform) for mesh in content.meshes
-            ]
+            meshes = tuple(_placed(mesh, path.stem, upright, transform) for mesh in content.meshes)
         except LidarpoolError as error:
             raise LidarpoolError(f"{path}: {error}") from error
-    return content
+    if content.skipped:
+        names = ", ".join(content.skipped[:3]) + ", …" * (len(content.skipped) > 3)
+        tell(f"{path} scales {names} to nothing: left out")
+    return meshes
 
 
 def _read_whole(path: Path, data: bytes) -> Content:
     """Read a file, whatever it is: at least one mesh, or LidarpoolError."""
-    suffix = path.suffix.lower()
     try:
-        if foreign := _foreign_content(suffix, data):
-            raise MeshFileError(foreign)
-        content = _READERS[suffix](data, path)
+        for beginning, what in _FOREIGN:
+            if beginning.match(data):
+                raise MeshFileError(what)
+        content = _READERS[path.suffix.lower()](data, path)
     except MemoryError:
         raise
     except MeshFileError as refused:
@@ -177,58 +167,33 @@ def _like(path: Path) -> str:
     return did_you_mean(path.name, [name for name in beside if name.lower().endswith(SUFFIXES)])
 
 
-# What files of other kinds begin with, and those mesh files that have a beginning of their own.
+# What files that are no meshes begin with.
 _FOREIGN = (
     (re.compile(rb"\x1f\x8b|BZh|\xfd7zXZ\0|7z\xbc\xaf"), "is packed: unpack it first"),
-    (re.compile(rb"(?i)<!doctype html|<html"), "is a page of the web: download the file itself"),
+    (
+        re.compile(rb"(?i)\s*(<!doctype html|<html)"),
+        "is a page of the web: download the file itself",
+    ),
     (re.compile(rb"version https://git-lfs"), "only points to a mesh: get it with git lfs pull"),
 )
-_MESHES = (
-    (re.compile(rb"glTF"), ".glb"),
-    (re.compile(rb"PK\x03\x04"), ".3mf"),
-    (re.compile(rb"ply[ \t]*[\r\n]"), ".ply"),
-    (re.compile(rb"(ST)?C?N?OFF\b"), ".off"),
-    (re.compile(rb"solid\b[^\0]*\bfacet\s+normal"), ".stl"),
-    (re.compile(rb"<\?xml[^\0]*<COLLADA\b"), ".dae"),
-    (re.compile(rb'\{[^\0]*"asset"\s*:'), ".gltf"),
-)
-
-
-def _foreign_content(suffix: str, data: bytes) -> str | None:
-    """Say what a file is by its content that is not what it is called; None for nothing known."""
-    head = data[:4000].lstrip()
-    for pattern, what in _FOREIGN:
-        if pattern.match(head):
-            return what
-    kinds = [kind for pattern, kind in _MESHES if pattern.match(head)]
-    if kinds == [".3mf"] and suffix != ".3mf":
-        return "is a ZIP archive: unpack it first, or call it .3mf if it is one"
-    if kinds and suffix not in kinds and {suffix, kinds[0]} != {".glb", ".gltf"}:
-        return f"is a {kinds[0]} file by its content: give it that ending"
-    return None
 
 
 def _placed(mesh: Mesh, stem: str, upright: Transform, transform: Transform | None) -> Mesh:
     """Mesh in the world, its name fit for terminals and files."""
-    mesh = _moved(mesh, upright)
+    name = _printable(mesh.name) or _printable(stem)
+    mesh = mesh.moved(name, upright.linear, upright.offset)
     if transform is not None:
-        mesh = _moved(mesh, transform)
+        mesh = mesh.moved(name, transform.linear, transform.offset)
     reach = np.abs(mesh.vertices).max()
     if reach > FARTHEST_M:
         raise LidarpoolError(
             f"Object {mesh.name!r} reaches {reach:.3g} m from the origin, farther than anything "
             "on Earth: check its unit and where it is placed."
         )
-    return Mesh(_printable(mesh.name) or _printable(stem), mesh.vertices, mesh.faces)
+    return mesh
 
 
 def _printable(text: str) -> str:
     """Text from a file on one line of bounded length, without codes that a terminal obeys."""
     kept = "".join(c if c.isprintable() else " " for c in text)
     return " ".join(kept.split())[:_LETTERS]
-
-
-def _moved(mesh: Mesh, transform: Transform) -> Mesh:
-    """Mesh with its vertices transformed, its faces still facing outward."""
-    faces = mesh.faces[:, ::-1] if transform.mirrors else mesh.faces
-    return Mesh(mesh.name, transform.apply(mesh.vertices), faces)

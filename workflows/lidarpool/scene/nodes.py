@@ -110,15 +110,8 @@ def instances(roots: Iterable[K], node_of: Callable[[K], Node[K]], stem: str) ->
             if np.linalg.matrix_rank(matrix[:3, :3]) < 2:
                 content.skipped.append(named)
             else:
-                content.meshes.append(_moved(mesh, named, matrix))
+                content.meshes.append(mesh.moved(named, matrix[:3, :3], matrix[:3, 3]))
     return content
-
-
-def _moved(mesh: Mesh, name: str, matrix: NDArray[np.float64]) -> Mesh:
-    """Mesh in the coordinates of the scene, its faces still facing outward."""
-    linear = matrix[:3, :3]
-    faces = mesh.faces[:, ::-1] if np.linalg.det(linear) < 0 else mesh.faces
-    return Mesh(name, mesh.vertices @ linear.T + matrix[:3, 3], faces)
 
 
 def joined(name: str, parts: Iterable[tuple[NDArray[np.float64], NDArray[np.int64]]]) -> list[Mesh]:

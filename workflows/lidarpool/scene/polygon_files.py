@@ -192,7 +192,8 @@ def read_stl(data: bytes, path: Path) -> Content:
         rows = np.frombuffer(data, np.uint8, 50 * announced, 84).reshape(-1, 50)
         corners = np.ascontiguousarray(rows[:, 12:48]).view("<f4").astype(np.float64)
         return Content(_stl_mesh(path.stem, corners.reshape(-1, 3)))
-    solids = re.split(rb"^[ \t]*solid\b", data, flags=re.MULTILINE | re.IGNORECASE)[1:]
+    text = data.replace(b"\r", b"\n")
+    solids = re.split(rb"^[ \t]*solid\b", text, flags=re.MULTILINE | re.IGNORECASE)[1:]
     if not solids:
         raise MeshFileError(
             f"announces {announced:,} triangles and has {max(0, len(data) - 84) // 50:,}: it is "

@@ -33,9 +33,6 @@ _UNITS_M = {
 # Required extensions that change looks, or that are read here.
 _READ = re.compile(r"/(material|production|securecontent)/")
 
-_LEAST_LIMIT = 2**28  # bytes that any file may become in memory
-_GROWTH = 100  # and times its size; real files are packed by 5 to 30
-
 _Key = tuple[str, str]  # inner file and number of an object
 
 
@@ -72,12 +69,6 @@ def read_3mf(data: bytes, path: Path) -> Content:
         What one stumbles over in a file that is broken.
     """
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        unpacked = sum(part.file_size for part in archive.infolist())
-        if unpacked > max(_LEAST_LIMIT, _GROWTH * len(data)):
-            raise MeshFileError(
-                f"has {len(data):,} bytes and says that it holds {unpacked:,}, out of all "
-                "proportion: export it again"
-            )
         package = _Package(archive)
         root = package.model(_start(archive))
 
@@ -110,7 +101,7 @@ def _meshes(made: _Object) -> list[Mesh]:
     if not made.faces:
         return []
     vertices = np.frombuffer(made.vertices, np.float64).reshape(-1, 3)
-    return [Mesh("", vertices, np.frombuffer(made.faces, np.int64).reshape(-1, 3))]
+    return [Mesh(made.name, vertices, np.frombuffer(made.faces, np.int64).reshape(-1, 3))]
 
 
 class _Package:

@@ -105,8 +105,3 @@ class Transform:
     def apply(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the transformed points, float64 (n, 3)."""
         return points @ self.linear.T + self.offset
-
-    @property
-    def mirrors(self) -> bool:
-        """Whether it turns surfaces inside out, so that faces must be wound the other way."""
-        return bool(np.linalg.det(self.linear) < 0)
