@@ -1,6 +1,5 @@
 """Pool partitions and pipes for Dask clusters."""
 
-from .awaiting import Backoff, await_news, take_news
 from .devices import assign_devices, own_device
 from .errors import PipeClosed, PipeFailed, PoolError
 from .fence import lower_fence, raise_fence
@@ -14,7 +13,7 @@ from .page import (
     tell_page,
 )
 from .partition import Partition
-from .pipe import Pipe, forget_pipes
+from .pipe import Backoff, Pipe, await_news, forget_pipes, take_news
 from .placement import Recorder, TaskRecord, placement_violations, recorded
 from .pool import Pool
 from .remote import ask_workers, worker_identities

@@ -11,13 +11,12 @@ from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 from .errors import PoolError
-from .rules import Count, Declared, Rest, Rule, partition_for
+from .internals import Resources
+from .rules import Count, Declared, Rest, Rule
 from .worker_info import WorkerInfo
 
 HOLD_S = 30.0  # how long a worker's place is kept while its nanny starts it again
 FORGET_S = 3600.0  # after which a worker that comes back is a new one
-
-Resources = dict[str, float]
 
 
 @dataclass(eq=False)
@@ -38,14 +37,8 @@ class Seat:
         How many of the partition's slots it has.
     nanny
         Address of its nanny, None for none.
-    home
-        Where it is lent from.
     absent_since
         When it left, by `time.monotonic`; None while it is there.
-    given_up
-        It is not there, and its place is not kept any more.
-    joined
-        When it joined after the cluster was divided, by `time.monotonic`; else 0.
     unplaced
         It joined after the cluster was divided, and no rule has wanted it yet.
     """
@@ -56,10 +49,7 @@ class Seat:
     partition: str | None = None
     slots: float = 0
     nanny: str | None = None
-    home: str | None = None
     absent_since: float | None = None
-    given_up: bool = False
-    joined: float = 0.0
     unplaced: bool = False
 
     @property
@@ -109,7 +99,7 @@ class Book:
 
     def put(self, seat: Seat, name: str | None, slots: float | None = None) -> None:
         """Put a worker into a partition, or None; if not given, slots are as it was started."""
-        seat.partition, seat.unplaced, seat.home = name, False, None
+        seat.partition, seat.unplaced = name, False
         if name is None:
             seat.slots = 0
         elif slots is not None:
@@ -155,38 +145,6 @@ class Book:
     def groups(self) -> Mapping[str, list[WorkerInfo]]:
         """Tell what is known of the members, by partition."""
         return {name: [seat.info for seat in self.members(name)] for name in self.rules}
-
-    def vacated(self) -> list[Seat]:
-        """Workers whose place is given up now; each is returned once.
-
-        While a nanny may be starting its worker again, the worker's place is kept, and a worker
-        that joins goes where the rules want it otherwise, mostly to the partition that has the
-        rest. Once the place is given up, it is as if that worker joined now: see `replacement`.
-        """
-        seats = [
-            seat
-            for seat in self.seats.values()
-            if seat.absent_since is not None and not seat.holds and not seat.given_up
-        ]
-        for seat in seats:
-            seat.given_up = True
-        return seats
-
-    def replacement(self, gone: Seat) -> Seat | None:
-        """Worker that has joined since another left, and would have its place if it joined now."""
-        rest = self.remainder()
-        if rest is None or gone.partition in (None, rest) or gone.absent_since is None:
-            return None
-        members = self.members(rest, present=True)
-        if len(members) <= self.rules[rest].minimum:
-            return None
-        for seat in members:
-            others = [member.info for member in self.members(rest) if member is not seat]
-            groups = {**self.groups(), rest: others}
-            late = seat.joined > gone.absent_since and seat.home is None
-            if late and partition_for(seat.info, self.rules, groups) == gone.partition:
-                return seat
-        return None
 
     def forget(self, now: float) -> None:
         """Forget workers that have been away for so long that they will not come back."""

@@ -13,8 +13,8 @@ from .book import Seat, names_of
 from .errors import PoolError
 from .fence import enclose, fences_of, lower, settle_fences
 from .inherit import begin_inheritance, end_inheritance
+from .internals import asks_for, lift_restrictions
 from .page import close_page
-from .placing import asks_for
 from .reconciler import LOOK_EVERY_S
 from .remote import on_scheduler
 from .rules import Rule
@@ -56,7 +56,7 @@ def declare(
     rules: Mapping[str, Rule],
     chosen: Mapping[str, Sequence[WorkerInfo]],
     pool: Sequence[WorkerInfo],
-) -> None:
+) -> str:
     """Make partitions, and have the scheduler follow their rules from now on; all or none.
 
     It is one question to the scheduler: a client that dies leaves the whole answer behind, or
@@ -73,13 +73,18 @@ def declare(
     pool
         All workers, as the client saw them when it chose.
 
+    Returns
+    -------
+    note
+        What a user should know of all of them; empty for nothing.
+
     Raises
     ------
     PoolError
         If one of them left meanwhile, somebody else has put it into a partition or made a
         partition of such a name, or other workers have it.
     """
-    ask(
+    note: str = ask(
         client,
         _declare,
         rules=dict(rules),
@@ -87,6 +92,7 @@ def declare(
         seen=sorted({name for worker in pool for name in worker.partitions}),
         gpus={worker.address: worker.gpus for worker in pool},
     )
+    return note
 
 
 async def _declare(
@@ -95,12 +101,12 @@ async def _declare(
     chosen: Mapping[str, Sequence[str]],
     seen: Collection[str],
     gpus: Mapping[str, Sequence[str]],
-) -> None:
+) -> str:
     # Up to the first await nothing else happens on the scheduler.
     seats = {name: [_seat(steward, name, a) for a in chosen[name]] for name in rules}
     for name in rules:
         _check_sole(steward, name, seats[name], seen)
-    _begin(steward, rules)
+    note = _begin(steward, rules)
     for address, devices in gpus.items():
         if devices and (seat := steward.reconciler.seat_at(address)):
             seat.info = seat.info.with_gpus(devices)
@@ -118,24 +124,26 @@ async def _declare(
             f"{' and '.join(sorted({str(seat.partition) for seat in away}))}; the other workers "
             "are in theirs. Make the pool anew to divide it again."
         )
+    return note
 
 
-def _begin(steward: Steward, rules: Mapping[str, Rule]) -> None:
+def _begin(steward: Steward, rules: Mapping[str, Rule]) -> str:
     """Have tasks inherit the partitions, raise or lower their fences, and count their tasks."""
-    scheduler, book = steward.scheduler, steward.book
+    scheduler, book, note = steward.scheduler, steward.book, ""
     try:
         for name, rule in rules.items():
-            begin_inheritance(scheduler, name)
+            note = begin_inheritance(scheduler, name)
             if rule.exclusive:
                 enclose(scheduler, name)
             elif name in book.rules and book.rules[name].exclusive:
                 lower(scheduler, name)
-    except PoolError:  # this version of Dask lacks what these build on
+    except PoolError:  # this version of Dask lacks what fences build on
         for name in rules.keys() - book.rules.keys():
             lower(scheduler, name)
             end_inheritance(scheduler, name)
         raise
     statistics_of(scheduler)
+    return note
 
 
 def _seat(steward: Steward, name: str, address: str) -> Seat:
@@ -231,8 +239,6 @@ async def _dissolve(steward: Steward, names: list[str] | None, timeout_s: float)
     # From here to the next await nothing else happens on the scheduler; up to here somebody else
     # may have dissolved the same partitions, or made some.
     gone = those()
-    for name in gone:  # whoever was lent is a member of its own partition again
-        steward.rebalancing.drop_all(name)
     seats = [seat for seat in book.seats.values() if seat.partition in gone]
     for name in gone:
         del book.rules[name]
@@ -243,11 +249,12 @@ async def _dissolve(steward: Steward, names: list[str] | None, timeout_s: float)
     if names is None:
         for fence in fences_of(scheduler):  # raised by hand, of workers that were started so
             lower(scheduler, fence)
+        end_inheritance(scheduler, None)
         close_page(scheduler)
         forget_statistics(scheduler)
     for seat in seats:
         book.put(seat, None)
-    _lift_restrictions(scheduler, gone)
+    lift_restrictions(scheduler, gone)
     late = await steward.reconciler.arrive(seats, max(timeout_s, _RETURN_S))
     for seat in seats:
         if not seat.holds:
@@ -266,14 +273,3 @@ def _unfinished(scheduler: Any, names: Collection[str]) -> list[Any]:
         for task in scheduler.tasks.values()
         if task.state in _UNFINISHED and asks_for(task, names)
     ]
-
-
-def _lift_restrictions(scheduler: Any, names: Collection[str]) -> None:
-    """Let results that are still held be computed again, if they are lost, on any worker.
-
-    There is none any more that could take such a task: it would wait for ever.
-    """
-    for task in scheduler.tasks.values():
-        if asks_for(task, names):
-            kept = {n: q for n, q in task.resource_restrictions.items() if n not in names}
-            task.resource_restrictions = kept or None

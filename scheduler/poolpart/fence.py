@@ -15,21 +15,12 @@ follows what the workers declare, so workers that join late, are restarted or mo
 partitions need nothing else. Tasks that no worker outside may take wait; the scheduler logs
 that, every client gets a warning, and statistics count them.
 
-A fence is a rule that is asked whenever the scheduler decides where a task goes: the methods
-that decide are overridden on the running scheduler, and nothing is written on tasks or
-workers. Two ways that need no overriding were tried, on two workers, one of them fenced:
-
-- *A resource that all workers outside declare, put on every task without one
-  (`update_graph`).* The scheduler marks each such task, workers must hold enough of the
-  resource, declare it again after a restart and take part in its accounting; and tasks that
-  were there before, or that are given `workers=`, need care of their own.
-- *`worker_restrictions` that name the workers outside, one set that all tasks share.* An
-  empty set means "no restriction", user-given restrictions must be merged and put back.
-
-Both make every task a restricted one, and Dask holds no restricted tasks back: of 200 root
-tasks all 200 were given to the open worker at once, whose memory then holds all their results,
-where without restrictions 2 are given and 198 stay in the scheduler's queue. With the rule of
-this module it is 2 and 198.
+A fence is a rule that is asked whenever the scheduler decides where a task goes, see
+`internals.py`; nothing is written on tasks or workers. Two ways that need no such rule were tried:
+a resource that all workers outside declare, put on every task without one, and
+`worker_restrictions` that name the workers outside. Both make every task a restricted one, and
+Dask holds no restricted tasks back: of 200 root tasks all 200 were given to the open worker at
+once, whose memory then holds all their results. With the rule it is 2, and 198 wait.
 """
 
 from __future__ import annotations
@@ -38,17 +29,13 @@ import asyncio
 import logging
 import pickle
 import time
-from collections.abc import Callable, Iterable
 from itertools import islice
 from typing import Any
 
 from distributed import Client
-from distributed.core import Status
 from distributed.diagnostics.plugin import SchedulerPlugin
-from distributed.shuffle._core import barrier_key
 
-from .override import Overrides
-from .placing import forget_recalls, recall, recalls_under_way
+from .internals import FenceRules, open_to_all, recall, recalls_under_way
 from .remote import on_scheduler
 
 logger = logging.getLogger(__name__)
@@ -120,41 +107,25 @@ class Fences(SchedulerPlugin):
         self.scheduler = scheduler
         self.names: set[str] = set()
         self.closed: set[Any] = set()  # states of the workers behind fences
-        self._overrides = Overrides()
+        self._rules = FenceRules(scheduler, self.closed, self.stop, self._changed)
         self._complained_at = float("-inf")
 
     # -- coming and going --------------------------------------------------------------
 
     def install(self) -> None:
-        """Override what decides.
+        """Have a say in what the scheduler decides.
 
         Raises
         ------
         PoolError
             If this version of Dask decides by other means.
         """
-        scheduler, put = self.scheduler, self._overrides.put
-        rule: dict[str, Callable[..., Any]] = {
-            "valid_workers": self._valid_workers,
-            "decide_worker_non_rootish": self._non_rootish,
-            "decide_worker_rootish_queuing_disabled": self._rootish_not_queued,
-            "add_resources": self._add_resources,
-        }
-        put(scheduler, rule)
-        if stealing := scheduler.extensions.get("stealing"):
-            put(stealing, {"_get_thief": self._get_thief})
-        if shuffle := scheduler.extensions.get("shuffle"):
-            put(shuffle, {"_calculate_worker_for": self._outputs_of_shuffle})
-        scheduler.handlers["set_resources"] = scheduler.add_resources
-        scheduler.idle_task_count = _OpenWorkers(self.closed, scheduler.idle_task_count)
-        scheduler.add_plugin(self)
+        self._rules.install()
+        self.scheduler.add_plugin(self)
 
     def uninstall(self) -> None:
         """Take everything back."""
-        self._overrides.take_back()
-        self.scheduler.handlers["set_resources"] = self.scheduler.add_resources
-        self.scheduler.idle_task_count = set(self.scheduler.idle_task_count)
-        forget_recalls(self.scheduler)
+        self._rules.uninstall()
         self.scheduler.remove_plugin(NAME)
 
     # -- who is behind a fence ---------------------------------------------------------
@@ -178,13 +149,13 @@ class Fences(SchedulerPlugin):
             self.scheduler.idle_task_count.discard(worker)
         elif worker in self.closed:
             self.closed.discard(worker)
-            self.scheduler.check_idle_saturated(worker)
-            if worker.status is Status.running:
-                stimulus = f"{NAME}-opened-{time.time()}"
-                self.scheduler.transitions(
-                    self.scheduler.bulk_schedule_unrunnable_after_adding_worker(worker), stimulus
-                )
-                self.scheduler.stimulus_queue_slots_maybe_opened(stimulus_id=stimulus)
+            open_to_all(self.scheduler, worker)
+
+    def _changed(self, worker: Any) -> None:
+        """Look at a worker that has declared something."""
+        self._look_at(worker)
+        if worker in self.closed:
+            self._turn_out(worker, set())
 
     def _turn_out(self, worker: Any, asked: set[Any]) -> None:
         """Ask a worker for tasks that it should not have, each once."""
@@ -219,53 +190,9 @@ class Fences(SchedulerPlugin):
         """Whether fences are why no worker may take a task now."""
         if not self.stop(task):
             return False
-        # As Dask has it, without fences: what nobody could take anyhow is not our affair.
-        valid = type(self.scheduler).valid_workers(self.scheduler, task)
-        could = self.scheduler.running if valid is None else valid
+        # What nobody could take anyhow is not our affair.
+        could = self._rules.could_take(task)
         return bool(could) and could <= self.closed
-
-    def _add_resources(self, original: Callable[..., Any], worker: str, resources: Any) -> Any:
-        answer = original(worker, resources)
-        state = self.scheduler.workers[worker]
-        self._look_at(state)
-        if state in self.closed:
-            self._turn_out(state, set())
-        return answer
-
-    def _valid_workers(self, original: Callable[..., Any], task: Any) -> Any:
-        valid = original(task)
-        if not self.stop(task):
-            return valid
-        if valid is None:
-            return self.remainder
-        allowed = valid - self.closed
-        # Restrictions that are mere wishes; without this Dask would then take any worker.
-        return allowed or (self.remainder if task.loose_restrictions else allowed)
-
-    def _non_rootish(self, original: Callable[..., Any], task: Any) -> Any:
-        worker = original(task)
-        return None if worker in self.closed and self.stop(task) else worker
-
-    def _rootish_not_queued(self, original: Callable[..., Any], task: Any) -> Any:
-        return self.scheduler.decide_worker_non_rootish(task)
-
-    def _get_thief(
-        self, original: Callable[..., Any], scheduler: Any, task: Any, *args: Any, **kwargs: Any
-    ) -> Any:
-        thief = original(scheduler, task, *args, **kwargs)
-        return None if thief in self.closed and self.stop(task) else thief
-
-    def _outputs_of_shuffle(self, original: Callable[..., Any], spec: Any) -> Any:
-        """Have a shuffle choose the workers of its outputs among those that may take them."""
-        barrier = self.scheduler.tasks[barrier_key(spec.id)]
-        given = barrier.worker_restrictions
-        allowed = self.scheduler.valid_workers(barrier)
-        try:
-            if not given and allowed:
-                barrier.worker_restrictions = {worker.address for worker in allowed}
-            return original(spec)
-        finally:
-            barrier.worker_restrictions = given
 
     # -- never silently ----------------------------------------------------------------
 
@@ -289,19 +216,6 @@ class Fences(SchedulerPlugin):
         )
         logger.warning(complaint)
         self.scheduler.log_event("warn", {"message": pickle.dumps(complaint)})
-
-
-class _OpenWorkers(set[Any]):
-    """Workers with room for tasks from the queue, without those behind fences."""
-
-    def __init__(self, closed: set[Any], workers: Iterable[Any]) -> None:
-        super().__init__(workers)
-        self.difference_update(closed)
-        self._closed = closed
-
-    def add(self, worker: Any) -> None:
-        if worker not in self._closed:
-            super().add(worker)
 
 
 def raise_fence(client: Client, name: str) -> None:

@@ -10,9 +10,8 @@ from collections.abc import Collection, Coroutine
 from typing import Any, TypeVar
 
 from distributed import Client, get_worker
-from distributed.protocol import to_serialize
-from distributed.utils import wait_for
-from distributed.utils_comm import gather_from_workers
+
+from .internals import answer_to, as_bytes, ask, ping, take_from_worker, who_has
 
 T = TypeVar("T")
 
@@ -53,11 +52,11 @@ def fetch_available(
 
     async def fetch() -> dict[str, Any]:
         try:
-            who_has = await wait_for(client.scheduler.who_has(keys=list(keys)), patience_s)
+            found = await asyncio.wait_for(who_has(client, keys), patience_s)
         except TimeoutError:
             return {}
         by_worker: dict[str, list[str]] = defaultdict(list)
-        for key, addresses in who_has.items():
+        for key, addresses in found.items():
             if addresses:
                 # Any one of them: if it does not answer, the next call may ask another.
                 by_worker[random.choice(list(addresses))].append(key)
@@ -99,10 +98,8 @@ def fetch_from(
 
 
 async def _take(client: Client, address: str, held: list[str], patience_s: float) -> dict[str, Any]:
-    who_has = {key: [address] for key in held}
-    taking = gather_from_workers(who_has, rpc=client.rpc)
-    data, *_ = await _unless_silent(client, address, taking, patience_s) or ({},)
-    return data
+    taking = take_from_worker(client, address, held)
+    return await _unless_silent(client, address, taking, patience_s) or {}
 
 
 async def _unless_silent(
@@ -124,7 +121,7 @@ async def _unless_silent(
 
 async def _answers(client: Client, address: str, patience_s: float) -> bool:
     try:
-        await wait_for(client.rpc(address).ping(), patience_s)
+        await asyncio.wait_for(ping(client, address), patience_s)
     except (TimeoutError, OSError):
         return False
     return True
@@ -138,7 +135,7 @@ def hold_for_driver(name: str, data: Any) -> str:
     worker = get_worker()
     with _lock:
         _held[name] = data
-        worker.handlers.setdefault(_HANDLER, _hand_over)
+        answer_to(worker, _HANDLER, _hand_over)
     return str(worker.address)
 
 
@@ -164,7 +161,7 @@ def take_held(client: Client, address: str, name: str, patience_s: float = 2.0) 
     """
 
     async def take() -> Any:
-        request = getattr(client.rpc(address), _HANDLER)(name=name)
+        request = ask(client, address, _HANDLER, name=name)
         answer = await _unless_silent(client, address, request, patience_s)
         return answer and answer["data"]
 
@@ -176,4 +173,4 @@ def take_held(client: Client, address: str, name: str, patience_s: float = 2.0) 
 
 def _hand_over(name: str) -> dict[str, Any]:
     data = _held.pop(name, None)
-    return {"data": None if data is None else to_serialize(memoryview(data))}
+    return {"data": None if data is None else as_bytes(data)}

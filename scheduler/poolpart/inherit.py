@@ -18,124 +18,95 @@ tasks that *those* submit, and every task is pickled with a wrapper around it).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import logging
 from typing import Any
 
 from distributed import Client
 from distributed.diagnostics.plugin import SchedulerPlugin
 
-from .override import Overrides
+from .errors import PoolError
+from .internals import Resources, Rules, rule_for_graphs, rule_for_shuffles
 from .remote import on_scheduler
+
+logger = logging.getLogger(__name__)
 
 NAME = "poolpart-inherit"
 
 
-def inherit(client: Client, name: str) -> None:
+def keep_shuffles_in(client: Client) -> None:
+    """Have shuffles and rechunks of tasks that ask for a partition stay in it, from now on."""
+    on_scheduler(client, _keep_shuffles_in)
+
+
+async def _keep_shuffles_in(dask_scheduler: Any = None) -> None:
+    _rules_of(dask_scheduler)
+
+
+def begin_inheritance(scheduler: Any, name: str) -> str:
     """Have tasks that tasks of the partition submit belong to it, from now on.
 
-    Raises
-    ------
-    PoolError
-        If the scheduler lacks this package, or what this needs of Dask.
+    Returns
+    -------
+    note
+        What a user should know where this version of Dask has no room for the rule; else empty.
     """
-    on_scheduler(client, _inherit, name=name)
-
-
-def disinherit(client: Client, name: str) -> None:
-    """Leave it to Dask again where such tasks go; nothing is left behind."""
-    on_scheduler(client, _disinherit, name=name)
-
-
-async def _inherit(name: str, dask_scheduler: Any = None) -> None:
-    begin_inheritance(dask_scheduler, name)
-
-
-async def _disinherit(name: str, dask_scheduler: Any = None) -> None:
-    end_inheritance(dask_scheduler, name)
-
-
-def begin_inheritance(scheduler: Any, name: str) -> None:
-    """Do what `inherit` does, on the scheduler."""
-    rule: Inheritance | None = scheduler.plugins.get(NAME)
-    if rule is None:
-        rule = Inheritance(scheduler)
-        rule.install()
+    rule = _rules_of(scheduler)
     rule.names.add(name)
+    return rule.note
 
 
-def end_inheritance(scheduler: Any, name: str) -> None:
-    """Do what `disinherit` does, on the scheduler."""
+def end_inheritance(scheduler: Any, name: str | None) -> None:
+    """Leave it to Dask again where such tasks go, or all of them; nothing is left behind."""
     rule: Inheritance | None = scheduler.plugins.get(NAME)
     if rule is not None:
-        rule.names.discard(name)
+        rule.names -= rule.names if name is None else {name}
         if not rule.names:
             rule.uninstall()
 
 
+def _rules_of(scheduler: Any) -> Inheritance:
+    rule: Inheritance | None = scheduler.plugins.get(NAME)
+    if rule is None:
+        rule = Inheritance(scheduler)
+        rule.install()
+    return rule
+
+
 class Inheritance(SchedulerPlugin):
-    """The scheduler's side: looks at each graph before its tasks are made."""
+    """The scheduler's side: looks at each graph before its tasks are made, and at shuffles."""
 
     name = NAME
 
     def __init__(self, scheduler: Any) -> None:
         self.scheduler = scheduler
         self.names: set[str] = set()
-        self._overrides = Overrides()
+        self.note = ""
+        self._rules = Rules()
 
     def install(self) -> None:
-        """See all graphs from now on."""
-        self._overrides.put(
-            self.scheduler,
-            {
-                "_create_taskstate_from_graph": self._create,
-                "valid_workers": self._valid_workers,
-            },
-        )
+        """See all graphs from now on, as far as this version of Dask allows it."""
+        try:
+            rule_for_graphs(self._rules, self.scheduler, self._bequeath)
+            self._rules.after(self.scheduler, "valid_workers", self._valid_workers, "ts")
+            rule_for_shuffles(self._rules, self.scheduler)
+        except PoolError as error:  # partitions are of use without
+            self.note = f"tasks from inside tasks may run anywhere: {error}"
+            logger.warning("Partitions: %s", self.note)
         self.scheduler.add_plugin(self)
 
     def uninstall(self) -> None:
         """Take that back."""
-        self._overrides.take_back()
+        self._rules.take_back()
         self.scheduler.remove_plugin(NAME)
 
-    def _create(
-        self,
-        original: Callable[..., Any],
-        *,
-        submitting_task: Any,
-        annotations_by_type: dict[str, dict[Any, Any]],
-        global_annotations: dict[str, Any] | None,
-        **graph: Any,
-    ) -> Any:
-        legacy = self._legacy(submitting_task)
-        given = global_annotations or {}
-        if legacy and "resources" not in given and "workers" not in given:
-            # Those of its tasks that say themselves where to run: {key: workers or resources}
-            otherwise = {
-                **annotations_by_type.get("workers", {}),
-                **annotations_by_type.get("resources", {}),
-            }
-            heirs = {key: legacy for key in graph["dsk"] if key not in otherwise}
-            annotations_by_type = {
-                **annotations_by_type,
-                "resources": {**annotations_by_type.get("resources", {}), **heirs},
-            }
-        return original(
-            submitting_task=submitting_task,
-            annotations_by_type=annotations_by_type,
-            global_annotations=global_annotations,
-            **graph,
-        )
-
-    def _legacy(self, submitting_task: Any) -> dict[str, int]:
+    def _bequeath(self, task: Any) -> Resources:
         """Resources for what a task submits; none if it belongs to no partition."""
-        task = self.scheduler.tasks.get(submitting_task)
-        asked = task.resource_restrictions if task is not None else None
+        asked = task.resource_restrictions
         return dict.fromkeys(self.names & asked.keys(), 0) if asked else {}
 
-    def _valid_workers(self, original: Callable[..., Any], task: Any) -> Any:
+    def _valid_workers(self, valid: Any, task: Any) -> Any:
         """Workers that have none of a resource any more would do for a task that needs 0."""
-        valid, asked = original(task), task.resource_restrictions
-        if not asked or 0 not in asked.values():
+        asked = task.resource_restrictions
+        if not valid or not asked or 0 not in asked.values():
             return valid
         return {worker for worker in valid if all(worker.resources.get(name) for name in asked)}

@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import dask
-from distributed import Nanny, Scheduler, Security, SpecCluster, Status
+from distributed import Nanny, Scheduler, Security, SpecCluster
 
 from .errors import PoolError
+from .internals import FixedCluster
 from .rules import check_name
 
 LOOPBACK = "127.0.0.1"
@@ -105,7 +106,7 @@ def local_cluster(
     }
     try:
         with dask.config.set(_PRE_SPAWN):
-            return _NannyCluster(
+            return FixedCluster(
                 workers=workers, scheduler=scheduler, security=security, silence_logs=logging.ERROR
             )
     except RuntimeError as error:
@@ -159,28 +160,6 @@ def _worker_spec(
         "silence_logs": logging.ERROR,
     }
     return {"cls": Nanny, "options": options}
-
-
-class _NannyCluster(SpecCluster):
-    """A cluster that leaves dead workers to their nannies, and keeps the workers it has.
-
-    A SpecCluster looks 15 seconds after a worker was lost whether one of its name is there,
-    and if not closes the nanny for good. A worker that dies twice within that time may be
-    starting just then, and would never come back.
-    """
-
-    def _update_worker_status(self, op: str, msg: Any) -> None:
-        super(SpecCluster, self)._update_worker_status(op, msg)
-
-    def scale(self, n: int = 0, **options: Any) -> None:
-        """Refuse: SpecCluster would drop the workers described last, whatever their kind."""
-        if self.status == Status.closing:  # it stops its workers by this
-            super().scale(n, **options)
-            return
-        raise PoolError(
-            "A cluster of local_cluster has a fixed number of workers: give it when you start "
-            "one, or move workers with Partition.grow and Partition.shrink."
-        )
 
 
 def check_count(name: str, count: object, least: int = 1) -> None:

@@ -1,4 +1,8 @@
-"""Results of one function for many items, several items in a task, with bounded work under way."""
+"""Results of one function for many items, several items in a task, with bounded work under way.
+
+A map of a map is one map of two stages: each task of the first is followed by a task of the
+second, which takes what the first has left on its worker. Data goes from worker to worker.
+"""
 
 from __future__ import annotations
 
@@ -9,20 +13,21 @@ import queue
 import reprlib
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from itertools import islice
+from itertools import islice, repeat
 from types import TracebackType
 from typing import Any, NoReturn
 
 from dask.sizeof import sizeof
 from dask.utils import funcname
-from distributed import CancelledError, Future, Reschedule
+from distributed import CancelledError, Client, Future, Reschedule
 from distributed.core import clean_exception, error_message
 
-from .sender import Sender, when_done
+from .internals import when_done
+from .remote import worker_identities
 
 NOTE = "poolpart: "  # how the notes that name a failed item start
 MOST_ITEMS = 1024
@@ -30,6 +35,7 @@ GROWTH = 4  # from one size that was tried to the next
 MOST_BYTES = 2**20
 
 Call = tuple[Any, ...]  # the arguments of one call
+Row = tuple[Call, ...]  # of one item, by stage: what it is called with beside the result before
 
 
 @dataclass(frozen=True)
@@ -40,15 +46,15 @@ class Chunk:
     ----------
     first
         Index of the first of them among all items.
-    calls
-        Arguments of the function, item by item.
+    rows
+        What the functions are called with, item by item.
     """
 
     first: int
-    calls: Sequence[Call]
+    rows: Sequence[Row]
 
     def __str__(self) -> str:
-        last = self.first + len(self.calls) - 1
+        last = self.first + len(self.rows) - 1
         return f"item {self.first}" if last == self.first else f"items {self.first} to {last}"
 
 
@@ -99,17 +105,26 @@ class Answer:
 
 
 def run_chunk(
-    function: Callable[..., Any], patience_s: float, first: int, calls: Sequence[Call]
+    function: Callable[..., Any],
+    patience_s: float,
+    at: int,
+    first: int,
+    calls: Sequence[Call],
+    before: Answer | None = None,
 ) -> Answer:
     """Call a function for the items of a chunk, one after the other; runs on a worker.
 
     It stops early when `patience_s` seconds have passed, so that items which take longer than
     those before them do not wait for each other on one worker. An error of the first item is
-    the task's; a later one is sent with the results before it.
+    the task's; a later one is sent with the results before it. What the stage before has made of
+    the items is argument number `at`.
     """
     start = time.perf_counter()
     results: list[Any] = []
     failure = None
+    if before is not None:
+        made = zip(calls, before.results, strict=False)
+        calls = [(*call[:at], result, *call[at:]) for call, result in made]
     for number, call in enumerate(calls, first):
         try:
             results.append(_call(function, call))
@@ -124,6 +139,10 @@ def run_chunk(
         if time.perf_counter() - start > patience_s:
             break
     seconds = time.perf_counter() - start
+    if before is not None:
+        seconds += before.seconds
+        if failure is None and len(results) == len(before.results):
+            failure = before.failure
     return Answer(results, seconds, sizeof(calls) + sizeof(results), failure)
 
 
@@ -193,6 +212,7 @@ class MapOptions:
     chunk: int | None = None
     priority: int = 0
     retries: int = 0
+    slots: int = 1
 
     def __post_init__(self) -> None:
         if not isinstance(self.retries, int) or self.retries < 0:
@@ -203,6 +223,72 @@ class MapOptions:
                 raise ValueError(f"{name} is {value!r}; give a whole number, 1 or more.")
 
 
+@dataclass(frozen=True)
+class Stage:
+    """A function that is mapped, and where.
+
+    Parameters
+    ----------
+    client, partition
+        Client of the cluster, and name of the partition.
+    function, options
+        What is mapped, and how.
+    at
+        Number of the argument that is the result of the stage before.
+    """
+
+    client: Client
+    partition: str
+    function: Callable[..., Any]
+    options: MapOptions
+    at: int = 0
+
+    def slots(self) -> int:
+        """Tasks of this stage that run at a time."""
+        declared = (i["resources"].get(self.partition, 0) for i in self._workers())
+        return sum(int(slots) // self.options.slots for slots in declared)
+
+    def _workers(self) -> Iterable[dict[str, Any]]:
+        return worker_identities(self.client).values()
+
+    def send(self, patience_s: float, *columns: Sequence[Any]) -> list[Future]:
+        """Submit a task for each row of columns."""
+        return send(
+            self.client,
+            {self.partition: self.options.slots},
+            partial(run_chunk, self.function, patience_s, self.at),
+            columns,
+            key=f"map-{funcname(self.function)}",
+            priority=self.options.priority,
+            retries=self.options.retries,
+        )
+
+
+def send(
+    client: Client,
+    resources: dict[str, int],
+    function: Callable[..., Any],
+    columns: Sequence[Sequence[Any]],
+    *,
+    key: str,
+    priority: int,
+    retries: int,
+) -> list[Future]:
+    """Submit a task for each row; one message costs the scheduler less than one for each."""
+    if not columns or not columns[0]:
+        return []
+    futures: list[Future] = client.map(
+        function,
+        *columns,
+        key=key,
+        pure=False,
+        priority=priority,
+        retries=retries or None,
+        resources=resources,
+    )
+    return futures
+
+
 class Results(Iterator[Any]):
     """Results of a function for many items, as `Partition.map` gives them.
 
@@ -210,21 +296,11 @@ class Results(Iterator[Any]):
     are asked for. Close it, or let go of it, to stop early.
     """
 
-    def __init__(
-        self,
-        sender: Sender,
-        slots: Callable[[], int],
-        function: Callable[..., Any],
-        calls: Iterator[Call],
-        total: int | None,
-        options: MapOptions,
-    ) -> None:
+    def __init__(self, stage: Stage, iterables: Sequence[Iterable[Any]]) -> None:
         self._closed = False
-        self._sender, self._count_slots = sender, slots
-        self._function, self._options = function, options
-        self._source, self._total = calls, total
+        self._begun = False  # somebody has asked for a result
         self._taken = 0  # items taken from the source
-        self._again: list[tuple[int, Sequence[Call]]] = []  # heap of items to be sent once more
+        self._again: list[tuple[int, Sequence[Row]]] = []  # heap of items to be sent once more
         self._size = ChunkSize()
         self._running: dict[Future, Chunk] = {}
         self._done: queue.SimpleQueue[Future] = queue.SimpleQueue()
@@ -233,12 +309,42 @@ class Results(Iterator[Any]):
         self._next_item = 0  # the one to be delivered next, if in order
         self._ready: deque[Any] = deque()  # results to be delivered
         self._failed: tuple[Chunk, Answer | Future] | None = None  # to be raised after these
+        sized = [len(iterable) for iterable in iterables if isinstance(iterable, Sized)]
+        self._total = min(sized, default=None)
+        maps = [n for n, i in enumerate(iterables) if isinstance(i, Results) and not i._begun]
+        # Of two, the second is an iterable like others: their tasks are not of the same items.
+        before = iterables[maps[0]] if maps else None
+        if isinstance(before, Results):
+            others = [i for i in iterables if i is not before]
+            self._follow(before, replace(stage, at=maps[0]), others)
+        else:
+            self._stages: tuple[Stage, ...] = (stage,)
+            self._source: Iterator[Row] = ((call,) for call in zip(*iterables, strict=False))
+            self._look()
+        self._submit()
+
+    def _follow(self, before: Results, stage: Stage, iterables: Sequence[Iterable[Any]]) -> None:
+        """Take over a map from which nothing was taken, as the stages before the last."""
+        calls: Iterator[Call] = zip(*iterables, strict=False) if iterables else repeat(())
+        self._stages = (*before._stages, stage)
+        self._source = ((*row, call) for call, row in zip(calls, before._source, strict=False))
+        if before._total is not None:
+            self._total = min(before._total, before._total if self._total is None else self._total)
+        self._taken = before._taken
         self._look()
-        self._submit(wait=False)
+        sent = []
+        for future, chunk in before._running.items():
+            rows = [(*row, call) for row, call in zip(chunk.rows, calls, strict=False)]
+            if rows:
+                sent.append((future, Chunk(chunk.first, rows)))
+        self._run([chunk for _, chunk in sent], [future for future, _ in sent])
+        before._begun = before._closed = True
+        before._running.clear()
 
     # -- for the user ------------------------------------------------------------------
 
     def __next__(self) -> Any:
+        self._begun = True
         while not self._ready:
             if self._failed is not None:
                 self._raise(*self._failed)
@@ -261,9 +367,10 @@ class Results(Iterator[Any]):
 
     def __repr__(self) -> str:
         state = "closed" if self._closed else f"{len(self._running)} tasks under way"
-        name = funcname(self._function)
+        last = self._stages[-1]
         return (
-            f"<Results of {name} on {self._sender.resource!r}: {self._taken} items taken, {state}>"
+            f"<Results of {funcname(last.function)} on {last.partition!r}: "
+            f"{self._taken} items taken, {state}>"
         )
 
     def close(self) -> None:
@@ -285,70 +392,73 @@ class Results(Iterator[Any]):
     def _step(self) -> None:
         """Wait for tasks, take back what is done, send more."""
         if not self._running:
-            self._submit(wait=True)
+            self._submit()
         if self._running:
             self._take_back(self._wait())
             self._deliver()
-            self._submit(wait=False)
+            self._submit()
         else:
             self.close()
 
     def _look(self) -> None:
         """See how many slots there are: partitions grow, shrink, and lose workers."""
-        self._slots = self._count_slots()
+        slots = [stage.slots() for stage in self._stages]
+        self._slots = max(slots)
+        self._window = sum(
+            stage.options.window or max(2, 2 * has)
+            for stage, has in zip(self._stages, slots, strict=True)
+        )
+        self._retries = any(stage.options.retries for stage in self._stages)
         self._next_look = time.monotonic() + LOOK_S
-        if not self._slots:
-            logger.warning("Partition %r has no workers: a map on it waits.", self._sender.resource)
+        for stage, has in zip(self._stages, slots, strict=True):
+            if not has:
+                logger.warning("Partition %r has no workers: a map on it waits.", stage.partition)
 
-    def _submit(self, wait: bool) -> None:
+    def _submit(self) -> None:
         """Send chunks, several in one message, up to the window."""
-        window = self._options.window or max(2, 2 * self._slots)
-        window = min(window, 2 * self._sender.most)  # of its quota's tasks, some are done
-        free = window - len(self._running)
+        free = self._window - len(self._running)
         # One at a time would be many messages; the rest keeps the slots busy meanwhile.
-        if self._running and free < window // 4:
+        if self._running and free < self._window // 4:
             return
         chunks: list[Chunk] = []
         # What came back out of turn takes room as well, but not from the items it waits for.
         fresh = free - len(self._back)
         while len(chunks) < free and (chunk := self._next_chunk(fresh=len(chunks) < fresh)):
             chunks.append(chunk)
-        if not chunks:
-            return
-        patience_s = math.inf if self._options.chunk else PATIENCE * self._target_s()
-        futures = self._sender.send_many(
-            partial(run_chunk, self._function, patience_s),
-            [chunk.first for chunk in chunks],
-            [chunk.calls for chunk in chunks],
-            key=f"map-{funcname(self._function)}",
-            priority=self._options.priority,
-            retries=self._options.retries,
-            wait=wait,
-        )
-        for future, chunk in zip(futures, chunks, strict=False):
+        self._run(chunks)
+
+    def _run(self, chunks: Sequence[Chunk], done: list[Future] | None = None) -> None:
+        """Send chunks through all stages, or through the last where those before are `done`."""
+        firsts = [chunk.first for chunk in chunks]
+        stages = list(enumerate(self._stages))
+        futures = done
+        for number, stage in stages if done is None else stages[-1:]:
+            patience_s = math.inf if stage.options.chunk else PATIENCE * self._target_s()
+            calls = [[row[number] for row in chunk.rows] for chunk in chunks]
+            # Nobody holds what a stage has made but the task that takes it.
+            futures = stage.send(patience_s, firsts, calls, *([futures] if futures else []))
+        for future, chunk in zip(futures or [], chunks, strict=True):
             self._running[future] = chunk
             when_done(future, self._done.put)
-        for chunk in chunks[len(futures) :]:  # beyond the quota of the sender
-            heapq.heappush(self._again, (chunk.first, chunk.calls))
 
     def _next_chunk(self, fresh: bool) -> Chunk | None:
         """Take items: first those to be sent once more, then, if `fresh`, from the source."""
         if self._again:
-            first, calls = heapq.heappop(self._again)
-            size = self._chunk_size(len(calls))
-            if len(calls) > size:
-                heapq.heappush(self._again, (first + size, calls[size:]))
-            return Chunk(first, calls[:size])
+            first, rows = heapq.heappop(self._again)
+            size = self._chunk_size(len(rows))
+            if len(rows) > size:
+                heapq.heappush(self._again, (first + size, rows[size:]))
+            return Chunk(first, rows[:size])
         if not fresh:
             return None
         left = None if self._total is None else max(0, self._total - self._taken)
-        calls = list(islice(self._source, self._chunk_size(left)))
-        first, self._taken = self._taken, self._taken + len(calls)
-        return Chunk(first, calls) if calls else None
+        rows = list(islice(self._source, self._chunk_size(left)))
+        first, self._taken = self._taken, self._taken + len(rows)
+        return Chunk(first, rows) if rows else None
 
     def _chunk_size(self, left: int | None) -> int:
-        if self._options.chunk is not None:
-            return self._options.chunk
+        if chunk := next((s.options.chunk for s in self._stages[::-1] if s.options.chunk), None):
+            return chunk
         size = self._size.items(self._target_s())
         if left is not None:
             # Smaller towards the end, so that all slots come to it together.
@@ -362,9 +472,9 @@ class Results(Iterator[Any]):
         """Wait until tasks are done."""
         done: list[Future] = []
         while not done:
-            if self._sender.client.status in ("closing", "closed"):
+            if self._stages[-1].client.status in ("closing", "closed"):
                 raise CancelledError(
-                    f"The client of partition {self._sender.resource!r} was closed."
+                    f"The client of partition {self._stages[-1].partition!r} was closed."
                 )
             if time.monotonic() > self._next_look:
                 self._look()
@@ -385,7 +495,7 @@ class Results(Iterator[Any]):
             else:
                 chunk = self._running.pop(future)
                 self._back[chunk.first] = chunk, future
-        answers = self._sender.client.gather(finished) if finished else ()
+        answers = self._stages[-1].client.gather(finished) if finished else ()
         for future, answer in zip(finished, answers, strict=True):
             chunk = self._running.pop(future)
             self._back[chunk.first] = chunk, answer
@@ -394,7 +504,7 @@ class Results(Iterator[Any]):
     def _deliver(self) -> None:
         """Make results ready whose turn it is."""
         while self._back and self._failed is None:
-            first = self._next_item if self._options.ordered else next(iter(self._back))
+            first = self._next_item if self._stages[-1].options.ordered else next(iter(self._back))
             if first not in self._back:
                 return
             chunk, answer = self._back.pop(first)
@@ -405,10 +515,10 @@ class Results(Iterator[Any]):
             self._ready.extend(answer.results)
             self._next_item += count
             # The item that failed is the first of a task then, which Dask runs again itself.
-            if answer.failure is not None and not self._options.retries:
+            if answer.failure is not None and not self._retries:
                 self._failed = chunk, answer
-            elif count < len(chunk.calls):
-                heapq.heappush(self._again, (first + count, chunk.calls[count:]))
+            elif count < len(chunk.rows):
+                heapq.heappush(self._again, (first + count, chunk.rows[count:]))
 
     def _raise(self, chunk: Chunk, answer: Answer | Future) -> NoReturn:
         """Stop, and raise what a task raised; a note says at which item."""

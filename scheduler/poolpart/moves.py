@@ -16,8 +16,7 @@ from distributed import Client
 from .book import Seat, names_of
 from .declare import ask
 from .errors import PoolError
-from .placing import held_by
-from .rebalancing import Help
+from .internals import held_by
 from .steward import Steward
 from .wording import counted
 
@@ -42,21 +41,6 @@ def shrink(client: Client, name: str, workers: int, timeout_s: float) -> list[st
 def minimum(client: Client, name: str) -> int:
     """Workers that a partition keeps whatever is moved."""
     return int(ask(client, _minimum, name=name))
-
-
-def follow(client: Client, rule: Help) -> None:
-    """Lend idle workers from now on; see `Pool.rebalance`."""
-    if rule.lender == rule.borrower:
-        raise PoolError(f"Partition {rule.lender!r} cannot help itself; name two.")
-    if rule.idle_s < 0:
-        raise PoolError(f"idle_s is {rule.idle_s}; give seconds, 0 or more.")
-    ask(client, _follow, rule=rule)
-
-
-def unfollow(client: Client, lender: str, borrower: str, timeout_s: float) -> list[str]:
-    """Lend no more, and wait until the workers are back; returns their names."""
-    names: list[str] = ask(client, _unfollow, lender=lender, borrower=borrower, timeout_s=timeout_s)
-    return names
 
 
 def _check(workers: int) -> None:
@@ -97,11 +81,9 @@ async def _shrink(steward: Steward, name: str, count: int, timeout_s: float) -> 
     book.adopt(name)
     members, least = _arrived(steward, name), book.rules[name].minimum
     if len(members) - count < least:
-        lent = sum(seat.home is not None for seat in book.members(name, present=True))
         raise PoolError(
             f"Partition {name!r} cannot shrink by {count}: it has "
-            f"{counted(len(members), 'worker')} and needs at least {least}"
-            f"{f'; {lent} more are only lent to it' if lent else ''}."
+            f"{counted(len(members), 'worker')} and needs at least {least}."
         )
     target = book.remainder()
     chosen = _by_load(steward, members)[:count]
@@ -113,40 +95,23 @@ async def _minimum(steward: Steward, name: str) -> int:
     return rule.minimum if rule else 0
 
 
-async def _follow(steward: Steward, rule: Help) -> None:
-    for name in (rule.lender, rule.borrower):
-        steward.book.adopt(name)
-    steward.rebalancing.add(rule)
-
-
-async def _unfollow(steward: Steward, lender: str, borrower: str, timeout_s: float) -> list[str]:
-    back = steward.rebalancing.drop(lender, borrower)
-    if late := await steward.reconciler.arrive(back, timeout_s):
-        raise PoolError(
-            f"{names_of(late)} not back in partition {lender!r} after {timeout_s:g} s"
-            f"{_held(steward, late, [borrower])}; what is left to do there ends first."
-        )
-    return [seat.info.name for seat in back]
-
-
 async def _move(
     steward: Steward, seats: Sequence[Seat], target: str | None, timeout_s: float
 ) -> list[str]:
     """Move workers; PoolError if some do not come free in time, which then stay."""
-    before = {seat: (seat.partition, seat.slots, seat.home) for seat in seats}
+    before = {seat: (seat.partition, seat.slots) for seat in seats}
     for seat in seats:
         _resize(steward, seat.partition, -1)
         _resize(steward, target, 1)
         steward.book.put(seat, target)
     late = await steward.reconciler.arrive(seats, timeout_s)
     for seat in late:
-        origin, slots, home = before[seat]
+        origin, slots = before[seat]
         if seat.partition != target or (origin and origin not in steward.book.rules):
             continue  # meanwhile somebody else has moved it, or dissolved where it was
         _resize(steward, target, -1)
         _resize(steward, origin, 1)
         steward.book.put(seat, origin, slots)
-        seat.home = home
     if late:
         leaving = [name for name, *_ in (before[seat] for seat in late) if name]
         steward.reconciler.settle(late)
@@ -163,13 +128,9 @@ async def _move(
 
 
 def _arrived(steward: Steward, name: str) -> list[Seat]:
-    """Members that may be moved.
-
-    Not those under way, which may turn back, and belong to another's move; nor those that are
-    only lent: they go back, and would leave fewer than the minimum behind.
-    """
+    """Members that may be moved: not those under way, which may turn back."""
     members = steward.book.members(name, present=True)
-    return [s for s in members if s.home is None and steward.reconciler.settled(s)]
+    return [seat for seat in members if steward.reconciler.settled(seat)]
 
 
 def _resize(steward: Steward, name: str | None, change: int) -> None:

@@ -14,6 +14,7 @@ from tornado import web
 
 from .errors import PoolError
 from .fence import fences_of, kept_out
+from .internals import depth_of, queues_of, serve, serve_no_longer, serves, state_of
 from .remote import on_scheduler
 from .stats import TOTALS_TOPIC, Ran, running_on, slots_of, statistics_of, told
 
@@ -71,7 +72,7 @@ def _worker(worker: Any) -> dict[str, Any]:
         "partition": partition,
         "threads": worker.nthreads,
         "slots": slots,
-        "busy": min(running_on(worker, partition).total(), slots),
+        "busy": running_on(worker, partition)[1],
         "status": worker.status.name,
         "given": len(worker.processing),
         "seen": round(worker.last_seen, 3),
@@ -81,15 +82,14 @@ def _worker(worker: Any) -> dict[str, Any]:
 
 def _pipes(scheduler: Any) -> list[dict[str, Any]]:
     """Pipes are queues beside which there is a variable of their name with a pipe's state."""
-    queues, variables = scheduler.extensions["queues"], scheduler.extensions["variables"]
     pipes = []
-    for name, queue in queues.queues.items():
-        state = variables.variables.get(name, {}).get("value")
+    for name in queues_of(scheduler):
+        state = state_of(scheduler, name)
         if isinstance(state, dict) and {"closed", "failure"} <= state.keys():
             failure = str(state["failure"])[:_FAILURE_LENGTH]
             shown = "failed" if failure else "closed" if state["closed"] else "open"
-            pipe = {"name": name, "depth": queue.qsize(), "state": shown, "failure": failure}
-            pipes.append(pipe)
+            depth = depth_of(scheduler, name)
+            pipes.append({"name": name, "depth": depth, "state": shown, "failure": failure})
     return pipes
 
 
@@ -140,20 +140,18 @@ def open_page(scheduler: Any) -> None:
             (r"(?:/.*)?/" + PATH, PageHandler, {"scheduler": scheduler}),
             (r"(?:/.*)?/" + PATH + r"/data", DataHandler, {"scheduler": scheduler}),
         ]
-        scheduler.http_application.add_application(PageApplication(handlers))
+        serve(scheduler, PageApplication(handlers))
     statistics_of(scheduler)
 
 
 def is_open(scheduler: Any) -> bool:
     """Whether the page is served."""
-    applications = scheduler.http_application.applications
-    return any(isinstance(other, PageApplication) for other in applications)
+    return serves(scheduler, PageApplication)
 
 
 def close_page(scheduler: Any) -> None:
     """Serve it no longer."""
-    applications = scheduler.http_application.applications
-    applications[:] = [a for a in applications if not isinstance(a, PageApplication)]
+    serve_no_longer(scheduler, PageApplication)
 
 
 def partitions_page(client: Client) -> str:

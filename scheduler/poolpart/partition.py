@@ -2,25 +2,38 @@
 
 from __future__ import annotations
 
-import copy
+import inspect
 import time
-from collections.abc import Callable, Iterable, Sized
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack
+from contextvars import ContextVar
 from typing import Any, Self
 
+import dask
 from dask.utils import funcname
 from distributed import Client, Future
 
 from . import moves
-from .awaiting import Backoff
 from .declare import dissolve
 from .errors import PoolError
-from .mapping import MapOptions, Results
+from .inherit import keep_shuffles_in
+from .mapping import MapOptions, Results, Stage, send
 from .remote import worker_identities
-from .sender import Quota, Sender
 from .stats import PartitionStats, partition_stats
 from .task_context import own_client
 from .wording import counted
 from .worker_info import WorkerInfo
+
+# What `with partition:` has to undo, innermost last; of this thread or coroutine.
+_entered: ContextVar[tuple[ExitStack, ...]] = ContextVar("_entered", default=())
+
+# `Client.submit` keeps these for itself; a function that has one of them would not get it.
+_OPTIONS_OF_SUBMIT = frozenset(
+    parameter.name
+    for parameter in inspect.signature(Client.submit).parameters.values()
+    if parameter.kind is inspect.Parameter.KEYWORD_ONLY
+    or parameter.default is not inspect.Parameter.empty
+)
 
 
 class Partition:
@@ -38,29 +51,18 @@ class Partition:
         Client of the cluster. By default, in a task, that of its worker.
     note
         Something a user should know of it, such as that it had to do without GPUs.
-    priority
-        Priority of its tasks where none is given: of tasks that wait for the same worker,
-        those of a higher one run first. It can be changed.
 
     Notes
     -----
     It can be given to a task, which submits with the client of its worker then.
     """
 
-    def __init__(
-        self, name: str, client: Client | None = None, note: str = "", priority: int = 0
-    ) -> None:
-        self.name, self.note, self.priority = name, note, priority
+    def __init__(self, name: str, client: Client | None = None, note: str = "") -> None:
+        self.name, self.note = name, note
         self._client = client
-        self._quota: Quota | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
-        if self._quota is not None:
-            raise TypeError(
-                f"A handle on {self.name!r} with a quota cannot be sent to a task, since it counts "
-                "what is submitted where it was made: send the partition, and limit it there."
-            )
-        return Partition, (self.name, None, self.note, self.priority)
+        return Partition, (self.name, None, self.note)
 
     @property
     def client(self) -> Client:
@@ -69,10 +71,6 @@ class Partition:
         if self._client is None:
             self._client = own_client()
         return self._client
-
-    @property
-    def _sender(self) -> Sender:
-        return Sender(self.client, self.name, self._quota)
 
     @property
     def workers(self) -> tuple[WorkerInfo, ...]:
@@ -116,14 +114,13 @@ class Partition:
             If it has fewer after so many seconds.
         """
         deadline = time.monotonic() + (float("inf") if timeout_s is None else timeout_s)
-        pause = Backoff(0.01, 0.2)
         while (there := len(self)) < n_workers:
             if time.monotonic() >= deadline:
                 raise PoolError(
                     f"Partition {self.name!r} has {there} of {counted(n_workers, 'worker')} after "
                     f'{timeout_s} s: start some with dask worker … --resources "{self.name}=1"'
                 )
-            pause.sleep()
+            time.sleep(0.05)
 
     # -- tasks -------------------------------------------------------------------------
 
@@ -133,8 +130,9 @@ class Partition:
         /,
         *args: Any,
         key: str | None = None,
-        priority: int | None = None,
+        priority: int = 0,
         retries: int = 0,
+        slots: int = 1,
         worker: str | None = None,
         **kwargs: Any,
     ) -> Future:
@@ -149,9 +147,12 @@ class Partition:
         key
             The task's key; by default a new one, so that equal calls run each by itself.
         priority
-            Higher runs first; the partition's by default.
+            Of tasks that wait for the same worker, those of a higher one run first.
         retries
             How often the task runs again if it fails.
+        slots
+            Slots of one worker that it takes while it runs; it waits for ever where no member
+            has so many.
         worker
             Address of the one member to run on; if it leaves, the task waits for ever.
 
@@ -163,15 +164,25 @@ class Partition:
         ------
         TypeError
             If a keyword is another option of `Client.submit`.
+        ValueError
+            If `slots` is below 1.
         """
-        return self._sender.send(
+        if taken := sorted(_OPTIONS_OF_SUBMIT & kwargs.keys()):
+            raise TypeError(
+                f"{', '.join(taken)}: Client.submit has options of this name, so that "
+                f"{function} would not get it: bind it with functools.partial. To give Dask the "
+                f"option, use Client.submit(…, resources={{{self.name!r}: 1}})."
+            )
+        return self.client.submit(
             function,
-            args,
-            kwargs,
+            *args,
             key=key,
-            priority=self._default(priority),
-            worker=worker,
-            retries=retries,
+            pure=False,
+            priority=priority,
+            retries=retries or None,
+            resources=self._taking(slots),
+            workers=None if worker is None else [worker],
+            **kwargs,
         )
 
     def submit_many(
@@ -179,8 +190,9 @@ class Partition:
         function: Callable[..., Any],
         /,
         *iterables: Iterable[Any],
-        priority: int | None = None,
+        priority: int = 0,
         retries: int = 0,
+        slots: int = 1,
     ) -> list[Future]:
         """Submit one task for each item, in one message; see `map` for many or endless items.
 
@@ -193,19 +205,20 @@ class Partition:
             In the order of the items, as many as the shortest iterable has.
         """
         columns = list(zip(*zip(*iterables, strict=False), strict=True))
-        count = len(columns[0]) if columns else 0
-        sender = self._sender
-        futures: list[Future] = []
-        while (start := len(futures)) < count:
-            futures += sender.send_many(
-                function,
-                *(column[start : start + sender.most] for column in columns),
-                key=funcname(function),
-                priority=self._default(priority),
-                retries=retries,
-                wait=True,
-            )
-        return futures
+        return send(
+            self.client,
+            self._taking(slots),
+            function,
+            columns,
+            key=funcname(function),
+            priority=priority,
+            retries=retries,
+        )
+
+    def _taking(self, slots: int) -> dict[str, int]:
+        if not isinstance(slots, int) or slots < 1:
+            raise ValueError(f"slots is {slots!r}; give a whole number, 1 or more.")
+        return {self.name: slots}
 
     def map(
         self,
@@ -215,8 +228,9 @@ class Partition:
         ordered: bool = True,
         window: int | None = None,
         chunk: int | None = None,
-        priority: int | None = None,
+        priority: int = 0,
         retries: int = 0,
+        slots: int = 1,
     ) -> Results:
         """Call a function for each item; an iterator gives the results.
 
@@ -224,6 +238,10 @@ class Partition:
         while results are asked for, and a bounded number is under way. Small items travel
         several in a task; how many, is learned from how long they take and how large they
         are.
+
+        A map that is given the results of another as items takes them on the workers, also
+        of another partition: nothing of them passes driver and scheduler. That holds for one
+        map among the iterables, of which nothing was taken before.
 
         Parameters
         ----------
@@ -238,9 +256,11 @@ class Partition:
             Items in a task; by default as many as take a tenth of a second, or longer where
             there are many slots. Give 1 where items differ much, or must not wait for others.
         priority
-            Higher runs first; the partition's by default.
+            Higher runs first.
         retries
             How often an item that fails is tried again, at least.
+        slots
+            Slots of one worker that each task takes.
 
         Returns
         -------
@@ -252,48 +272,100 @@ class Partition:
         Raises
         ------
         ValueError
-            If the window or the chunk is below 1, or retries below 0.
+            If the window, the chunk or `slots` is below 1, or `retries` below 0.
         """
-        options = MapOptions(ordered, window, chunk, self._default(priority), retries)
-        sized = [len(iterable) for iterable in iterables if isinstance(iterable, Sized)]
-        calls = zip(*iterables, strict=False)
-        total = min(sized, default=None)
-        return Results(self._sender, lambda: self.slots, function, calls, total, options)
+        self._taking(slots)
+        options = MapOptions(ordered, window, chunk, priority, retries, slots)
+        return Results(Stage(self.client, self.name, function, options), iterables)
 
-    def limited(self, slots: int, priority: int | None = None) -> Self:
-        """Give a handle on the same workers that has at most so many tasks under way.
+    # -- collections and data ----------------------------------------------------------
 
-        With one for each, users of a partition share it. Beyond the limit its `submit` waits
-        until one of its tasks is done; so each of its tasks is wanted until then, also when
-        its future is dropped, unless it is cancelled. It limits what is submitted through
-        this handle: Dask itself knows no users.
+    def compute(self, collections: Any, *, slots: int = 1, **options: Any) -> Any:
+        """Compute Dask collections on these workers: arrays, dataframes, bags, delayed values.
+
+        Each of their tasks takes a slot. Rechunking and shuffling stay on these workers too.
 
         Parameters
         ----------
+        collections
+            One, or a list of them.
         slots
-            Tasks under way at a time, 1 or more.
-        priority
-            Priority of its tasks; by default that of this handle.
+            Slots that each task takes.
+        options
+            Others of `Client.compute`, such as ``sync=True`` for the result in place of a future.
+
+        Returns
+        -------
+        Future or list of Future
+
+        Examples
+        --------
+        >>> total = io.compute(dask.array.ones(10**9).sum())             # doctest: +SKIP
+        >>> total.result()                                               # doctest: +SKIP
+        1000000000.0
+        """
+        keep_shuffles_in(self.client)
+        return self.client.compute(collections, resources=self._taking(slots), **options)
+
+    def persist(self, collections: Any, *, slots: int = 1, **options: Any) -> Any:
+        """Compute Dask collections and keep the results on these workers; see `compute`.
+
+        Returns
+        -------
+        collection or list of collections
+            With the same meaning, backed by futures.
+        """
+        keep_shuffles_in(self.client)
+        return self.client.persist(collections, resources=self._taking(slots), **options)
+
+    def gather(self, futures: Any, **options: Any) -> Any:
+        """Results of futures, in the same nesting; `options` are those of `Client.gather`."""
+        return self.client.gather(futures, **options)
+
+    def scatter(self, data: Any, **options: Any) -> Any:
+        """Put data into the memory of these workers; returns futures.
+
+        Scattered data cannot be computed again when its worker dies.
+
+        Parameters
+        ----------
+        data
+            As `Client.scatter` takes it: a value, a list or a dict of values.
+        options
+            Others of `Client.scatter`, such as ``broadcast=True`` for a copy on each worker.
 
         Raises
         ------
-        ValueError
-            If `slots` is below 1.
+        PoolError
+            If the partition has no workers.
         """
-        handle = copy.copy(self)
-        handle._quota = Quota(slots)
-        if priority is not None:
-            handle.priority = priority
-        return handle
+        addresses = [worker.address for worker in self.workers]
+        if not addresses:  # to Dask that would be any worker
+            raise PoolError(f"Partition {self.name!r} has no workers to keep data.")
+        return self.client.scatter(data, workers=addresses, **options)
 
-    def __copy__(self) -> Self:
-        # By itself `copy` would do what pickle does.
-        twin = object.__new__(type(self))
-        twin.__dict__.update(self.__dict__)
-        return twin
+    def __enter__(self) -> Self:
+        """Have what is computed or submitted in the block run on these workers.
 
-    def _default(self, priority: int | None) -> int:
-        return self.priority if priority is None else priority
+        That is `compute` and `persist` of Dask collections, `dask.compute`, and `Client.submit`
+        and `Client.map` of this partition's client, in this thread. Each task takes a slot.
+
+        Examples
+        --------
+        >>> with io:                                                     # doctest: +SKIP
+        ...     total = dask.array.ones(10**9).sum().compute()
+        """
+        keep_shuffles_in(self.client)
+        with ExitStack() as stack:
+            stack.enter_context(self.client.as_current())
+            stack.enter_context(dask.annotate(resources={self.name: 1}))
+            _entered.set((*_entered.get(), stack.pop_all()))
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        *outer, stack = _entered.get()
+        _entered.set(tuple(outer))
+        stack.close()
 
     # -- workers that come and go ------------------------------------------------------
 

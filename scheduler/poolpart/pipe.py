@@ -24,15 +24,23 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, TypeVar
 
 from distributed import Client, Queue, Variable
 from distributed.diagnostics.plugin import SchedulerPlugin
 
-from .awaiting import await_news, await_room, take_news
 from .errors import PipeClosed, PipeFailed
+from .internals import (
+    AttachedQueue,
+    depth_of,
+    forget_queue,
+    make_queue,
+    set_state,
+    state_of,
+    take_all,
+)
 from .remote import on_scheduler
 from .task_context import own_client
 
@@ -44,7 +52,8 @@ _STATE_MAX_AGE_S = 0.05  # how long a pipe may go on before it sees that it was 
 _WAIT_S = 1.0  # in one request; a pipe that is closed or fails ends it
 _NO_SUCH_PIPE_S = 0.05  # how long the scheduler may look for a Variable; it is there or it is not
 _UNKNOWN_FUTURE_S = 10.0  # how long the scheduler may wait to hear of a future that is put
-_LATE_WORD_S = 2.0  # clients send such words every few milliseconds
+_SOON_S = 0.02  # something that comes will come soon, mostly
+_LOOK_EVERY_S = (0.002, 0.005)  # on the scheduler, first and then; some microseconds each time
 _OWNERS = "poolpart-pipe-owners"
 
 
@@ -55,18 +64,6 @@ class PipeState:
     closed: bool = False
     failure: str = ""  # the reason, empty while there is none
     advice: int = 1
-
-
-class AttachedQueue(Queue):
-    """A Queue that exists already.
-
-    Constructing a `Queue` creates it where it does not exist and counts as a reference, which
-    a killed worker never gives back: a consumer that starts late would revive the queue of
-    a pipe that was deleted. This one does neither.
-    """
-
-    def _maybe_start(self) -> None:
-        """Do not create the queue."""
 
 
 class Pipe:
@@ -376,56 +373,34 @@ def forget_pipes(client: Client, names: Sequence[str]) -> None:
 
 
 async def _open(name: str, owner: str, state: dict[str, Any], dask_scheduler: Any = None) -> bool:
-    queues = dask_scheduler.extensions["queues"]
-    variables = dask_scheduler.extensions["variables"]
-    if name in queues.queues or name in variables.variables:
+    taken = depth_of(dask_scheduler, name) is not None or state_of(dask_scheduler, name) is not None
+    # An owner that was killed, and whose last question is read after that was seen: nobody would
+    # take the pipe away, nor hear the answer.
+    if taken or owner not in dask_scheduler.clients:
         return False
-    if owner not in dask_scheduler.clients:
-        # It was killed, and its last question is read after that was seen: nobody would take
-        # the pipe away, nor hear the answer.
-        return False
-    # Without `maxsize`: see `Pipe.put`.
-    queues.create(name=name)
+    make_queue(dask_scheduler, name)  # without a limit: see `Pipe.put`
     _note_owner(dask_scheduler, name, owner)
-    await variables.set(name=name, data=state)
+    await set_state(dask_scheduler, name, state)
     return True
 
 
 async def _change(
     name: str, changes: dict[str, Any], dask_scheduler: Any = None
 ) -> dict[str, Any] | None:
-    variables = dask_scheduler.extensions["variables"]
-    if name not in variables.variables:
+    state: dict[str, Any] | None = state_of(dask_scheduler, name)
+    if state is None:
         return None
-    state: dict[str, Any] = {**variables.variables[name]["value"]}
     if state["failure"]:  # the first reason is the cause, later ones are its consequences
         changes = {key: value for key, value in changes.items() if key != "failure"}
-    state |= changes
-    await variables.set(name=name, data=state)
+    state = {**state, **changes}
+    await set_state(dask_scheduler, name, state)
     return state
 
 
 async def _forget(names: list[str], dask_scheduler: Any = None) -> None:
-    queues = dask_scheduler.extensions["queues"]
-    variables = dask_scheduler.extensions["variables"]
     _drop_owners(dask_scheduler, names)
     for name in names:
-        while name in queues.queues:
-            queues.release(name=name, client="poolpart")
-        _forget_counts(queues, name)
-        # A consumer's word that it has a future may still be under way, and would be counted.
-        asyncio.get_running_loop().call_later(_LATE_WORD_S, _forget_counts, queues, name)
-        # Futures that were taken by a consumer which died before it could say so.
-        if f"queue-{name}" in dask_scheduler.clients:
-            dask_scheduler.remove_client(f"queue-{name}")
-        if name in variables.variables:
-            await variables.delete(name=name, client="poolpart")
-
-
-def _forget_counts(queues: Any, name: str) -> None:
-    if name not in queues.queues:
-        for counted in [counted for counted in queues.future_refcount if counted[0] == name]:
-            del queues.future_refcount[counted]
+        await forget_queue(dask_scheduler, name)
 
 
 class PipeOwners(SchedulerPlugin):
@@ -459,3 +434,147 @@ def _drop_owners(scheduler: Any, names: Sequence[str]) -> None:
             owners.pop(name, None)
         if not owners:
             scheduler.remove_plugin(_OWNERS)
+
+
+# -- waiting until something happens ----------------------------------------------------
+#
+# Polling over the network costs a request each time, and finds news late. A request that takes an
+# item as soon as one comes loses the item if the client that asked has died. So these ask the
+# scheduler to wait and, but for `take_news`, take nothing: their answer, early or not, says only
+# that it is worth looking now. An answer that nobody reads does no harm.
+
+
+class Backoff:
+    """Pauses that double from `least_s` to `most_s`, and start over after `reset`.
+
+    Examples
+    --------
+    >>> pause = Backoff(least_s=0.001, most_s=0.004)
+    >>> [pause.next() for _ in range(4)]
+    [0.001, 0.002, 0.004, 0.004]
+    >>> pause.reset(); pause.next()
+    0.001
+    """
+
+    def __init__(self, least_s: float = 0.001, most_s: float = 0.016) -> None:
+        if not 0 < least_s <= most_s:
+            raise ValueError(f"Pauses must be 0 < least_s <= most_s, not {least_s} and {most_s}.")
+        self.least_s, self.most_s = least_s, most_s
+        self._next_s = least_s
+
+    def next(self) -> float:
+        """Seconds to pause now."""
+        now, self._next_s = self._next_s, min(2 * self._next_s, self.most_s)
+        return now
+
+    def sleep(self) -> None:
+        """Pause this thread."""
+        time.sleep(self.next())
+
+    def reset(self) -> None:
+        """Something happened: the next pause is the shortest again."""
+        self._next_s = self.least_s
+
+
+def await_news(
+    client: Client, seconds: float, pipes: Collection[str] = (), keys: Collection[str] = ()
+) -> bool:
+    """Wait until there is something in a pipe, or a task has ended, but no longer than so.
+
+    Parameters
+    ----------
+    client
+        A client of the cluster.
+    seconds
+        The longest wait.
+    pipes
+        Names of pipes; one that was closed, has failed or is gone ends the wait as well.
+    keys
+        Keys of tasks; one that the scheduler does not know ends the wait as well.
+
+    Returns
+    -------
+    bool
+        Whether something happened.
+    """
+    return bool(on_scheduler(client, _wait, seconds=seconds, pipes=list(pipes), keys=list(keys)))
+
+
+def await_room(client: Client, seconds: float, pipe: str, capacity: int) -> bool:
+    """Wait until a pipe holds fewer items than so, or is closed, has failed or is gone.
+
+    Returns
+    -------
+    bool
+        Whether that is so; False where the wait was over before.
+    """
+    return bool(on_scheduler(client, _wait_for_room, seconds=seconds, pipe=pipe, most=capacity))
+
+
+def take_news(
+    client: Client, seconds: float, pipes: Collection[str], keys: Collection[str] = ()
+) -> dict[str, list[Any]]:
+    """Wait as `await_news` does, and take what is in the pipes, all in one request.
+
+    What is taken is lost if the client that asked dies meanwhile. So it is for one whose death
+    ends what it asks for anyway. Items must be plain data, not futures.
+
+    Returns
+    -------
+    dict
+        Items by pipe, of those that had some.
+    """
+    found: dict[str, list[Any]] = on_scheduler(
+        client, _take, seconds=seconds, pipes=list(pipes), keys=list(keys)
+    )
+    return found
+
+
+async def _take(
+    seconds: float, pipes: list[str], keys: list[str], dask_scheduler: Any = None
+) -> dict[str, list[Any]]:
+    await _wait(seconds, pipes, keys, dask_scheduler)
+    found = {name: await take_all(dask_scheduler, name) for name in pipes}
+    return {name: items for name, items in found.items() if items}
+
+
+async def _wait_for_room(seconds: float, pipe: str, most: int, dask_scheduler: Any = None) -> bool:
+    return await _until(
+        seconds,
+        lambda: _has_ended(dask_scheduler, pipe) or (depth_of(dask_scheduler, pipe) or 0) < most,
+    )
+
+
+async def _wait(
+    seconds: float, pipes: list[str], keys: list[str], dask_scheduler: Any = None
+) -> bool:
+    return await _until(
+        seconds,
+        lambda: (
+            any(depth_of(dask_scheduler, p) or _has_ended(dask_scheduler, p) for p in pipes)
+            or _any_ended(dask_scheduler, keys)
+        ),
+    )
+
+
+async def _until(seconds: float, condition: Callable[[], bool]) -> bool:
+    start = time.monotonic()
+    while not condition():
+        waited = time.monotonic() - start
+        if waited >= seconds:
+            return False
+        await asyncio.sleep(min(_LOOK_EVERY_S[waited > _SOON_S], seconds - waited))
+    return True
+
+
+def _has_ended(scheduler: Any, name: str) -> bool:
+    """Whether a pipe was closed, has failed or is gone."""
+    state = state_of(scheduler, name)
+    if state is None or depth_of(scheduler, name) is None:
+        return True
+    return bool(state["closed"] or state["failure"])
+
+
+def _any_ended(scheduler: Any, keys: list[str]) -> bool:
+    tasks = (scheduler.tasks.get(key) for key in keys)
+    return any(task is None or task.state in ("memory", "erred") for task in tasks)

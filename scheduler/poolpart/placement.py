@@ -9,6 +9,8 @@ from typing import Any, TypeVar
 
 from distributed import get_worker
 
+from .internals import resources_here
+
 T = TypeVar("T")
 
 
@@ -56,7 +58,7 @@ class Recorder:
             stage=self.stage,
             partition=self.partition,
             worker=str(worker.name),
-            resources=tuple(sorted(worker.state.total_resources)),
+            resources=resources_here(worker),
             start=self.start,
             stop=self.start + (time.perf_counter() - self._begun),
             items=items,

@@ -11,11 +11,9 @@ from distributed import Client
 
 from .declare import declare, dissolve
 from .errors import PoolError
-from .moves import follow, unfollow
 from .page import partitions_page
 from .partition import Partition
 from .probe import probe_worker
-from .rebalancing import Help
 from .remote import ask_workers, worker_identities
 from .rules import Rule, check_request, check_rule, check_rules, choose, divide, rule_of
 from .wording import counted
@@ -272,43 +270,6 @@ class Pool:
         """Add a page of partitions to Dask's dashboard, see `partitions_page`; returns its URL."""
         return partitions_page(self.client)
 
-    def rebalance(self, lender: str, *, helps: str, idle_s: float = 1.0) -> None:
-        """Let idle workers of a partition help another one, from now on.
-
-        While tasks of `helps` wait for a slot, workers of `lender` that have had nothing to
-        do for a while are moved there, as far as its minimum allows. They go back as soon as
-        tasks of `lender` wait, once what they have begun has ended, or when they have had
-        nothing to do there either, for two seconds longer. Until then `grow` and `shrink` leave
-        them alone. The scheduler does this, also when this client has gone.
-
-        Parameters
-        ----------
-        lender, helps
-            Names of the partitions.
-        idle_s
-            Seconds without a task after which a worker counts as idle.
-
-        Raises
-        ------
-        PoolError
-            If there is no such partition.
-
-        Examples
-        --------
-        >>> pool.rebalance("OTHER", helps="GPU")                       # doctest: +SKIP
-        """
-        follow(self.client, Help(lender, helps, idle_s))
-
-    def stop_rebalancing(self, lender: str, *, helps: str, timeout_s: float = 60.0) -> list[str]:
-        """Undo `rebalance`: the workers that were lent go back; returns their names.
-
-        Raises
-        ------
-        PoolError
-            If tasks that they have begun do not end in time; the workers go back when they do.
-        """
-        return unfollow(self.client, lender, helps, timeout_s)
-
     def dissolve(self, timeout_s: float = 30.0) -> list[str]:
         """Undo every partition of this cluster that was made while it ran, whoever made it.
 
@@ -344,8 +305,9 @@ class Pool:
         for name, note in notes.items():
             if note:
                 logger.warning("Partition %r: %s", name, note)
-        declare(self.client, rules, chosen, cluster)
-        return {name: Partition(name, self.client, notes.get(name, "")) for name in rules}
+        common = declare(self.client, rules, chosen, cluster)
+        told = {name: "; ".join(filter(None, (notes.get(name), common))) for name in rules}
+        return {name: Partition(name, self.client, told[name]) for name in rules}
 
     def _cluster_now(self) -> list[WorkerInfo]:
         """Every worker of the cluster; the GPUs of those in this pool are known."""

@@ -2,11 +2,6 @@
 
 What each worker declares is compared with the book, and changed in small steps that can be cut
 off anywhere: a worker or its nanny may die between any two of them.
-
-The scheduler's request to declare other resources goes by another connection than the tasks
-that it sends, and may arrive first. A task that was sent and cancelled at once is forgotten by
-the scheduler while it is on its way; a worker that gets a task for a resource which it does not
-declare breaks down. So a barrier is sent behind the tasks, and the worker waits for it.
 """
 
 from __future__ import annotations
@@ -14,22 +9,114 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-import uuid
 from collections.abc import Awaitable, Callable, Collection, Iterable
 from typing import Any
 
-from .book import Book, Resources, Seat, seat_key
-from .nannies import Nannies
-from .placing import hand_off, held_by, recount, show, wake
-from .remote import call
+from distributed.comm.addressing import parse_address, parse_host_port
+
+from .book import Book, Seat, seat_key
+from .internals import (
+    Resources,
+    call,
+    declare_on_worker,
+    hand_off,
+    held_by,
+    keep_on_nanny,
+    recount,
+    restore_on_nanny,
+    send_barrier,
+    show,
+    wake,
+)
 from .tracing import trace
 
 logger = logging.getLogger(__name__)
 
 LOOK_EVERY_S = 0.01
+_CONNECT_S = 5.0
 
-_HELD_S = 1.0  # how long a worker waits for tasks to give a resource back
-_BARRIER = "poolpart-barrier"
+
+class Nannies:
+    """Tells nannies; part of the steward.
+
+    Parameters
+    ----------
+    scheduler
+        The scheduler.
+    """
+
+    def __init__(self, scheduler: Any) -> None:
+        self.scheduler = scheduler
+        # {address: what it was told; None where its answer has not come, or never will}
+        self._told: dict[str, Resources | None] = {}
+
+    def agrees(self, seat: Seat, wanted: Resources) -> bool:
+        """Whether a worker's nanny, if it has one and was told anything, was told this."""
+        return self._told.get(seat.nanny or "", wanted) == wanted
+
+    def was_told(self, seat: Seat) -> bool:
+        """Whether a worker's nanny starts it with something else than it was found to."""
+        return seat.nanny in self._told
+
+    def forget(self, address: str) -> None:
+        """Forget a nanny that has gone."""
+        self._told.pop(address, None)
+
+    def forget_others(self, known: Collection[str | None]) -> None:
+        """Forget all nannies but these."""
+        for nanny in self._told.keys() - known:
+            del self._told[nanny]
+
+    async def tell(self, seat: Seat, wanted: Resources) -> None:
+        """Have a worker started with these resources from now on.
+
+        Raises
+        ------
+        OSError
+            If its nanny does not answer.
+        """
+        nanny = seat.nanny
+        if nanny is None:
+            return
+        if wanted == seat.found:
+            if nanny in self._told:
+                await call(self.scheduler, nanny, restore_on_nanny)
+                self._told.pop(nanny, None)
+        elif self._told.get(nanny) != wanted:
+            self._told[nanny] = None  # its worker may die before it answers, which ends this
+            await call(self.scheduler, nanny, keep_on_nanny, resources=wanted)
+            self._told[nanny] = wanted
+
+    async def restore(self, seat: Seat) -> None:
+        """Have a worker that is not there started as it was found to be, if it comes back."""
+        nanny = seat.nanny
+        if nanny is not None and nanny in self._told:
+            del self._told[nanny]
+            try:
+                await call(self.scheduler, nanny, restore_on_nanny)
+            except OSError as error:
+                logger.info("The nanny at %s is gone: %s", nanny, error)
+
+
+async def has_gone(nanny: str) -> bool:
+    """Whether nobody listens at a nanny's address: then its worker does not come back.
+
+    Dask itself would try to connect for half a minute. One that cannot be reached for another
+    reason counts as there; so does one that talks TLS, which would complain of each caller that
+    hangs up.
+    """
+    scheme, place = parse_address(nanny)
+    if scheme != "tcp":
+        return False
+    try:
+        async with asyncio.timeout(_CONNECT_S):
+            _, writer = await asyncio.open_connection(*parse_host_port(place))
+    except ConnectionRefusedError:
+        return True
+    except OSError:  # TimeoutError is one
+        return False
+    writer.close()
+    return False
 
 
 class Reconciler:
@@ -188,73 +275,3 @@ class Reconciler:
                 break
             await asyncio.sleep(LOOK_EVERY_S)
         return late
-
-
-# -- on the worker, but for the first --------------------------------------------------
-
-
-async def send_barrier(scheduler: Any, address: str) -> None:
-    """Send a barrier behind all messages to a worker; runs on the scheduler.
-
-    Raises
-    ------
-    OSError
-        If the worker does not answer.
-    """
-    number = uuid.uuid4().hex
-    await call(scheduler, address, _await_barrier, number=number)
-    if address in scheduler.stream_comms:
-        scheduler.worker_send(address, {"op": _BARRIER, "number": number})
-
-
-def _is_awaited(worker: Any) -> bool:
-    """Whether a barrier is still on its way; runs on the worker."""
-    return _BARRIER in worker.stream_handlers
-
-
-def _await_barrier(number: str, dask_worker: Any = None) -> None:
-    awaited = number
-
-    def arrive(number: str) -> None:
-        # Barriers arrive in the order in which they were sent: behind this one there is none.
-        if number == awaited:
-            del dask_worker.stream_handlers[_BARRIER]
-
-    dask_worker.stream_handlers[_BARRIER] = arrive
-
-
-async def declare_on_worker(
-    resources: Resources, after_barrier: bool = False, dask_worker: Any = None
-) -> bool:
-    """Declare these resources and no others; runs on a worker.
-
-    Parameters
-    ----------
-    resources
-        What to declare.
-    after_barrier
-        Whether to wait for what the scheduler has sent before.
-
-    Returns
-    -------
-    done
-        False if tasks still hold a resource that is to go: they give it back when they end,
-        and must find it then. Such a task may be one that was cancelled, of which the
-        scheduler knows nothing any more; it may even be on its way.
-    """
-    state = dask_worker.state
-    total, available = state.total_resources, state.available_resources
-    leaving = total.keys() - resources.keys()
-    for _ in range(int(_HELD_S / 0.01)):
-        held = any(available[name] < total[name] for name in leaving)
-        if not held and not (after_barrier and _is_awaited(dask_worker)):
-            break
-        await asyncio.sleep(0.01)
-    else:
-        return False
-    for name in leaving:
-        del total[name], available[name]
-    for name, quantity in resources.items():
-        available[name] = available.get(name, 0) + quantity - total.get(name, 0)
-        total[name] = quantity
-    return True

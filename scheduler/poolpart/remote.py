@@ -1,8 +1,4 @@
-"""Running functions on the scheduler, workers and nannies of a cluster.
-
-`on_scheduler`, `ask_workers` and `worker_identities` are called by clients; `call` is called on
-the scheduler, in its event loop.
-"""
+"""Running functions on the scheduler and workers of a cluster, by clients."""
 
 from __future__ import annotations
 
@@ -11,10 +7,9 @@ from typing import Any
 
 from distributed import Client
 from distributed.comm.core import CommClosedError
-from distributed.protocol.pickle import dumps
-from distributed.protocol.serialize import Serialize, Serialized, deserialize
 
 from .errors import PoolError
+from .internals import identities
 
 
 def on_scheduler(client: Client, function: Callable[..., Any], **kwargs: Any) -> Any:
@@ -52,18 +47,13 @@ def check_client(client: Client) -> None:
 def worker_identities(client: Client) -> dict[str, dict[str, Any]]:
     """Ask the scheduler for all its workers, by address.
 
-    `Client.scheduler_info(n_workers=-1)` asks too, but returns what is in an attribute by then.
-    Every two seconds the client itself puts an answer there that has no workers, so that on a
-    busy machine a cluster of hundreds looks empty now and then.
-
     Raises
     ------
     PoolError
         If the client is closed, or asynchronous.
     """
     check_client(client)
-    identity: dict[str, Any] = client.sync(client.scheduler.identity, n_workers=-1)
-    workers: dict[str, dict[str, Any]] = identity["workers"]
+    workers: dict[str, dict[str, Any]] = client.sync(identities, client)
     return workers
 
 
@@ -99,22 +89,3 @@ def ask_workers(
 def _has_died(answer: Any, is_here: bool) -> bool:
     # An OSError may also be what the question raised on a worker that is well.
     return isinstance(answer, CommClosedError) or (isinstance(answer, OSError) and not is_here)
-
-
-async def call(scheduler: Any, address: str, function: Callable[..., Any], **arguments: Any) -> Any:
-    """Call a function in the event loop of a worker or nanny, which it gets as `dask_worker`.
-
-    Raises
-    ------
-    OSError
-        If nobody answers there, or the function raises something.
-    """
-    answer = await scheduler.rpc(address).run(function=dumps(function), kwargs=dumps(arguments))
-    if answer["status"] != "OK":
-        raise OSError(answer["exception_text"])
-    result = answer["result"]
-    # The scheduler leaves what passes through it as it came: as bytes, or not yet packed where
-    # the worker is in the same process.
-    if isinstance(result, Serialized):
-        return deserialize(result.header, result.frames)
-    return result.data if isinstance(result, Serialize) else result

@@ -174,28 +174,25 @@ def slots_of(worker: Any, partition: str) -> int:
     return int(worker.resources.get(partition, 0)) if partition else int(worker.nthreads)
 
 
-def running_on(worker: Any, partition: str) -> Counter[str]:
-    """Tasks of a partition that a worker runs, by stage, as far as the scheduler knows.
+def running_on(worker: Any, partition: str) -> tuple[Counter[str], int]:
+    """Tasks of a partition that a worker runs, by stage, and the slots that they hold.
 
-    It knows what it gave to a worker: of that, as many run as the worker has slots. Tasks that
-    were submitted from inside others take none, but a thread each.
+    As far as the scheduler knows, which is what it gave to a worker: of that, as many run as the
+    worker has slots. Tasks that were submitted from inside others take none, but a thread each.
     """
     slots, threads = slots_of(worker, partition), worker.nthreads
-    holding = nested = 0
+    held = nested = 0
     stages: Counter[str] = Counter()
     for task in islice(worker.processing, _LOOK_AT_MOST):
         if partition_of(task) != partition:
             continue
-        if partition and not task.resource_restrictions[partition]:
-            nested += 1
-            if nested > threads:
-                continue
-        else:
-            holding += 1
-            if holding > slots:
-                break
+        takes = int(task.resource_restrictions[partition]) if partition else 1
+        if held + takes > slots or (not takes and nested == threads):
+            continue
+        held += takes
+        nested += not takes
         stages[task.prefix.name] += 1
-    return stages
+    return stages, held
 
 
 @dataclass(frozen=True)
@@ -325,14 +322,12 @@ def told(scheduler: Any, name: str) -> dict[str, Any]:
     """Statistics of a partition as plain values; runs on the scheduler."""
     workers = members(scheduler, name)
     by_worker = [running_on(worker, name) for worker in workers]
-    running: Counter[str] = sum(by_worker, Counter())
-    slots = [slots_of(worker, name) for worker in workers]
-    busy = sum(min(stages.total(), has) for stages, has in zip(by_worker, slots, strict=True))
+    running: Counter[str] = sum((stages for stages, _ in by_worker), Counter())
     return {
         "name": name,
         "workers": len(workers),
-        "slots": sum(slots),
-        "busy": busy,
+        "slots": sum(slots_of(worker, name) for worker in workers),
+        "busy": sum(held for _, held in by_worker),
         "exclusive": name in fences_of(scheduler),
         "stages": {
             stage: {

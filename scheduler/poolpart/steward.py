@@ -9,20 +9,17 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Hashable, Iterator
+from collections.abc import Coroutine, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 from distributed.diagnostics.plugin import SchedulerPlugin
 from tornado.ioloop import PeriodicCallback
 
-from .adapting import Adapting
 from .book import Book, Seat, seat_key
-from .nannies import Nannies, has_gone
+from .internals import call, forget_resources
 from .probe import probe_worker
-from .rebalancing import Rebalancing
-from .reconciler import Reconciler
-from .remote import call
+from .reconciler import Nannies, Reconciler, has_gone
 from .rules import PerGpu, partition_for
 from .worker_info import WorkerInfo
 
@@ -49,13 +46,9 @@ class Steward(SchedulerPlugin):
         self.asked = 0  # questions of clients that are being answered
         self.nannies = Nannies(scheduler)
         self.reconciler = Reconciler(scheduler, self.book, self.nannies, self._find_place)
-        self.rebalancing = Rebalancing(scheduler, self.book, self.reconciler)
-        self.adapting = Adapting(scheduler, self.book)
-        self.adapting.install()
         self._looked_at: Any = None  # rules and members when nobody wanted those without a place
         self._resources_before = set(scheduler.resources)
-        self._missed: set[asyncio.Task[None]] = set()  # looks whether workers come back
-        self._restoring: dict[Hashable, asyncio.Task[None]] = {}  # {key of the seat: …}
+        self._work: set[asyncio.Task[None]] = set()  # else it might be collected
         for worker in scheduler.workers.values():
             self._seat(worker)
         self._ticker = PeriodicCallback(self._tick, 1000 * TICK_S)
@@ -78,7 +71,7 @@ class Steward(SchedulerPlugin):
             if seat.nanny is not None:
                 self.nannies.forget(seat.nanny)
         seat.info, seat.nanny = info, worker.nanny
-        seat.absent_since, seat.given_up = None, False
+        seat.absent_since = None
         return seat
 
     def add_worker(self, scheduler: Any, worker: str) -> None:
@@ -86,7 +79,6 @@ class Steward(SchedulerPlugin):
         known = {s.key for s in self.book.seats.values() if s.holds}
         seat = self._seat(scheduler.workers[worker])
         if seat.key not in known:
-            seat.joined = time.monotonic()
             declared = [name for name in self.book.rules if seat.found.get(name)]
             if declared:
                 self.book.put(seat, declared[0], seat.found[declared[0]])
@@ -100,9 +92,12 @@ class Steward(SchedulerPlugin):
         for seat in self.book.seats.values():
             if seat.info.address == worker and seat.absent_since is None:
                 seat.absent_since = time.monotonic()
-                missed = asyncio.ensure_future(self._miss(seat))
-                self._missed.add(missed)
-                missed.add_done_callback(self._missed.discard)
+                self._begin(self._miss(seat))
+
+    def _begin(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.ensure_future(work)
+        self._work.add(task)
+        task.add_done_callback(self._work.discard)
 
     async def _miss(self, seat: Seat) -> None:
         """Give up the place of a worker whose nanny is gone as well, so that another has it."""
@@ -117,8 +112,16 @@ class Steward(SchedulerPlugin):
                 seat.nanny = None
 
     def valid_workers_downscaling(self, scheduler: Any, workers: list[Any]) -> list[Any]:
-        """Choose those that an adaptive cluster may stop."""
-        return self.adapting.spare(workers)
+        """Choose those that an adaptive cluster may stop: each partition keeps its minimum."""
+        may_stop = {worker.address: worker for worker in workers}
+        for name, rule in self.book.rules.items():
+            members = self.book.members(name, present=True)
+            offered = [m.info.address for m in members if m.info.address in may_stop]
+            # The busiest stay.
+            offered.sort(key=lambda address: -len(may_stop[address].processing))
+            for address in offered[: max(0, rule.minimum - (len(members) - len(offered)))]:
+                del may_stop[address]
+        return list(may_stop.values())
 
     async def close(self) -> None:
         """Stop with the scheduler."""
@@ -127,31 +130,20 @@ class Steward(SchedulerPlugin):
     def stop(self) -> None:
         """Do nothing more."""
         self._ticker.stop()
-        self.adapting.uninstall()
         self.reconciler.stop()
-        for task in (*self._missed, *self._restoring.values()):
+        for task in self._work:
             task.cancel()
 
     def _tick(self) -> None:
         if not self.book.rules:
-            self._restore_nannies()
             self.remove_if_done()
             return
-        self.rebalancing.look(time.monotonic())
         if any(seat.absent_since is not None for seat in self.book.seats.values()):
-            for gone in self.book.vacated():
-                self._pass_on(gone)
             self.book.forget(time.monotonic())
             self.nannies.forget_others({seat.nanny for seat in self.book.seats.values()})
         waiting = [s for s in self.book.seats.values() if s.unplaced and s.absent_since is None]
         if waiting:
             self._look_for_places(waiting)
-
-    def _pass_on(self, gone: Seat) -> None:
-        """Give the place of a worker to one that joined while it was kept."""
-        if seat := self.book.replacement(gone):
-            self.book.put(seat, gone.partition)
-            self.reconciler.settle([seat])
 
     def _look_for_places(self, waiting: list[Seat]) -> None:
         """Place workers that nobody wanted: another may have gone for good since.
@@ -195,35 +187,22 @@ class Steward(SchedulerPlugin):
 
     # -- the end -----------------------------------------------------------------------
 
-    def _restore_nannies(self) -> None:
-        """Let workers come back as they were found for whom nobody waits any more."""
-        for seat in self.book.seats.values():
-            if seat.key not in self._restoring and self._is_to_be_restored(seat):
-                self._restoring[seat.key] = asyncio.ensure_future(self._restore(seat))
-
-    async def _restore(self, seat: Seat) -> None:
-        while self._is_to_be_restored(seat):
-            await self.nannies.restore(seat)
-            await asyncio.sleep(10 * TICK_S)
-        del self._restoring[seat.key]
-
-    def _is_to_be_restored(self, seat: Seat) -> bool:
-        return seat.absent_since is not None and not seat.holds and self.nannies.was_told(seat)
-
     def _at_rest(self, seat: Seat) -> bool:
         """Whether nothing is left to do for a worker, or its nanny, which may start it again."""
         if seat.absent_since is None:
             return self.reconciler.settled(seat)
-        return not self.nannies.was_told(seat)
+        # One that takes longer comes as it was: its nanny is asked once more before.
+        return not (seat.holds and self.nannies.was_told(seat))
 
     def remove_if_done(self) -> None:
         """Leave the scheduler, once there are no partitions and all workers are as they were."""
         if self.book.rules or self.asked or not all(map(self._at_rest, self.book.seats.values())):
             return
         self.stop()
-        for name in self.book.names - self._resources_before:
-            if not self.scheduler.resources.get(name, True):
-                del self.scheduler.resources[name]
+        for seat in self.book.seats.values():
+            if self.nannies.was_told(seat):
+                self._begin(self.nannies.restore(seat))
+        forget_resources(self.scheduler, self.book.names - self._resources_before)
         if self.scheduler.plugins.get(NAME) is self:
             self.scheduler.remove_plugin(NAME)
 

@@ -7,12 +7,11 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from distributed import Client
-from distributed.scheduler import heartbeat_interval
 
 from .remote import on_scheduler
 
 SILENT_S = 20.0  # without a heartbeat; a stopped worker gives none, nor one whose GIL is held
-_BEATS = 3  # heartbeats that a worker may miss at least; in a large cluster they are rare
+_BEATS = 3  # heartbeats that a worker may miss at least
 
 
 @dataclass(frozen=True)
@@ -94,7 +93,8 @@ def silent_workers(scheduler: Any, patience_s: float) -> set[str]:
     # The scheduler's own clock: where all have been silent for as long, it is the scheduler
     # that was stopped or busy, and they are about to be heard.
     now = max((ws.last_seen for ws in scheduler.workers.values()), default=0.0)
-    patience_s = max(patience_s, _BEATS * heartbeat_interval(len(scheduler.workers)))
+    # As Dask has it: in a large cluster they are rare.
+    patience_s = max(patience_s, _BEATS * (1 + len(scheduler.workers) / 100))
     return {ws.address for ws in scheduler.workers.values() if now - ws.last_seen > patience_s}
 
 

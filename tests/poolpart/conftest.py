@@ -10,7 +10,7 @@ import pytest
 from distributed import Client, Nanny, Scheduler, SpecCluster, Worker
 
 from poolpart import Pipe, Pool, local_cluster
-from poolpart.local import _NannyCluster
+from poolpart.internals import FixedCluster
 
 QUIET = 50  # logging level: the workers that tests kill are not news
 
@@ -82,7 +82,7 @@ def nanny_cluster():
         "options": {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0", "dashboard": False},
     }
     # Not a bare SpecCluster: it gives up a worker that is dead 15 seconds after another death.
-    return _NannyCluster(workers=spec, scheduler=scheduler, silence_logs=QUIET)
+    return FixedCluster(workers=spec, scheduler=scheduler, silence_logs=QUIET)
 
 
 @pytest.fixture(scope="session")

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from poolpart import Backoff, Pipe, await_news, take_news
-from poolpart.awaiting import await_room
+from poolpart.pipe import await_room
 
 LONG_S = 120.0  # nobody waits so long: a test that does has failed
 

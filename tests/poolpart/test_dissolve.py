@@ -24,7 +24,7 @@ from poolpart import (
     steward,
     worker_identities,
 )
-from poolpart import nannies as their
+from poolpart import reconciler as their
 
 LONG_S = 120.0
 
@@ -104,7 +104,6 @@ def test_everything_is_as_before(start, wait_until):
     client.gather([part.submit(here), *(p.submit(here) for p in parts.values())])
     parts["A"].grow(1)
     parts["C"].minimum  # noqa: B018 - asks the scheduler
-    pool.rebalance("A", helps="B", idle_s=0.0)
     wait_until(lambda: client.cluster.scheduler.tasks.keys() == {"held"})
     assert known(client) != before
     assert sorted(Pool.from_client(client).dissolve()) == ["A", "B", "C", "GPU"]
@@ -240,19 +239,6 @@ def test_one_partition(start):
     assert declared(client) == {"a": {}, "b": {}, "c": {}}
 
 
-def test_whoever_was_lent_goes_home_first(start, wait_until):
-    client = start({name: {} for name in "abc"})
-    parts = Pool.from_client(client).divide({"A": named("a"), "B": rest()})
-    Pool.from_client(client).rebalance("B", helps="A", idle_s=0.0)
-    event = Event("lent", client)
-    tasks = [parts["A"].submit(wait_for, "lent") for _ in range(6)]
-    wait_until(lambda: len(parts["A"]) == 3)
-    threading.Timer(0.3, event.set).start()
-    parts["A"].dissolve(timeout_s=LONG_S)
-    assert all(client.gather(tasks))
-    assert declared(client) == {"a": {}, "b": {"B": 1}, "c": {"B": 1}}
-
-
 def test_workers_that_join_afterwards_are_left_alone(start):
     client = start({"a": {}})
     pool = Pool.from_client(client)
@@ -340,10 +326,10 @@ def start_once(path, dask_worker):
     dask_worker.preload = dask_worker.process.worker_kwargs["preload"] = [wait]
 
 
-def test_a_worker_that_comes_back_when_nobody_expects_it_is_as_it_was(
+def test_a_worker_that_comes_back_after_all_is_as_it_was(
     own_nannies, wait_until, monkeypatch, tmp_path
 ):
-    """Its place has been given up by then, and there is no partition any more."""
+    """There is no partition any more by then."""
     part = Pool.from_client(own_nannies).divide({"A": rest()})["A"]
     victim, gate = part.workers[0], tmp_path / "gate"
     own_nannies.run(start_once, str(gate), nanny=True)
@@ -352,9 +338,6 @@ def test_a_worker_that_comes_back_when_nobody_expects_it_is_as_it_was(
     wait_until(lambda: len(part.workers) == 1)
     with pytest.raises(PoolError, match="did not answer while A were dissolved; they become what"):
         part.dissolve(timeout_s=0.1)
-    monkeypatch.setattr("poolpart.book.HOLD_S", 0.0)  # from here on nobody expects it
-    nanny = next(n for n in own_nannies.cluster.workers.values() if str(n.name) == victim.name)
-    wait_until(lambda: nanny.resources is None)  # it was told, but its worker is on its way
     gate.touch()
     own_nannies.wait_for_workers(2, timeout=LONG_S)
     wait_until(lambda: steward.NAME not in own_nannies.cluster.scheduler.plugins)

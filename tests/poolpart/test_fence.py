@@ -13,7 +13,7 @@ import dask.array
 import pytest
 from distributed import get_worker, wait, worker_client
 
-from poolpart import Partition, Pool, PoolError
+from poolpart import Partition, Pool
 from poolpart.fence import (
     NAME,
     enclose,
@@ -23,7 +23,6 @@ from poolpart.fence import (
     raised_fences,
     settle_fences,
 )
-from poolpart.override import Overrides
 
 LONG_S = 120.0
 CLUSTER = {
@@ -456,33 +455,3 @@ def test_a_lowered_fence_leaves_nothing(client):
     assert raised_fences(client) == frozenset()
     assert look() == before
     assert set(mapped(client)) == {*CLUSTER}
-
-
-def test_another_version_of_dask_is_refused():
-    class Owner:
-        def kept(self):
-            return 1
-
-    owner, overrides = Owner(), Overrides()
-    overrides.put(owner, {"kept": lambda original: original() + 1})
-    assert owner.kept() == 2
-    with pytest.raises(PoolError, match=r"Owner of distributed [0-9.]+ has no decide"):
-        overrides.put(owner, {"kept": lambda original: 0, "decide": lambda original: 0})
-    assert owner.kept() == 1
-    assert vars(owner) == {}
-
-
-def test_two_may_override_the_same_method():
-    class Owner:
-        def value(self, more):
-            return [more]
-
-    owner, first, second = Owner(), Overrides(), Overrides()
-    first.put(owner, {"value": lambda original, more: [*original(more), "first"]})
-    second.put(owner, {"value": lambda original, more: [*original(more), "second"]})
-    assert owner.value(0) == [0, "first", "second"]
-    first.take_back()
-    assert owner.value(0) == [0, "second"]
-    second.take_back()
-    assert owner.value(0) == [0]
-    assert vars(owner) == {}

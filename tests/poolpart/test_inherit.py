@@ -8,10 +8,24 @@ import pytest
 from distributed import get_client, get_worker, secede, worker_client
 
 from poolpart import Partition, Pool
-from poolpart.inherit import disinherit, inherit
+from poolpart.inherit import begin_inheritance, end_inheritance
 
 LONG_S = 120.0
 CLUSTER = {"A-0": {"resources": {"A": 1}}, "B-0": {"resources": {"B": 1}}, "plain": {}}
+
+
+def inherit(client, name):
+    async def begin(dask_scheduler):
+        begin_inheritance(dask_scheduler, name)
+
+    client.run_on_scheduler(begin)
+
+
+def disinherit(client, name):
+    async def end(dask_scheduler):
+        end_inheritance(dask_scheduler, name)
+
+    client.run_on_scheduler(end)
 
 
 def here(*_):

@@ -200,7 +200,7 @@ def test_advice_where_there_is_no_home(monkeypatch):
     def no_home():
         raise RuntimeError("Could not determine home directory.")
 
-    monkeypatch.setattr("poolpart.local._NannyCluster", lambda **_: no_home())
+    monkeypatch.setattr("poolpart.local.FixedCluster", lambda **_: no_home())
     with pytest.raises(PoolError, match=r"under `if __name__.* killed while it started: .*memory"):
         local_cluster({"A": (1, 1)})
     monkeypatch.setattr("poolpart.local.Path.home", no_home)

@@ -3,16 +3,17 @@
 import itertools
 import logging
 import os
-import queue
 import signal
 import threading
 import time
 import uuid
 import weakref
+from collections import Counter
 from typing import ClassVar
 
 import pytest
-from distributed import CancelledError, Client, Event, wait
+from distributed import CancelledError, Client, Event, get_worker
+from distributed.comm import tcp
 
 from poolpart import Partition, Pool
 
@@ -284,78 +285,91 @@ def test_a_partition_without_workers_is_told_of(client, caplog):
     results.close()
 
 
-# -- quotas ----------------------------------------------------------------------------
+# -- maps of maps ----------------------------------------------------------------------
 
 
-def test_a_limited_handle_has_so_many_tasks_under_way(a, client, gate, wait_until):
-    mine, others = a.limited(2), a.limited(1, priority=4)
-    assert (mine.name, mine.slots, mine.priority, others.priority) == ("A", 4, 0, 4)
-    first = mine.submit(wait_for, gate.name)
-    results = mine.map(wait_for, [gate.name] * 20, chunk=1)
-    wait_until(lambda: task_count(client) == 2)
-    assert others.submit(twice, 2).result(LONG_S) == 4  # it has a quota of its own
-    assert unfinished(client) == 2
-    gate.set()
+def block(_):
+    return bytearray(2**20)
+
+
+def length_and_place(data, other=0):
+    return len(data) + other, get_worker().name.partition("-")[0]
+
+
+@pytest.fixture
+def counted(monkeypatch):
+    """Bytes that this process, which has driver and scheduler, sends and receives."""
+    count = Counter()
+
+    async def sent(*args, **kwargs):
+        frames = await to_frames(*args, **kwargs)
+        count["sent"] += sum(memoryview(frame).nbytes for frame in frames)
+        return frames
+
+    async def received(frames, *args, **kwargs):
+        count["received"] += sum(memoryview(frame).nbytes for frame in frames)
+        return await from_frames(frames, *args, **kwargs)
+
+    to_frames, from_frames = tcp.to_frames, tcp.from_frames
+    monkeypatch.setattr(tcp, "to_frames", sent)
+    monkeypatch.setattr(tcp, "from_frames", received)
+    return count
+
+
+def test_a_map_of_a_map_keeps_data_away_from_driver_and_scheduler(processes, counted):
+    io, gpu = Partition("IO", processes), Partition("GPU", processes)
+    counted.clear()
+    results = list(gpu.map(length_and_place, io.map(block, range(64))))
+    assert results == [(2**20, "GPU")] * 64
+    assert 0 < counted["sent"] + counted["received"] < 2**20  # of 64 MiB
+    # What the user iterates over does come here.
+    assert len(list(gpu.map(length_and_place, (b for b in io.map(block, range(8)))))) == 8
+    assert counted["received"] > 8 * 2**20
+
+
+@pytest.mark.parametrize("chunk", [None, 3])
+def test_a_map_of_a_map_of_a_map_with_other_arguments(a, b, chunk):
+    inner = a.map(twice, range(500), chunk=chunk)
+    middle = b.map(add, itertools.count(), inner)
+    outer = a.map(twice, middle)
+    assert list(outer) == [6 * x for x in range(500)]
+    assert list(middle) == list(inner) == []  # whoever has taken them over has them
+    short = b.map(add, a.map(twice, range(500), chunk=chunk), range(7))
+    assert list(short) == [3 * x for x in range(7)]
+    twins = b.map(add, a.map(twice, range(50)), a.map(twice, range(50)))
+    assert list(twins) == [4 * x for x in range(50)]
+
+
+def test_a_map_that_has_begun_is_an_iterable_like_others(a, b):
+    inner = a.map(twice, range(9), chunk=1)
+    assert next(inner) == 0
+    assert list(b.map(twice, inner)) == [4 * x for x in range(1, 9)]
+
+
+def test_a_map_of_an_endless_map_has_a_bounded_number_under_way(a, b, client):
+    results = b.map(twice, a.map(twice, itertools.count(), chunk=1), chunk=1)
     most = 0
-    for result in results:
-        most = max(most, unfinished(client))
-        assert result
-    assert most <= 2
-    assert first.result(LONG_S)
-
-
-def test_a_limited_handle_submits_many_as_others_are_done(a):
-    assert [f.result(LONG_S) for f in a.limited(3).submit_many(twice, range(50))] == [
-        2 * x for x in range(50)
-    ]
-
-
-def test_two_maps_share_the_quota_of_their_handle(a):
-    handle = a.limited(1)
-    doubles, sums = handle.map(twice, range(40)), handle.map(add, range(40), range(40))
-    pairs = list(zip(doubles, sums, strict=True))
-    assert pairs == [(2 * x, 2 * x) for x in range(40)]
-
-
-def test_a_task_that_failed_or_was_cancelled_gives_its_place_back(a, gate):
-    handle = a.limited(1)
-    wait([handle.submit(fail_at_3, 3)], timeout=LONG_S)
-    handle.submit(wait_for, gate.name).cancel()
-    results = handle.map(wait_for, [gate.name] * 3)
+    for number in range(200):
+        assert next(results) == 4 * number
+        most = max(most, task_count(client))
+    assert most <= 4 * (2 * 4 + 2 * 1)  # two tasks an item, those that wait and those that ended
     results.close()
-    last = handle.submit(twice, 1)
-    gate.set()  # what was cancelled goes on on its worker, which may be the one for the last
-    assert last.result(LONG_S) == 2
 
 
-def test_what_cannot_be_submitted_gives_its_places_back(a):
-    handle, lock = a.limited(2), threading.Lock()
-    for _ in range(3):
-        with pytest.raises(TypeError, match="must be a callable"):
-            handle.submit(3)
-        with pytest.raises(TypeError, match="Could not serialize"):
-            handle.submit(twice, lock)
-        with pytest.raises(TypeError, match="Could not serialize"):
-            handle.map(twice, [lock] * 9)
-    assert handle.submit(twice, 1).result(LONG_S) == 2
+@pytest.mark.parametrize("chunk", [1, 2, None])
+def test_an_error_of_the_inner_map_names_its_item(a, b, chunk):
+    results = b.map(twice, a.map(fail_at_3, range(9), chunk=chunk))
+    got = []
+    with pytest.raises(ZeroDivisionError, match="at 3") as caught:
+        got.extend(iter_until_error(results, got))
+    assert got == [0, 2, 4]
+    assert "this was item 3 of a map: 3" in "".join(caught.value.__notes__)
 
 
-def test_a_callback_may_submit_more_than_the_quota(a):
-    handle, submitted = a.limited(1), queue.SimpleQueue()
-
-    def go_on(_):
-        for number in range(3):
-            submitted.put(handle.submit(twice, number))
-
-    handle.submit(twice, 1).add_done_callback(go_on)
-    futures = [submitted.get(timeout=LONG_S) for _ in range(3)]
-    assert [future.result(LONG_S) for future in futures] == [0, 2, 4]
-
-
-@pytest.mark.parametrize("slots", [0, -1, 1.5])
-def test_quotas_are_checked(a, slots):
-    with pytest.raises(ValueError, match=f"A quota of {slots} slots; give a whole number"):
-        a.limited(slots)
+def iter_until_error(results, got):
+    for result in results:
+        got.append(result)
+    return []
 
 
 # -- lost workers ----------------------------------------------------------------------

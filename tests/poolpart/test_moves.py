@@ -17,14 +17,13 @@ from poolpart import (
     PoolError,
     n_workers,
     per_host,
-    rebalancing,
     reconciler,
     recorded,
     rest,
     trace_to,
     worker_identities,
 )
-from poolpart.placing import wake
+from poolpart.internals import wake
 
 LONG_S = 120.0
 
@@ -344,103 +343,6 @@ def test_a_cluster_that_was_divided_when_it_was_started(start):
     assert Pool.from_client(client).dissolve() == ["A", "B"]
     assert declared(client) == {"a": {"A": 1}, "b": {"B": 2}, "c": {"B": 2}}
     assert set(client.cluster.scheduler.plugins) == plugins
-
-
-# -- rebalancing -----------------------------------------------------------------------
-
-
-def test_idle_workers_help_and_go_back(divided, wait_until):
-    client, parts = divided
-    pool = Pool.from_client(client)
-    pool.rebalance("C", helps="B", idle_s=0.1)
-    pool.rebalance("C", helps="B", idle_s=0.1)
-    home = members(parts["C"])
-    event = Event("help", client)
-    tasks = [parts["B"].submit(wait_for, "help") for _ in range(3)]
-    wait_until(lambda: len(parts["B"]) == 3)
-    assert not members(parts["C"])
-    event.set()
-    client.gather(tasks)
-    wait_until(lambda: members(parts["C"]) == home)
-
-
-def test_whoever_helps_goes_back_when_needed(divided, wait_until):
-    client, parts = divided
-    Pool.from_client(client).rebalance("C", helps="B", idle_s=0.1)
-    events = {name: Event(name, client) for name in ("b", "c")}
-    tasks = [parts["B"].submit(recorded, "s", "B", wait_for, "b") for _ in range(3)]
-    wait_until(lambda: len(parts["B"]) == 3)
-    # There is nobody in C: its task waits for nobody, and calls somebody back.
-    tasks += [parts["C"].submit(recorded, "s", "C", wait_for, "c")]
-    events["b"].set()
-    wait_until(lambda: len(parts["C"]) >= 1)
-    events["c"].set()
-    assert not any(record.misplaced for _, record in client.gather(tasks))
-
-
-def test_the_lender_keeps_its_minimum(start, wait_until, monkeypatch):
-    monkeypatch.setattr(rebalancing, "SETTLE_IN_S", 3600.0)  # nobody goes back by itself
-    client = start({name: {} for name in "abcd"})
-    parts = Pool.from_client(client).divide({"A": n_workers(1), "B": rest(minimum=2)})
-    pool = Pool.from_client(client)
-    pool.rebalance("B", helps="A", idle_s=0.0)
-    event = Event("minimum", client)
-    tasks = [parts["A"].submit(wait_for, "minimum") for _ in range(9)]
-    wait_until(lambda: len(parts["A"]) == 2)
-    time.sleep(0.5)
-    assert (len(parts["A"]), len(parts["B"])) == (2, 2)
-    event.set()
-    client.gather(tasks)
-    pool.stop_rebalancing("B", helps="A")
-    assert (len(parts["A"]), len(parts["B"])) == (1, 3)
-
-
-def test_a_borrower_keeps_its_minimum_when_its_helpers_go_back(divided, wait_until, monkeypatch):
-    monkeypatch.setattr(rebalancing, "SETTLE_IN_S", 3600.0)  # nobody goes back by itself
-    client, parts = divided
-    pool = Pool.from_client(client)
-    pool.rebalance("C", helps="A", idle_s=0.0)
-    event = Event("borrower", client)
-    tasks = [parts["A"].submit(wait_for, "borrower") for _ in range(9)]
-    wait_until(lambda: len(parts["A"]) == 5)
-    event.set()
-    client.gather(tasks)
-    assert len(parts["A"].shrink(2)) == 2
-    with pytest.raises(PoolError, match="cannot shrink by 1: it has 1 worker and needs at least 1"):
-        parts["A"].shrink(1)
-    with pytest.raises(PoolError, match="'B' cannot grow by 1: partition 'A', beyond its minimum"):
-        parts["B"].grow(1, source="A")
-    pool.stop_rebalancing("C", helps="A")
-    assert (len(parts["A"]), len(parts["B"]), len(parts["C"])) == (1, 1, 4)
-    assert parts["A"].minimum == 1
-
-
-def test_rebalancing_that_makes_no_sense(divided):
-    client, _ = divided
-    pool = Pool.from_client(client)
-    with pytest.raises(PoolError, match="'A' cannot help itself"):
-        pool.rebalance("A", helps="A")
-    with pytest.raises(PoolError, match="idle_s is -1"):
-        pool.rebalance("A", helps="B", idle_s=-1)
-    with pytest.raises(PoolError, match="There is no partition 'X'"):
-        pool.rebalance("A", helps="X")
-    assert pool.stop_rebalancing("A", helps="B") == []
-
-
-def test_whoever_helps_and_is_killed_goes_back(nannies, wait_until):
-    pool = Pool.from_client(nannies)
-    parts = pool.divide({"A": n_workers(1), "B": n_workers(1, minimum=0)})
-    helper = parts["B"].workers[0]
-    pool.rebalance("B", helps="A", idle_s=0)
-    event = Event("helper", nannies)
-    tasks = [parts["A"].submit(wait_for, "helper") for _ in range(4)]
-    wait_until(lambda: len(parts["A"]) == 2)
-    os.kill(nannies.run(os.getpid, workers=[helper.address])[helper.address], signal.SIGKILL)
-    wait_until(lambda: helper.address not in worker_identities(nannies))
-    assert pool.stop_rebalancing("B", helps="A", timeout_s=LONG_S) == [helper.name]
-    assert members(parts["B"]) == [helper.name]
-    event.set()
-    nannies.gather(tasks)
 
 
 # -- whoever dies in between -----------------------------------------------------------

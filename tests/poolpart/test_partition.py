@@ -1,12 +1,15 @@
 """Tasks of a partition: where they run, in which order, and how many at a time."""
 
-import pickle
 import time
 import uuid
 from functools import partial
 
+import dask
+import dask.array as da
+import dask.bag
+import numpy as np
 import pytest
-from distributed import Client, Event, Variable, get_worker, secede, wait
+from distributed import Client, Event, Variable, get_worker, secede
 
 from poolpart import Partition, Pool, PoolError, own_client
 
@@ -107,30 +110,6 @@ def test_higher_priority_runs_first(b, client, wait_until):
     assert max(future.result() for future in high) < min(future.result() for future in low)
 
 
-def test_the_priority_of_the_partition_is_that_of_its_tasks(client, wait_until):
-    tasks = client.cluster.scheduler.tasks
-
-    def priority(future):
-        return -tasks[future.key].priority[0]
-
-    partition = Partition("B", client, priority=3)
-    one, two = partition.submit(stamp, 0), partition.submit(stamp, 0, priority=0)
-    many = partition.submit_many(stamp, range(2))
-    wait([one, two, *many])
-    assert [priority(future) for future in (one, two, *many)] == [3, 0, 3, 3]
-    partition.priority = 7
-    later = partition.submit(stamp, 0)
-    wait([later])
-    assert priority(later) == 7
-    gate = Event(f"gate-{uuid.uuid4().hex}", client=client)
-    results = partition.map(wait_for, [gate.name])
-    wait_until(lambda: any(key.startswith("map-") for key in list(tasks)))
-    (mapped,) = (task for key, task in list(tasks.items()) if key.startswith("map-"))
-    assert -mapped.priority[0] == 7
-    gate.set()  # else it may hold its worker for long
-    results.close()
-
-
 def test_submit_many_stops_with_the_shortest_iterable(a):
     assert [future.result() for future in a.submit_many(pow, [2, 3, 4], [5, 6])] == [32, 729]
     assert a.submit_many(pow, []) == a.submit_many(pow) == []
@@ -155,17 +134,11 @@ def test_wait_names_what_is_missing(client):
 
 def submit_to(part, number):
     secede()
-    return part.submit(here).result(), sum(part.map(twice, range(number))), part.priority
+    return part.submit(here).result(), sum(part.map(twice, range(number)))
 
 
 def test_a_partition_can_be_given_to_a_task_of_another(a, b):
-    b.priority = 7
-    ran, total, priority = a.submit(submit_to, b, 100).result()
-    assert (ran, total, priority) == ("B-0", 9900, 7)
-    handle = a.limited(2)
-    assert handle.client is a.client
-    with pytest.raises(TypeError, match="handle on 'A' with a quota cannot be sent to a task"):
-        pickle.dumps(handle)
+    assert a.submit(submit_to, b, 100).result() == ("B-0", 9900)
 
 
 def fail_at_first(name, item):
@@ -240,3 +213,65 @@ def test_an_asynchronous_client_is_refused(_threads):
                 Partition("A", client).stats()
 
     _threads.sync(ask)
+
+
+# -- several slots, collections, data --------------------------------------------------
+
+
+def test_a_task_may_take_several_slots(a, client, wait_until):
+    gate = Event(f"gate-{uuid.uuid4().hex}", client=client)
+    tasks = [a.submit(wait_for, gate.name, slots=2) for _ in range(2)]
+    wait_until(lambda: a.stats().busy == 4)
+    behind = a.submit(here)
+    time.sleep(0.1)
+    assert not behind.done()
+    gate.set()
+    assert client.gather(tasks) == [True, True]
+    assert behind.result() in ("A-0", "A-1")
+    assert list(a.map(abs, range(5), slots=2)) == list(range(5))
+    assert [f.result() for f in a.submit_many(abs, range(3), slots=2)] == [0, 1, 2]
+    for call in (a.submit, a.submit_many, a.map):
+        with pytest.raises(ValueError, match="slots is 0; give a whole number, 1 or more"):
+            call(abs, [1], slots=0)
+
+
+def places(_=None):
+    return np.array([[int(here() == "B-0")]])
+
+
+def ones(name):
+    return da.map_blocks(places, chunks=((1,) * 4, (1,)), dtype=int, name=f"{name}-{uuid.uuid4()}")
+
+
+def test_collections_are_computed_on_its_workers(b, client):
+    total = ones("a").sum()
+    assert b.compute(total).result() == b.compute(total, sync=True) == 4
+    first, second = b.compute([ones("a").sum(), dask.delayed(here, pure=False)()])
+    assert b.gather([first, second]) == [4, "B-0"]
+    kept = b.persist(ones("b"))
+    assert kept.sum().compute() == 4
+    assert dask.bag.range(4, 2).map(lambda _: here()).compute() != ["B-0"] * 4
+
+
+def test_in_a_block_everything_is_on_its_workers(a, b, client):
+    with b:
+        assert ones("c").sum().compute() == 4
+        assert dask.compute(dask.delayed(here, pure=False)())[0] == "B-0"
+        assert client.submit(here, pure=False).result() == "B-0"
+        with a:
+            assert client.submit(here, pure=False).result() in ("A-0", "A-1")
+        assert set(client.gather(client.map(places, range(3)))[0].flat) == {1}
+    assert not dask.get_annotations()
+    with pytest.raises(ZeroDivisionError), b:
+        1 / 0  # noqa: B018
+    assert not dask.get_annotations()
+
+
+def test_data_is_put_on_its_workers(a, client):
+    address = {worker.address for worker in a.workers}
+    data = a.scatter({"x": 1, "y": 2})
+    assert a.gather(data) == {"x": 1, "y": 2}
+    assert {w for held in client.who_has(list(data.values())).values() for w in held} <= address
+    assert set(client.who_has(a.scatter(3, broadcast=True)).popitem()[1]) == address
+    with pytest.raises(PoolError, match="Partition 'C' has no workers to keep data"):
+        Partition("C", client).scatter(1)

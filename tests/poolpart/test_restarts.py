@@ -1,14 +1,17 @@
 """Workers that are killed come back into their partition, and tasks that waited run."""
 
+import asyncio
 import os
 import signal
+import socket
 import subprocess
 import sys
 
 import pytest
 from distributed import Client, get_worker
 
-from poolpart import Partition, Pool, worker_identities
+from poolpart import Partition, Pool, n_workers, worker_identities
+from poolpart.reconciler import has_gone
 
 LONG_S = 120.0
 
@@ -99,3 +102,33 @@ def test_a_worker_without_a_name(nameless):
     waiting = kill_and_submit_at_once(nameless, part, pool.names[0])
     assert len({future.result(LONG_S) for future in waiting}) == 1
     assert [worker.resources for worker in part.workers] == [{"P": 1}]
+
+
+# -- nannies that go with their workers: nobody waits for those to come back -----------
+
+
+def declared_by(client):
+    workers = client.cluster.scheduler.workers.values()
+    return {worker.name: dict(worker.resources) for worker in workers}
+
+
+def test_nobody_listens():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = "tcp://{}:{}".format(*server.getsockname())
+        assert not asyncio.run(has_gone(address))
+    assert asyncio.run(has_gone(address))
+    assert not asyncio.run(has_gone("inproc://127.0.0.1/1/2"))
+
+
+def test_the_place_of_a_worker_that_was_stopped_goes_to_the_next(own_nannies, wait_until):
+    parts = Pool.from_client(own_nannies).divide({"A": n_workers(1), "B": n_workers(1)})
+    (name,) = (name for name, resources in declared_by(own_nannies).items() if "A" in resources)
+    spec = own_nannies.cluster.worker_spec.pop(name)
+    own_nannies.sync(own_nannies.cluster._correct_state)
+    wait_until(lambda: name not in declared_by(own_nannies))
+    waiting = parts["A"].submit(pow, 2, 6)
+    own_nannies.cluster.worker_spec["next"] = spec
+    own_nannies.sync(own_nannies.cluster._correct_state)
+    assert waiting.result(120) == 64
+    (stayed,) = declared_by(own_nannies).keys() - {"next"}
+    assert declared_by(own_nannies) == {"next": {"A": 1}, stayed: {"B": 1}}

@@ -16,7 +16,7 @@ from lidarpool import LidarpoolError, Planning, Scene, Sensor, Survey, simulate
 from lidarpool.run.trials import TrialPump
 from lidarpool.scan import SurveyDriver
 from poolpart import trace_to, worker_identities
-from poolpart.local import _NannyCluster
+from poolpart.internals import FixedCluster
 
 SURVEY = Survey(
     Sensor.grid(rays_per_revolution=360, layers=4, step_deg=1), poses=[(0, 0, 1)] * 4, steps=360
@@ -40,7 +40,7 @@ def slots() -> Iterator[SpecCluster]:
         "cls": Scheduler,
         "options": {"host": "127.0.0.1", "port": 0, "dashboard_address": "127.0.0.1:0"},
     }
-    with _NannyCluster(workers=workers, scheduler=scheduler, silence_logs=50) as cluster:
+    with FixedCluster(workers=workers, scheduler=scheduler, silence_logs=50) as cluster:
         yield cluster
 
 
