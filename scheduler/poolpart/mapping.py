@@ -24,7 +24,6 @@ from typing import Any, NoReturn
 from dask.sizeof import sizeof
 from dask.utils import funcname
 from distributed import CancelledError, Client, Future, Reschedule
-from distributed.core import clean_exception, error_message
 
 from .internals import when_done
 from .remote import worker_identities
@@ -59,49 +58,22 @@ class Chunk:
 
 
 @dataclass(frozen=True)
-class Failure:
-    """An exception that a worker sends beside results; `reraise` raises it where it arrives."""
-
-    exception: bytes
-    traceback: bytes | None
-
-    @classmethod
-    def now(cls, error: Exception) -> Failure:
-        """Of the exception that is being handled."""
-        # Dask's own way of sending one: it falls back to the text of what cannot be pickled.
-        message = error_message(error)
-        traceback = message["traceback"]
-        return cls(message["exception"].data, None if traceback is None else traceback.data)
-
-    def reraise(self) -> NoReturn:
-        """Raise the exception."""
-        error: BaseException | None
-        traceback: TracebackType | None
-        _, error, traceback = clean_exception(self.exception, self.traceback)
-        assert error is not None
-        raise error.with_traceback(traceback)
-
-
-@dataclass(frozen=True)
 class Answer:
     """What came of a chunk.
 
     Parameters
     ----------
     results
-        Of its first items; of all, unless one failed or the time was up.
+        Of its first items, at least one; of all, unless one failed or the time was up.
     seconds
         Time from start to end.
     nbytes
         Estimated size of items and results.
-    failure
-        Of the item after the last result.
     """
 
     results: list[Any]
     seconds: float
     nbytes: int
-    failure: Failure | None = None
 
 
 def run_chunk(
@@ -116,12 +88,11 @@ def run_chunk(
 
     It stops early when `patience_s` seconds have passed, so that items which take longer than
     those before them do not wait for each other on one worker. An error of the first item is
-    the task's; a later one is sent with the results before it. What the stage before has made of
-    the items is argument number `at`.
+    the task's; at a later one it stops, and whoever sends the rest again learns of it. What the
+    stage before has made of the items is argument number `at`.
     """
     start = time.perf_counter()
     results: list[Any] = []
-    failure = None
     if before is not None:
         made = zip(calls, before.results, strict=False)
         calls = [(*call[:at], result, *call[at:]) for call, result in made]
@@ -131,19 +102,16 @@ def run_chunk(
         except Reschedule:
             raise
         except Exception as error:
+            if results:
+                break
             error.add_note(f"{NOTE}this was item {number} of a map: {_shown(call)}")
-            if not results:
-                raise
-            failure = Failure.now(error)
-            break
+            raise
         if time.perf_counter() - start > patience_s:
             break
     seconds = time.perf_counter() - start
     if before is not None:
         seconds += before.seconds
-        if failure is None and len(results) == len(before.results):
-            failure = before.failure
-    return Answer(results, seconds, sizeof(calls) + sizeof(results), failure)
+    return Answer(results, seconds, sizeof(calls) + sizeof(results))
 
 
 def _call(function: Callable[..., Any], call: Call) -> Any:
@@ -308,7 +276,7 @@ class Results(Iterator[Any]):
         self._back: dict[int, tuple[Chunk, Answer | Future]] = {}
         self._next_item = 0  # the one to be delivered next, if in order
         self._ready: deque[Any] = deque()  # results to be delivered
-        self._failed: tuple[Chunk, Answer | Future] | None = None  # to be raised after these
+        self._failed: tuple[Chunk, Future] | None = None  # to be raised after these
         sized = [len(iterable) for iterable in iterables if isinstance(iterable, Sized)]
         self._total = min(sized, default=None)
         maps = [n for n, i in enumerate(iterables) if isinstance(i, Results) and not i._begun]
@@ -408,7 +376,6 @@ class Results(Iterator[Any]):
             stage.options.window or max(2, 2 * has)
             for stage, has in zip(self._stages, slots, strict=True)
         )
-        self._retries = any(stage.options.retries for stage in self._stages)
         self._next_look = time.monotonic() + LOOK_S
         for stage, has in zip(self._stages, slots, strict=True):
             if not has:
@@ -514,20 +481,14 @@ class Results(Iterator[Any]):
             count = len(answer.results)
             self._ready.extend(answer.results)
             self._next_item += count
-            # The item that failed is the first of a task then, which Dask runs again itself.
-            if answer.failure is not None and not self._retries:
-                self._failed = chunk, answer
-            elif count < len(chunk.rows):
+            if count < len(chunk.rows):
                 heapq.heappush(self._again, (first + count, chunk.rows[count:]))
 
-    def _raise(self, chunk: Chunk, answer: Answer | Future) -> NoReturn:
+    def _raise(self, chunk: Chunk, future: Future) -> NoReturn:
         """Stop, and raise what a task raised; a note says at which item."""
         self.close()
         try:
-            if isinstance(answer, Future):
-                answer.result()
-            elif answer.failure is not None:
-                answer.failure.reraise()
+            future.result()
         except Exception as error:
             # Without a note of its own it comes from Dask, not from an item.
             if not any(note.startswith(NOTE) for note in getattr(error, "__notes__", ())):

@@ -15,7 +15,7 @@ from .page import partitions_page
 from .partition import Partition
 from .probe import probe_worker
 from .remote import ask_workers, worker_identities
-from .rules import Rule, check_request, check_rule, check_rules, choose, divide, rule_of
+from .rules import Rule, by_name, check_rules, divide, named, rule_of
 from .wording import counted
 from .worker_info import WorkerInfo
 
@@ -241,28 +241,25 @@ class Pool:
             If the selectors are not exactly one, a worker is not in this pool or belongs to
             another partition, there are too few, or other workers have this partition.
         """
-        given = {
+        selectors = {
             "max_workers_per_gpu": max_workers_per_gpu,
             "max_workers_per_host": max_workers_per_host,
             "n_workers": n_workers,
             "workers": workers,
         }
-        check_request(name, given, slots)
+        common = {"slots": slots, "minimum": minimum, "exclusive": exclusive}
+        rule = rule_of(name, selectors, **common)
         cluster = self._cluster_now()
         mine = self._mine(cluster)
-        chosen, note = choose(
-            name,
-            mine,
-            max_workers_per_gpu=max_workers_per_gpu,
-            max_workers_per_host=max_workers_per_host,
-            n_workers=n_workers,
-            workers=workers,
-        )
-        common = {"slots": slots, "minimum": minimum, "exclusive": exclusive}
-        rule = rule_of(given, [worker.name for worker in chosen], common)
-        check_rule(name, rule)
-        made = self._make({name: rule}, {name: chosen}, {name: note}, cluster)
-        taken = {worker.address for worker in chosen}
+        notes: dict[str, str] = {}
+        if workers is not None:
+            chosen = {name: by_name(name, mine, workers)}
+            rule = named(*(worker.name for worker in chosen[name]), **common)
+        else:
+            wanted = replace(rule, minimum=n_workers or max(1, minimum))
+            chosen, notes = divide({name: wanted}, mine)
+        made = self._make({name: rule}, chosen, notes, cluster)
+        taken = {worker.address for worker in chosen[name]}
         rest = Pool(self.client, [worker for worker in mine if worker.address not in taken])
         return made[name], rest
 

@@ -1,4 +1,4 @@
-"""Which workers a partition takes: selectors, and the rules that hold when more workers join."""
+"""Which workers a partition takes, now and when more of them join."""
 
 from __future__ import annotations
 
@@ -12,158 +12,6 @@ from .wording import counted
 from .worker_info import WorkerInfo
 
 NO_GPU = "no GPU in the pool: CPU workers instead"
-
-
-Selectors = Mapping[str, int | Sequence[str] | None]
-
-
-def check_request(partition: str, selectors: Selectors, slots: int | None) -> None:
-    """Check what is asked of `Pool.partition`; PoolError unless it makes sense."""
-    check_name(partition)
-    check_slots(slots)
-    given = {key: value for key, value in selectors.items() if value is not None}
-    if len(given) != 1:
-        raise PoolError(
-            f"Give exactly one of {', '.join(selectors)} to partition {partition!r}, "
-            f"not {' and '.join(given) or 'none'}."
-        )
-    for key, value in given.items():
-        if key == "workers":
-            if isinstance(value, str) or not value:
-                raise PoolError(
-                    f"workers is {value!r}; give a list of names or addresses, 1 or more."
-                )
-        elif not isinstance(value, int) or value < 1:
-            raise PoolError(f"{key} is {value!r}; give a whole number, 1 or more.")
-
-
-def check_name(partition: object) -> None:
-    """Check the name of a partition; PoolError unless it is one."""
-    if not isinstance(partition, str) or not partition:
-        raise PoolError(f"The name of a partition is {partition!r}; give one such as 'GPU'.")
-
-
-def check_slots(slots: object) -> None:
-    """Check how many slots each worker is to have; PoolError unless it can have so many."""
-    if slots is not None and (not isinstance(slots, int) or slots < 1):
-        raise PoolError(f"slots is {slots!r}; give a whole number, 1 or more: tasks take one each.")
-
-
-def choose(
-    partition: str,
-    pool: Sequence[WorkerInfo],
-    *,
-    max_workers_per_gpu: int | None = None,
-    max_workers_per_host: int | None = None,
-    n_workers: int | None = None,
-    workers: Sequence[str] | None = None,
-) -> tuple[list[WorkerInfo], str]:
-    """Choose workers of a pool by the one selector that is given.
-
-    Returns
-    -------
-    chosen, note
-        The workers, and what a user should know of the choice; empty for nothing.
-
-    Raises
-    ------
-    PoolError
-        If there are too few, or one that was named cannot be had.
-    """
-    if workers is not None:
-        return by_name(partition, pool, workers), ""
-    # Members come first, so that the same call, again, makes the same partition.
-    free = [worker for worker in pool if worker.partitions == {partition}]
-    free += [worker for worker in pool if not worker.partitions]
-    if n_workers is not None:
-        return by_count(partition, pool, free, n_workers), ""
-    if not free:
-        raise PoolError(
-            f"No worker is left for partition {partition!r}: all {len(pool)} of this pool "
-            f"belong to others. Start more workers.{left_alone(partition, pool)}"
-        )
-    if max_workers_per_host is not None:
-        return by_host(free, max_workers_per_host), ""
-    if max_workers_per_gpu is not None:
-        return by_gpu(free, max_workers_per_gpu)
-    raise PoolError(f"Partition {partition!r} was given no selector.")
-
-
-def by_name(partition: str, pool: Sequence[WorkerInfo], wanted: Sequence[str]) -> list[WorkerInfo]:
-    """Take these workers, by name or address."""
-    known: dict[str, list[WorkerInfo]] = {}  # {name or address: workers}
-    for worker in pool:
-        for key in {worker.name, worker.address}:
-            known.setdefault(key, []).append(worker)
-    times = Counter(map(str, wanted))
-    if unknown := [name for name in times if name not in known]:
-        raise PoolError(
-            f"Partition {partition!r}: {', '.join(unknown)} not in this pool, which has "
-            f"{', '.join(worker.name for worker in pool) or 'no workers'}."
-        )
-    for name, count in times.items():
-        if len(known[name]) > count:  # all of them are meant if it is listed for each
-            raise PoolError(
-                f"Partition {partition!r}: {len(known[name])} workers are named {name}; give "
-                f"addresses: {', '.join(worker.address for worker in known[name])}."
-            )
-    asked = {worker.address for name in times for worker in known[name]}
-    chosen = [worker for worker in pool if worker.address in asked]
-    for worker in chosen:
-        if others := sorted(worker.partitions - {partition}):
-            raise PoolError(
-                f"Worker {worker.name} already declares {', '.join(others)}; a worker belongs "
-                "to one partition."
-            )
-    return chosen
-
-
-def left_alone(partition: str, pool: Sequence[WorkerInfo]) -> str:
-    """Say, for a message, which workers cannot be had because of what they declare."""
-    others = Counter(name for worker in pool for name in worker.partitions - {partition})
-    if not others:
-        return ""
-    declare = ", ".join(f"{name} by {count}" for name, count in sorted(others.items()))
-    return f" A worker that declares another resource is not taken: {declare}."
-
-
-def by_count(
-    partition: str, pool: Sequence[WorkerInfo], free: Sequence[WorkerInfo], n_workers: int
-) -> list[WorkerInfo]:
-    """Take so many workers of those that are free."""
-    if len(free) < n_workers:
-        raise PoolError(
-            f"Partition {partition!r} asks for {counted(n_workers, 'worker')}; the pool has "
-            f"{counted(len(free), 'worker')} in no other partition.{left_alone(partition, pool)}"
-        )
-    return list(free[:n_workers])
-
-
-def by_host(free: Sequence[WorkerInfo], most: int) -> list[WorkerInfo]:
-    """Take at most so many workers of each host."""
-    taken: Counter[str] = Counter()
-    chosen = []
-    for worker in free:
-        if taken[worker.host] < most:
-            taken[worker.host] += 1
-            chosen.append(worker)
-    return chosen
-
-
-def by_gpu(free: Sequence[WorkerInfo], most: int) -> tuple[list[WorkerInfo], str]:
-    """Take at most so many workers for each GPU; a note says if there was none to go by."""
-    if not any(worker.gpus for worker in free):
-        return by_host(free, most), NO_GPU
-    taken: Counter[str] = Counter()  # {GPU: workers chosen for it}
-    chosen = []
-    # Those that see the fewest GPUs first: the others have a choice.
-    for worker in sorted(free, key=lambda worker: len(worker.gpus)):
-        if worker.gpus:
-            gpu = min(worker.gpus, key=lambda gpu: taken[gpu])
-            if taken[gpu] < most:
-                taken[gpu] += 1
-                chosen.append(worker)
-    return chosen, ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -192,17 +40,7 @@ class Rule:
     def wants(
         self, worker: WorkerInfo, members: Sequence[WorkerInfo], everyone: Sequence[WorkerInfo]
     ) -> bool:
-        """Whether one more worker is wanted, beside the members that there are.
-
-        Parameters
-        ----------
-        worker
-            The one that may join.
-        members
-            The partition's workers.
-        everyone
-            All workers of the cluster.
-        """
+        """Whether one more worker is wanted, beside the members; `everyone` is all workers."""
         return len(self.choose([*members, worker])) > len(self.choose(members))
 
     def slots_of(self, worker: WorkerInfo) -> int:
@@ -218,7 +56,18 @@ class PerGpu(Rule):
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
         """Workers that share the GPUs evenly."""
-        return by_gpu(free, self.most)[0]
+        if not any(worker.gpus for worker in free):
+            return _by_host(free, self.most)
+        taken: Counter[str] = Counter()  # {GPU: workers chosen for it}
+        chosen = []
+        # Those that see the fewest GPUs first: the others have a choice.
+        for worker in sorted(free, key=lambda worker: len(worker.gpus)):
+            if worker.gpus:
+                gpu = min(worker.gpus, key=lambda gpu: taken[gpu])
+                if taken[gpu] < self.most:
+                    taken[gpu] += 1
+                    chosen.append(worker)
+        return chosen
 
     def wants(
         self, worker: WorkerInfo, members: Sequence[WorkerInfo], everyone: Sequence[WorkerInfo]
@@ -238,7 +87,17 @@ class PerHost(Rule):
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
         """Take the first of each host."""
-        return by_host(free, self.most)
+        return _by_host(free, self.most)
+
+
+def _by_host(free: Sequence[WorkerInfo], most: int) -> list[WorkerInfo]:
+    taken: Counter[str] = Counter()
+    chosen = []
+    for worker in free:
+        if taken[worker.host] < most:
+            taken[worker.host] += 1
+            chosen.append(worker)
+    return chosen
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -281,63 +140,37 @@ class Declared(Rule):
         return []
 
 
-def per_gpu(
-    most: int, *, slots: int | None = None, minimum: int = 1, exclusive: bool = False
-) -> PerGpu:
+def per_gpu(most: int, **common: Any) -> PerGpu:
     """At most so many workers for each GPU; CPU workers, so many a host, where there is none.
 
-    `slots`, `minimum` and `exclusive` are those of every `Rule`.
+    `common` are `slots`, `minimum` and `exclusive`, as in every `Rule`.
 
     Examples
     --------
     >>> per_gpu(1)
     PerGpu(slots=None, minimum=1, exclusive=False, most=1)
     """
-    return PerGpu(most=most, slots=slots, minimum=minimum, exclusive=exclusive)
+    return PerGpu(most=most, **common)
 
 
-def per_host(
-    most: int, *, slots: int | None = None, minimum: int = 1, exclusive: bool = False
-) -> PerHost:
-    """At most so many workers of each host; `slots` and the rest as in every `Rule`."""
-    return PerHost(most=most, slots=slots, minimum=minimum, exclusive=exclusive)
+def per_host(most: int, **common: Any) -> PerHost:
+    """At most so many workers of each host; `common` as in every `Rule`."""
+    return PerHost(most=most, **common)
 
 
-def n_workers(
-    workers: int, *, slots: int | None = None, minimum: int = 1, exclusive: bool = False
-) -> Count:
-    """So many workers, wherever they are; `slots` and the rest as in every `Rule`."""
-    return Count(workers=workers, slots=slots, minimum=minimum, exclusive=exclusive)
+def n_workers(workers: int, **common: Any) -> Count:
+    """So many workers, wherever they are; `common` as in every `Rule`."""
+    return Count(workers=workers, **common)
 
 
-def named(
-    *names: str, slots: int | None = None, minimum: int = 1, exclusive: bool = False
-) -> Named:
-    """Workers of these names or addresses; one that is not there yet belongs when it joins.
-
-    `slots`, `minimum` and `exclusive` are those of every `Rule`.
-    """
-    names = tuple(str(name) for name in names)
-    return Named(names=names, slots=slots, minimum=minimum, exclusive=exclusive)
+def named(*names: str, **common: Any) -> Named:
+    """Workers of these names or addresses, also those that join later; `common` as in `Rule`."""
+    return Named(names=tuple(map(str, names)), **common)
 
 
-def rest(*, slots: int | None = None, minimum: int = 0, exclusive: bool = False) -> Rest:
-    """Every worker that no rule before it wants; also where others find more workers.
-
-    `slots`, `minimum` and `exclusive` are those of every `Rule`; there may be none by default.
-    """
-    return Rest(slots=slots, minimum=minimum, exclusive=exclusive)
-
-
-def rule_of(given: Mapping[str, Any], names: Sequence[str], common: Mapping[str, Any]) -> Rule:
-    """Make the rule that goes on choosing as a selector of `Pool.partition` does."""
-    if given["max_workers_per_gpu"] is not None:
-        return PerGpu(most=given["max_workers_per_gpu"], **common)
-    if given["max_workers_per_host"] is not None:
-        return PerHost(most=given["max_workers_per_host"], **common)
-    if given["n_workers"] is not None:
-        return Count(workers=given["n_workers"], **common)
-    return Named(names=tuple(names), **common)
+def rest(*, minimum: int = 0, **common: Any) -> Rest:
+    """Every worker that no rule before it wants, perhaps none; `common` as in every `Rule`."""
+    return Rest(minimum=minimum, **common)
 
 
 def divide(
@@ -364,21 +197,101 @@ def divide(
     taken: set[str] = set()  # addresses: names need not differ
     named_by = {n for rule in rules.values() if isinstance(rule, Named) for n in rule.names}
     for name, rule in rules.items():
-        free = [worker for worker in pool if worker.partitions == {name}]
-        free += [w for w in pool if not w.partitions and w.address not in taken]
+        declaring = [worker for worker in pool if worker.partitions == {name}]
+        free = [w for w in pool if not w.partitions and w.address not in taken]
         if not isinstance(rule, Named):
             free = [worker for worker in free if not named_by & {worker.name, worker.address}]
+        free = [*declaring, *free]
         chosen[name] = rule.choose(free)
         taken |= {worker.address for worker in chosen[name]}
         if len(chosen[name]) < rule.minimum:
             raise PoolError(
                 f"Partition {name!r} would have {counted(len(chosen[name]), 'worker')} of the "
                 f"{rule.minimum} that it needs: {len(free)} of {len(pool)} are left for it. "
-                f"Start more workers, or put it before others.{left_alone(name, pool)}"
+                f"Start more workers, or put it before others.{_left_alone(name, pool)}"
             )
+        told = []
         if isinstance(rule, PerGpu) and free and not any(worker.gpus for worker in free):
-            notes[name] = NO_GPU
+            told.append(NO_GPU)
+        if declaring:
+            told.append(f"{counted(len(declaring), 'worker')} declared {name!r} already")
+        if not chosen[name] and (left := _left_alone(name, pool)):
+            told.append(f"it has no workers.{left}")
+        if told:
+            notes[name] = "; ".join(told)
     return chosen, notes
+
+
+def _left_alone(partition: str, pool: Sequence[WorkerInfo]) -> str:
+    """Say, for a message, which workers cannot be had because of what they declare."""
+    others = Counter(name for worker in pool for name in worker.partitions - {partition})
+    if not others:
+        return ""
+    declare = ", ".join(f"{name} by {count}" for name, count in sorted(others.items()))
+    return f" A worker that declares another resource is not taken: {declare}."
+
+
+def by_name(partition: str, pool: Sequence[WorkerInfo], wanted: Sequence[str]) -> list[WorkerInfo]:
+    """Take these workers, by name or address.
+
+    Raises
+    ------
+    PoolError
+        If one cannot be had, or a name is that of several.
+    """
+    known: dict[str, list[WorkerInfo]] = {}  # {name or address: workers}
+    for worker in pool:
+        for key in {worker.name, worker.address}:
+            known.setdefault(key, []).append(worker)
+    times = Counter(map(str, wanted))
+    if unknown := [name for name in times if name not in known]:
+        raise PoolError(
+            f"Partition {partition!r}: {', '.join(unknown)} not in this pool, which has "
+            f"{', '.join(worker.name for worker in pool) or 'no workers'}."
+        )
+    for name, count in times.items():
+        if len(known[name]) > count:  # all of them are meant if it is listed for each
+            raise PoolError(
+                f"Partition {partition!r}: {len(known[name])} workers are named {name}; give "
+                f"addresses: {', '.join(worker.address for worker in known[name])}."
+            )
+    asked = {worker.address for name in times for worker in known[name]}
+    chosen = [worker for worker in pool if worker.address in asked]
+    for worker in chosen:
+        if others := sorted(worker.partitions - {partition}):
+            raise PoolError(
+                f"Worker {worker.name} already declares {', '.join(others)}; a worker belongs "
+                "to one partition."
+            )
+    return chosen
+
+
+def rule_of(partition: str, selectors: Mapping[str, Any], **common: Any) -> Rule:
+    """Make the rule that goes on choosing as a selector of `Pool.partition` does.
+
+    Raises
+    ------
+    PoolError
+        If there is not exactly one selector, or it makes no sense.
+    """
+    given = {key: value for key, value in selectors.items() if value is not None}
+    if len(given) != 1:
+        raise PoolError(
+            f"Give exactly one of {', '.join(selectors)} to partition {partition!r}, "
+            f"not {' and '.join(given) or 'none'}."
+        )
+    [(key, value)] = given.items()
+    if key == "workers" and (isinstance(value, str) or not value):
+        raise PoolError(f"workers is {value!r}; give a list of names or addresses, 1 or more.")
+    rule: Rule
+    if key == "max_workers_per_gpu":
+        rule = per_gpu(value, **common)
+    elif key == "max_workers_per_host":
+        rule = per_host(value, **common)
+    else:
+        rule = n_workers(value, **common) if key == "n_workers" else named(*value, **common)
+    check_rules({partition: rule})
+    return rule
 
 
 def partition_for(
@@ -402,28 +315,32 @@ def partition_for(
     return next(iter([*by_name, *short, *willing]), None)
 
 
+def check_name(partition: object) -> None:
+    """Check the name of a partition; PoolError unless it is one."""
+    if not isinstance(partition, str) or not partition:
+        raise PoolError(f"The name of a partition is {partition!r}; give one such as 'GPU'.")
+
+
 def check_rules(rules: Mapping[str, Rule]) -> None:
     """Check rules as they were given; PoolError unless they make sense."""
-    if not isinstance(rules, Mapping):
+    if not isinstance(rules, Mapping) or not rules:
         raise PoolError(f'The rules are {rules!r}; give a dict, such as {{"NAME": rest()}}.')
-    if not rules:
-        raise PoolError('There are no rules to divide by; give {"NAME": rest()}, for example.')
     for name, rule in rules.items():
         check_name(name)
         if not isinstance(rule, Rule):
             raise PoolError(
                 f"The rule of partition {name!r} is {rule!r}; give one, such as per_host(2)."
             )
-        check_rule(name, rule)
-
-
-def check_rule(name: str, rule: Rule) -> None:
-    """Check one rule; PoolError unless it makes sense."""
-    check_slots(rule.slots)
-    if not isinstance(rule.minimum, int) or rule.minimum < 0:
-        raise PoolError(f"minimum of {name!r} is {rule.minimum!r}; give a whole number, 0 or more.")
-    number = getattr(rule, "most", getattr(rule, "workers", 1))
-    if not isinstance(number, int) or number < 1:
-        raise PoolError(f"The rule of {name!r} is {rule}: give a whole number, 1 or more.")
-    if isinstance(rule, Count) and rule.minimum > rule.workers:
-        raise PoolError(f"Partition {name!r} has a minimum above its {rule.workers} workers.")
+        number = getattr(rule, "most", getattr(rule, "workers", 1))
+        for what, value, least in (
+            ("slots", 1 if rule.slots is None else rule.slots, 1),
+            ("minimum", rule.minimum, 0),
+            ("the number of workers", number, 1),
+        ):
+            if not isinstance(value, int) or value < least:
+                raise PoolError(
+                    f"Partition {name!r}: {what} is {value!r}; give a whole number, {least} or "
+                    "more."
+                )
+        if isinstance(rule, Count) and rule.minimum > rule.workers:
+            raise PoolError(f"Partition {name!r} has a minimum above its {rule.workers} workers.")

@@ -19,35 +19,38 @@ def calls(*numbers):
 
 
 def test_all_results_come_in_order():
-    answer = run_chunk(invert, 10, 5, calls(1, 2, 4))
-    assert (answer.results, answer.failure) == ([1, 0.5, 0.25], None)
+    answer = run_chunk(invert, 10, 0, 5, calls(1, 2, 4))
+    assert answer.results == [1, 0.5, 0.25]
     assert answer.nbytes > 0 < answer.seconds
 
 
-def test_an_error_comes_with_the_results_before_it():
-    answer = run_chunk(invert, 10, 5, calls(1, 2, 0, 4))
-    assert answer.results == [1, 0.5]
-    with pytest.raises(ZeroDivisionError) as caught:
-        answer.failure.reraise()
-    assert caught.value.__notes__ == ["poolpart: this was item 7 of a map: 0"]
+def test_it_ends_before_an_item_that_fails():
+    assert run_chunk(invert, 10, 0, 5, calls(1, 2, 0, 4)).results == [1, 0.5]
+
+
+def test_it_takes_what_the_stage_before_has_made():
+    before = run_chunk(invert, 10, 0, 5, calls(1, 2, 0, 4))
+    answer = run_chunk(pow, 10, 1, 5, calls(2, 3, 4, 5), before)
+    assert answer.results == [2, 3**0.5]
+    assert answer.seconds > before.seconds
 
 
 def test_an_error_of_the_first_item_is_raised():
     with pytest.raises(ZeroDivisionError) as caught:
-        run_chunk(invert, 10, 5, calls(0, 1))
+        run_chunk(invert, 10, 0, 5, calls(0, 1))
     assert caught.value.__notes__ == ["poolpart: this was item 5 of a map: 0"]
 
 
 def test_long_items_are_shortened_in_the_note():
     with pytest.raises(TypeError) as caught:
-        run_chunk(invert, 10, 0, [("x" * 10_000,)])
+        run_chunk(invert, 10, 0, 0, [("x" * 10_000,)])
     assert len(caught.value.__notes__[0]) < 100
 
 
 def test_it_ends_when_the_time_is_up_but_not_before_the_first_item():
-    answer = run_chunk(time.sleep, 0.015, 0, calls(0.01, 0.01, 0.01, 0.01))
+    answer = run_chunk(time.sleep, 0.015, 0, 0, calls(0.01, 0.01, 0.01, 0.01))
     assert len(answer.results) in (1, 2)
-    assert len(run_chunk(invert, 0, 0, calls(1, 1)).results) == 1
+    assert len(run_chunk(invert, 0, 0, 0, calls(1, 1)).results) == 1
 
 
 def test_dask_is_told_to_reschedule():
@@ -55,7 +58,7 @@ def test_dask_is_told_to_reschedule():
         raise Reschedule
 
     with pytest.raises(Reschedule):
-        run_chunk(again, 10, 0, calls(1))
+        run_chunk(again, 10, 0, 0, calls(1))
 
 
 def test_a_chunk_says_which_items_it_has():

@@ -72,7 +72,7 @@ def test_dividing_the_remainder_again(start):
         ran = {future.result() for future in [part.submit(here) for _ in range(40)]}
         assert ran <= {worker.name for worker in part.workers}
     assert {len(resources) for resources in declared(client).values()} == {1}
-    with pytest.raises(PoolError, match="has 0 workers in no other partition"):
+    with pytest.raises(PoolError, match="would have 0 workers of the 1 that it needs"):
         rest.partition("FOUR", n_workers=1)
 
 

@@ -1,5 +1,7 @@
 """Rules: whom they choose, now and when a worker joins, without a cluster and on one."""
 
+from collections import Counter
+
 import pytest
 from distributed import Client, LocalCluster, get_worker
 from hypothesis import given
@@ -19,7 +21,7 @@ from poolpart import (
     steward,
     worker_identities,
 )
-from poolpart.rules import NO_GPU, check_rules, divide, partition_for
+from poolpart.rules import NO_GPU, by_name, check_rules, divide, partition_for, rule_of
 
 
 def worker(name, *gpus, host="h", **resources):
@@ -77,15 +79,15 @@ def test_fewer_than_the_minimum():
 @pytest.mark.parametrize(
     ("rules", "message"),
     [
-        ({}, "no rules to divide by"),
+        ({}, r"rules are \{\}; give a dict"),
         ([rest()], r"rules are \[.*\]; give a dict"),
         ({"": rest()}, "name of a partition is ''; give one such as 'GPU'"),
         ({3: rest()}, "name of a partition is 3; give one such as 'GPU'"),
         ({"P": 3}, r"rule of partition 'P' is 3; give one, such as per_host\(2\)"),
         ({"P": rest(slots=0)}, "slots is 0; give a whole number, 1 or more"),
         ({"P": rest(slots=1.5)}, "slots is 1.5; give a whole number, 1 or more"),
-        ({"P": rest(minimum=-1)}, "minimum of 'P' is -1"),
-        ({"P": rest(minimum=0.5)}, "minimum of 'P' is 0.5; give a whole number, 0 or more"),
+        ({"P": rest(minimum=-1)}, "'P': minimum is -1"),
+        ({"P": rest(minimum=0.5)}, "'P': minimum is 0.5; give a whole number, 0 or more"),
         ({"P": per_gpu(0)}, "a whole number, 1 or more"),
         ({"P": per_host(1.5)}, "a whole number, 1 or more"),
         ({"P": n_workers(0)}, "a whole number, 1 or more"),
@@ -95,6 +97,81 @@ def test_fewer_than_the_minimum():
 def test_rules_that_make_no_sense(rules, message):
     with pytest.raises(PoolError, match=message):
         check_rules(rules)
+
+
+def take(pool, rule, name="P"):
+    return names({name: rule}, pool)[name]
+
+
+SELECTORS = ("max_workers_per_gpu", "max_workers_per_host", "n_workers", "workers")
+
+
+@pytest.mark.parametrize(
+    ("selectors", "message"),
+    [
+        ({}, "exactly one of .* not none"),
+        ({"n_workers": 1, "workers": ["a"]}, "exactly one of .* not n_workers and workers"),
+        ({"n_workers": 0}, "workers is 0; give a whole number"),
+        ({"max_workers_per_gpu": 0}, "workers is 0"),
+        ({"max_workers_per_host": 1.5}, "workers is 1.5"),
+        ({"n_workers": float("nan")}, "workers is nan"),
+        ({"workers": []}, r"workers is \[\]; give a list"),
+        ({"workers": "GPU-0"}, "workers is 'GPU-0'; give a list"),
+    ],
+)
+def test_requests_that_make_no_sense(selectors, message):
+    with pytest.raises(PoolError, match=message):
+        rule_of("P", dict.fromkeys(SELECTORS) | selectors)
+
+
+def test_workers_that_cannot_be_had_are_told_by_what_they_declare():
+    pool = [worker("a", memory=1e9), worker("b", memory=1e9, disk=1), worker("c", P=1)]
+    with pytest.raises(PoolError, match="another resource is not taken: P by 1, disk by 1, mem"):
+        divide({"Q": n_workers(1)}, pool)
+    notes = divide({"P": rest(), "Q": rest()}, pool)[1]
+    assert notes["P"] == "1 worker declared 'P' already"
+    assert notes["Q"].startswith("it has no workers. A worker that declares another resource")
+
+
+def test_by_name_and_address_and_twice():
+    pool = [worker("a"), worker("b"), worker("3"), worker("c", Q=1)]
+    assert [w.name for w in by_name("P", pool, ["tcp://b", "a", "b"])] == ["a", "b"]
+    assert [w.name for w in by_name("P", pool, [3])] == ["3"]
+    with pytest.raises(PoolError, match="'P': x, y not in this pool, which has a, b, 3, c"):
+        by_name("P", pool, ["a", "x", "y"])
+    with pytest.raises(PoolError, match="Worker c already declares Q; a worker belongs to one"):
+        by_name("P", pool, ["c"])
+
+
+def test_two_workers_on_one_gpu_make_way_for_one_on_another():
+    pool = [worker("cpu", host="2"), worker("a", "x"), worker("b", "x"), worker("c", "y")]
+    assert take(pool, per_gpu(1)) == ["a", "c"]
+
+
+HOSTS = st.lists(
+    st.tuples(st.integers(0, 3), st.integers(1, 6)), max_size=4, unique_by=lambda host: host[1]
+)
+
+
+@given(hosts=HOSTS, most=st.integers(1, 4))
+def test_plain_workers_take_up_each_gpu_so_often(hosts, most):
+    pool = [
+        worker(f"{h}-{i}", *(f"{h}:{g}" for g in range(gpus)), host=str(h))
+        for h, (gpus, count) in enumerate(hosts)
+        for i in range(count)
+    ]
+    if not any(w.gpus for w in pool):
+        return
+    chosen = Counter(w.host for w in per_gpu(most).choose(pool))
+    for h, (gpus, count) in enumerate(hosts):
+        assert chosen[str(h)] == min(count, most * gpus)
+
+
+@given(hosts=st.lists(st.integers(1, 6), min_size=1, max_size=4), most=st.integers(1, 4))
+def test_so_many_workers_of_each_host(hosts, most):
+    pool = [worker(f"{h}-{i}", host=str(h)) for h, count in enumerate(hosts) for i in range(count)]
+    chosen = Counter(w.host for w in per_host(most).choose(pool))
+    assert chosen == {str(h): min(count, most) for h, count in enumerate(hosts)}
 
 
 # -- whom a worker that joins belongs to -----------------------------------------------
