@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import random
 import threading
+from asyncio import wait_for
 from collections import defaultdict
 from collections.abc import Collection, Coroutine
 from typing import Any, TypeVar
@@ -52,7 +53,7 @@ def fetch_available(
 
     async def fetch() -> dict[str, Any]:
         try:
-            found = await asyncio.wait_for(who_has(client, keys), patience_s)
+            found = await wait_for(who_has(client, keys), patience_s)
         except TimeoutError:
             return {}
         by_worker: dict[str, list[str]] = defaultdict(list)
@@ -121,7 +122,7 @@ async def _unless_silent(
 
 async def _answers(client: Client, address: str, patience_s: float) -> bool:
     try:
-        await asyncio.wait_for(ping(client, address), patience_s)
+        await wait_for(ping(client, address), patience_s)
     except (TimeoutError, OSError):
         return False
     return True

@@ -243,6 +243,7 @@ class FenceRules:
         after(scheduler, "add_resources", self._changed, "worker", "resources")
         if stealing := scheduler.extensions.get("stealing"):
             after(stealing, "_get_thief", self._thief, "scheduler", "ts")
+        rule_for_shuffles(self._rules, scheduler)
         scheduler.handlers["set_resources"] = scheduler.add_resources
         scheduler.idle_task_count = _OpenWorkers(self.closed, scheduler.idle_task_count)
 
