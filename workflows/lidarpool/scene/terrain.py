@@ -63,12 +63,17 @@ def terrain(triangles: int = 2_000_000, seed: int = 0, side_m: float = 1000.0) -
     points = np.empty((columns + 1, rows + 1, 3))
     points[..., 0], points[..., 1] = (x[:, None] - 0.5) * side_m, (y - 0.5) * side_m
     points[..., 2] = height * side_m
+    faces = grid_faces(columns, rows).reshape(-1, 3)
+    return Scene.from_meshes([Mesh("terrain", points.reshape(-1, 3), faces)])
+
+
+def grid_faces(columns: int, rows: int) -> NDArray[np.int64]:
+    """Two triangles for each cell of a grid of (columns + 1) x (rows + 1) points: (c * r, 2, 3)."""
     corner = (np.arange(columns)[:, None] * (rows + 1) + np.arange(rows)).reshape(-1)
     beside = corner + rows + 1
-    faces = np.empty((len(corner), 2, 3), np.int64)
-    faces[:, 0] = np.stack([corner, beside, beside + 1], axis=-1)
-    faces[:, 1] = np.stack([corner, beside + 1, corner + 1], axis=-1)
-    return Scene.from_meshes([Mesh("terrain", points.reshape(-1, 3), faces.reshape(-1, 3))])
+    return np.stack([corner, beside, beside + 1, corner, beside + 1, corner + 1], axis=1).reshape(
+        -1, 2, 3
+    )
 
 
 def _heights(x: Float, y: Float, rng: np.random.Generator) -> Float:

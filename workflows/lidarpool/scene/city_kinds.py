@@ -1,19 +1,48 @@
-"""Houses, towers, trees, cars and lamps: one of each kind, to be placed many times."""
+"""Things that a city is made of, one of each kind, put together from closed shapes."""
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from ..shapes import revolve
-from .solids import Solid, box, gable, joined, loft, lying, rectangle, regular
+from .shapes import revolve
+
+
+class Solid(NamedTuple):
+    """Triangles in coordinates of their own, metres, standing on z = 0.
+
+    `vertices` are float64 (v, 3), `faces` int64 (f, 3), counter-clockwise seen from outside.
+    """
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64]
+
+    def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Solid:
+        """Return it somewhere else."""
+        return Solid(self.vertices + np.array([x, y, z]), self.faces)
+
 
 FLOOR_M = 3.3
 TOWER_FLOORS = (6, 9, 13, 18, 25)
 
 
-def towers() -> list[Solid]:
+def all_kinds(seed: int = 0) -> dict[str, list[Solid]]:
+    """Make all kinds of things: {group: solids}."""
+    return {
+        "pavement": [box(1, 1, 0.15)],
+        "tower": _towers(),
+        "house": _houses(),
+        "tree": _trees(seed),
+        "car": _cars(),
+        "lamp": [_lamp()],
+    }
+
+
+def _towers() -> list[Solid]:
     """Make office blocks: of `TOWER_FLOORS` floors, each square, stepped, round and L-shaped."""
     corner = np.array([[0, 0], [0, 8], [-9, 8], [-9, -8], [9, -8], [9, 0]], dtype=np.float64)
     return [
@@ -59,7 +88,7 @@ def _stepped(floors: int) -> Solid:
     return joined([*parts, box(4, 4, 3).moved(0, 0, base)])
 
 
-def houses() -> list[Solid]:
+def _houses() -> list[Solid]:
     """Make dwellings: with gabled and hipped roofs, with a wing, one to three storeys high."""
     out = []
     for storeys in (1, 2, 3):
@@ -93,7 +122,7 @@ def _front(storeys: int) -> list[Solid]:
     return [*out, *(window.moved(x, y, 1.3 + 2.8 * storey) for x, y, storey in places)]
 
 
-def trees(seed: int = 0) -> list[Solid]:
+def _trees(seed: int) -> list[Solid]:
     """Make broad-leaved trees of several outlines, and conifers."""
     rng = np.random.default_rng(seed)
     return [_broadleaf(rng, tall) for tall in (0.9, 1.1, 1.35, 1.6)] + [_conifer(3), _conifer(4)]
@@ -117,7 +146,7 @@ def _conifer(tiers: int) -> Solid:
     return joined(parts)
 
 
-def cars() -> list[Solid]:
+def _cars() -> list[Solid]:
     """Make a saloon, a hatchback and a van."""
     saloon = [(0, 0.3), (2.2, 0.3), (2.25, 0.8), (1.1, 0.95), (0.55, 1.45), (-0.9, 1.45)]
     hatchback = [(0, 0.3), (2.0, 0.3), (2.0, 0.8), (1.0, 1.0), (0.4, 1.5), (-1.6, 1.5)]
@@ -133,9 +162,84 @@ def _car(side: list[tuple[float, float]]) -> Solid:
     return joined([body, *wheels])
 
 
-def lamps() -> list[Solid]:
+def _lamp() -> Solid:
     """Make a street lamp whose arm points along x."""
     pole = loft(regular(6, 0.09), [(0, -0.06), (0.5, 0), (6.2, 0.04)])
-    return [
-        joined([pole, box(1.6, 0.1, 0.1).moved(0.8, 0, 6.1), box(0.7, 0.3, 0.15).moved(1.6, 0, 6)])
+    return joined(
+        [pole, box(1.6, 0.1, 0.1).moved(0.8, 0, 6.1), box(0.7, 0.3, 0.15).moved(1.6, 0, 6)]
+    )
+
+
+def joined(parts: Iterable[Solid]) -> Solid:
+    """Several solids as one; where they touch or overlap, each keeps its own surface."""
+    solids = list(parts)
+    starts = np.cumsum([0] + [len(solid.vertices) for solid in solids[:-1]])
+    return Solid(
+        np.concatenate([solid.vertices for solid in solids]),
+        np.concatenate([s.faces + start for s, start in zip(solids, starts, strict=True)]),
+    )
+
+
+def loft(outline: ArrayLike, profile: Sequence[tuple[float, float]]) -> Solid:
+    """Raise an outline along z, drawn in or out on the way, and close it at both ends.
+
+    `outline` (n, 2) is a polygon, counter-clockwise, all of which can be seen from its first
+    point; `profile` has pairs of a height and an inset: how far the outline's sides move inwards
+    there, metres. Gives ``2 * n * len(profile) - 4`` triangles.
+    """
+    points = np.asarray(outline, dtype=np.float64)
+    n = len(points)
+    height, inset = np.asarray(profile, dtype=np.float64).T
+    along = np.roll(points, -1, axis=0) - points
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    inward = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    before = np.roll(inward, 1, axis=0)
+    # A corner moves so that both its sides move by the inset.
+    mitre = (inward + before) / (1 + (inward * before).sum(axis=1, keepdims=True))
+    rings = np.empty((len(height), n, 3))
+    rings[..., :2] = points + inset[:, None, None] * mitre
+    rings[..., 2] = height[:, None]
+    here = np.arange(len(height) * n).reshape(-1, n)
+    beside = np.roll(here, -1, axis=1)
+    fan = np.arange(1, n - 1)
+    lid = np.stack([np.zeros_like(fan), fan, fan + 1], axis=1)
+    faces = [
+        np.stack([here[:-1], beside[:-1], beside[1:]], axis=-1).reshape(-1, 3),
+        np.stack([here[:-1], beside[1:], here[1:]], axis=-1).reshape(-1, 3),
+        lid[:, ::-1],
+        lid + here[-1, 0],
     ]
+    return Solid(rings.reshape(-1, 3), np.concatenate(faces))
+
+
+def rectangle(width: float, depth: float) -> NDArray[np.float64]:
+    """Outline around zero: (4, 2)."""
+    return np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [width / 2, depth / 2]
+
+
+def regular(sides: int, radius: float) -> NDArray[np.float64]:
+    """Outline of a regular polygon around zero: (sides, 2)."""
+    angle = 2 * np.pi * (np.arange(sides) + 0.5) / sides
+    return radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def box(width: float, depth: float, height: float) -> Solid:
+    """Box on z = 0, twelve triangles."""
+    return loft(rectangle(width, depth), [(0, 0), (height, 0)])
+
+
+def gable(width: float, depth: float, eaves: float, rise: float, hip: float = 0.0) -> Solid:
+    """Pitched roof on a rectangle at height `eaves`, its ridge along x and `rise` above them.
+
+    The ends of the ridge stay behind those of the eaves by `hip`. Eight triangles.
+    """
+    x, y = width / 2, depth / 2
+    ridge = [[hip - x, 0, rise], [x - hip, 0, rise]]
+    corners = [[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0], *ridge]
+    faces = [[0, 1, 5], [0, 5, 4], [2, 3, 4], [2, 4, 5], [1, 2, 5], [3, 0, 4], [0, 2, 1], [0, 3, 2]]
+    return Solid(np.array(corners, dtype=np.float64), np.array(faces)).moved(z=eaves)
+
+
+def lying(solid: Solid) -> Solid:
+    """Lay it down: what was up points along y, what was along y points up."""
+    return Solid(solid.vertices[:, [0, 2, 1]], solid.faces[:, ::-1])
