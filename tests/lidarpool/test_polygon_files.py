@@ -177,6 +177,9 @@ def test_obj_as_programs_write_it(tmp_path, text, objects):
     [
         ("COFF 4 1 0\n0 0 0 1 0 0 1\n1 0 0 1 0 0 1\n1 1 0 1 0 0 1\n0 1 0 1 0 0 1\n4 0 1 2 3", 2),
         ("OFF # of mine\n\n3 1 3\n0 0 0\n1 0 0 # right\n0 1 0\n3 0 1 2 255 0 0\n", 1),
+        # As in ModelNet40, and with lines that end anywhere.
+        ("OFF3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", 1),
+        ("OFF\n4 1 0\n0 0 0 1 0 0\n1 1 0 0 1 0\n4 0 1\n2 3\n", 2),
         ("OFF\r\n4 2 0\r\n0 0 0\r\n1 0 0\r\n1 1 0\r\n0 1 0\r\n3 0 1 2\r\n2 0 1\r\n", 1),
     ],
 )

@@ -59,12 +59,6 @@ def test_a_shape_is_filled_wherever_its_outline_begins(name):
         assert (parts @ whole > -1e-12).all()
 
 
-def test_map_coordinates_lose_nothing():
-    vertices = placed(SHAPES["wall"], shift=(500_000.25, 4_000_000.5, 100.0))
-    parts = area_vectors(vertices - vertices[0], cut(vertices))
-    np.testing.assert_allclose(np.linalg.norm(parts, axis=1).sum(), 13, rtol=1e-9)
-
-
 def test_polygons_of_all_sizes_keep_their_order():
     shapes = [SHAPES["wall"], SHAPES["triangle"], SHAPES["arrow"], [(0, 0), (1, 1)], [(7, 7)]]
     vertices = np.concatenate(
@@ -113,19 +107,9 @@ def test_an_unusual_outline_is_filled(name):
         assert (parts @ whole >= 0).all()
 
 
-def test_an_outline_without_area_keeps_its_corners():
-    shape = [(0, 0), (4, 0), (1, 0), (3, 0), (2, 0)]
-    assert set(cut(placed(shape)).ravel().tolist()) == set(range(5))
-
-
 def test_corners_that_are_not_there():
     with pytest.raises(ValueError, match="vertices 0 to 3, counted from 0, of 3"):
         triangulated(np.zeros((3, 3)), np.array([0, 1, 3]), np.array([3]))
-
-
-def test_nothing():
-    none = np.empty(0, dtype=np.int64)
-    assert triangulated(np.empty((0, 3)), none, none).shape == (0, 3)
 
 
 def test_an_outline_without_end_is_refused_unless_it_is_convex():

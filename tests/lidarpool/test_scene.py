@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from lidarpool.base.errors import LidarpoolError
 from lidarpool.scene.mesh import Mesh
-from lidarpool.scene.scene import Scene, local_origin, unique_names
+from lidarpool.scene.scene import Scene, unique_names
 
 FACES = np.array([[0, 1, 2]])
 
@@ -73,30 +73,12 @@ def test_georeferenced_coordinates_lose_no_digit():
     np.testing.assert_array_equal(scene.origin, [512_346, 5_403_211, 432])
 
 
-def test_merge_keeps_world_coordinates_and_names():
-    near = Scene.from_meshes([triangle("Shelf"), triangle("Box")])
-    far = Scene.from_meshes([triangle("Shelf", at=(500_000, 4e6, 10))])
-    both = Scene.merge([near, far])
-    assert both.names == ("Shelf", "Box", "Shelf.2")
-    np.testing.assert_array_equal(both.face_object, [0, 1, 2])
-    np.testing.assert_allclose(
-        world(both), np.concatenate([world(near), world(far)]), rtol=0, atol=1e-9
-    )
-
-
 def test_meshes_are_the_inverse_of_from_meshes():
     scene = Scene.seed()
     again = Scene.from_meshes(scene.meshes())
     assert again.names == scene.names
     np.testing.assert_array_equal(world(again), world(scene))
     np.testing.assert_array_equal(again.face_object, scene.face_object)
-
-
-def test_local_origin():
-    near = np.array([[0.0, 0, 0], [19_000, 0, 0]])
-    np.testing.assert_array_equal(local_origin(near), [0, 0, 0])
-    far = np.array([[500_000.25, 10.0, 0], [500_003.75, 20.0, 5]])
-    np.testing.assert_array_equal(local_origin(far), [500_002, 15, 2])
 
 
 def test_unused_vertices_do_not_count_in_bounds():
@@ -143,6 +125,5 @@ def test_scenes_that_do_not_fit_together(change, message):
 
 
 def test_a_scene_of_nothing():
-    for make in (Scene.from_meshes, Scene.merge):
-        with pytest.raises(LidarpoolError, match="at least one object"):
-            make([])
+    with pytest.raises(LidarpoolError, match="at least one object"):
+        Scene.from_meshes([])

@@ -88,19 +88,6 @@ def test_revolved_profiles_are_watertight(steps, segments):
     assert trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).is_watertight
 
 
-def test_resample_spaces_points_evenly():
-    line = resample([(0, 0), (3, 0), (3, 0), (3, 4)], 8)
-    np.testing.assert_allclose(np.linalg.norm(np.diff(line, axis=0), axis=1), 1.0)
-    np.testing.assert_array_equal(line[[0, -1]], [(0, 0), (3, 4)])
-
-
-def test_smooth_keeps_the_ends_and_stays_in_the_hull():
-    line = smooth([(0, 0), (1, 0), (1, 1), (0, 1)])
-    np.testing.assert_array_equal(line[[0, -1]], [(0, 0), (0, 1)])
-    assert line.min() >= 0
-    assert line.max() <= 1
-
-
 @pytest.mark.parametrize(
     ("profile", "segments", "message"),
     [

@@ -18,7 +18,7 @@ def test_examples_in_the_docstrings():
     assert found.failed == 0 < found.attempted
 
 
-@pytest.mark.parametrize("triangles", [2, 3, 7, 50, 1999, 20_000, 100_000])
+@pytest.mark.parametrize("triangles", [2, 7, 1999, 20_000])
 def test_as_many_triangles_as_fit_a_grid(triangles):
     scene = terrain(triangles)
     assert triangles - 2 * np.sqrt(triangles) <= len(scene.faces) <= triangles

@@ -11,7 +11,7 @@ from lidarpool.scene.meshfile import load_meshes
 
 MODEL = (
     '<?xml version="1.0"?>{doctype}'
-    '<model unit="{unit}" xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02"'
+    '<model {unit} xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02"'
     ' xmlns:b="http://schemas.microsoft.com/3dmanufacturing/beamlattice/2017/02"'
     ' xmlns:p="http://schemas.microsoft.com/3dmanufacturing/production/2015/06" {more}>'
     '<resources><object id="1" name="leaf" type="model"><mesh><vertices>'
@@ -19,7 +19,7 @@ MODEL = (
     '</vertices><triangles><triangle v1="0" v2="1" v3="2"/></triangles>{beams}</mesh></object>'
     "{objects}</resources><build>{items}</build></model>"
 )
-PARTS = {"doctype": "", "unit": "meter", "more": "", "x": "0", "beams": "", "objects": ""}
+PARTS = {"doctype": "", "unit": 'unit="meter"', "more": "", "x": "0", "beams": "", "objects": ""}
 
 
 def model(items='<item objectid="1"/>', **parts):
@@ -50,9 +50,10 @@ def assembly(number, of, count, more=""):
 
 
 def test_units_and_names(tmp_path):
-    (leaf,) = load(tmp_path, unit="inch")
-    assert leaf.name == "leaf"
-    np.testing.assert_allclose(np.ptp(leaf.vertices, axis=0), [0.0254, 0.0254, 0])
+    for unit, metres in (('unit="inch"', 0.0254), ("", 0.001)):
+        (leaf,) = load(tmp_path, unit=unit)
+        assert leaf.name == "leaf"
+        np.testing.assert_allclose(np.ptp(leaf.vertices, axis=0), [metres, metres, 0])
 
 
 def test_nested_components_and_copies_are_all_there(tmp_path):
@@ -121,7 +122,7 @@ AMPLE = "".join(
         ({"beams": "<b:beamlattice/>"}, "has a <beamlattice>"),
         ({"items": '<item objectid="9"/>'}, "object '9' is placed and is not there"),
         ({"items": '<item objectid="1" transform="1 0 0"/>'}, "broken"),
-        ({"unit": "parsec"}, "parsec"),
+        ({"unit": 'unit="parsec"'}, "parsec"),
         ({"x": "nan"}, "NaN"),
         (
             {"objects": assembly(2, 3, 1) + assembly(3, 2, 1), "items": '<item objectid="2"/>'},

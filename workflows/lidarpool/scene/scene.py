@@ -157,17 +157,6 @@ class Scene:
             origin=origin,
         )
 
-    @classmethod
-    def merge(cls, scenes: Iterable[Scene]) -> Scene:
-        """Put scenes together, with a new common origin; objects keep their order.
-
-        Raises
-        ------
-        LidarpoolError
-            If there are none.
-        """
-        return cls.from_meshes([mesh for scene in scenes for mesh in scene.meshes()])
-
     def meshes(self) -> tuple[Mesh, ...]:
         """Return the objects that have triangles, in world coordinates and in order."""
         order = np.argsort(self.face_object, kind="stable")

@@ -42,13 +42,10 @@ def write_scene(path: str | Path, scene: Scene) -> Path:
     """
     path = Path(path)
     check_target(path)
-    data = _WRITERS[path.suffix.lower()](scene)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    data = _encoded(path.suffix.lower(), scene)
+    partial = path.with_name(f".{path.name}.partial")
     try:
-        with partial.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
+        partial.write_bytes(data)
         partial.replace(path)
     except OSError as error:
         raise LidarpoolError(f"{path} cannot be written: {error.strerror}.") from error
@@ -76,19 +73,16 @@ def check_target(path: Path) -> None:
         raise LidarpoolError(f"{path} cannot be written: choose another place.")
 
 
-def _ply(scene: Scene) -> bytes:
-    whole = trimesh.Trimesh(scene.vertices + scene.origin, scene.faces, process=False)
-    return bytes(export_ply(whole, vertex_normal=False))
-
-
-def _glb(scene: Scene) -> bytes:
-    # UP_AXES["y"] turns Y-up to Z-up; its transpose turns back.
-    return bytes(export_glb(_objects(scene, UP_AXES["y"].T), include_normals=False))
-
-
-def _obj(scene: Scene) -> bytes:
-    text = export_obj(_objects(scene, np.eye(3)), include_normals=False, include_texture=False)
-    return str(text).encode()
+def _encoded(suffix: str, scene: Scene) -> bytes:
+    """Content of a file of one of `SUFFIXES`."""
+    if suffix == ".ply":
+        whole = trimesh.Trimesh(scene.vertices + scene.origin, scene.faces, process=False)
+        return bytes(export_ply(whole, vertex_normal=False))
+    if suffix == ".glb":
+        # UP_AXES["y"] turns Y-up to Z-up; its transpose turns back.
+        return bytes(export_glb(_objects(scene, UP_AXES["y"].T), include_normals=False))
+    objects = _objects(scene, np.eye(3))
+    return str(export_obj(objects, include_normals=False, include_texture=False)).encode()
 
 
 def _objects(scene: Scene, turn: np.ndarray[Any, np.dtype[np.float64]]) -> trimesh.Scene:
@@ -98,6 +92,3 @@ def _objects(scene: Scene, turn: np.ndarray[Any, np.dtype[np.float64]]) -> trime
         geometry = trimesh.Trimesh(mesh.vertices @ turn.T, mesh.faces, process=False)
         out.add_geometry(geometry, node_name=mesh.name, geom_name=mesh.name)
     return out
-
-
-_WRITERS = {".ply": _ply, ".glb": _glb, ".obj": _obj}
