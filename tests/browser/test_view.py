@@ -34,7 +34,7 @@ def served(cloud):
     """Return a page that shows it, at most 20,000 points at a time, and the view."""
     with live_page("a cloud", port=0) as page:
         view = ResultView(page, ResultFile(cloud), most=20_000)
-        with redrawn(view.draw, 0.1, 0.7):
+        with redrawn(view.draw, 0.1):
             yield page, view
 
 

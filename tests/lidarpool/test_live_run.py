@@ -11,6 +11,7 @@ from importlib.metadata import version
 import msgspec
 import numpy as np
 import pytest
+import trimesh
 from tests.lidarpool.test_live_page import CAMERA
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
@@ -26,9 +27,11 @@ from lidarpool.run.run import Run, make_result
 from lidarpool.run.store import RunStore
 from lidarpool.scan import Receipt
 from lidarpool.scan.messages import samples_of_scan, summary_type
+from lidarpool.scene.mesh import Mesh
 
 LONG_S = 120.0
-SCENE = Scene.seed()
+WALL = trimesh.creation.box(bounds=[(5, -9, 0), (6, 9, 4)])  # beside the sensor
+SCENE = Scene.from_meshes([Mesh("Wall", WALL.vertices, WALL.faces)])
 WETNESS = Column("wetness", "float32", "%", "how wet it is", source="intensity")
 
 
@@ -117,7 +120,7 @@ def test_points_have_their_columns():
     assert live.cloud.positions[:, 2].tolist() == [3 + SCENE.origin[2]] * 3
     assert live.cloud["scan"].tolist() == [1, 1, 2]
     assert live.cloud["wetness"].tolist() == [1, 2, 3]
-    assert live.hit_counts[7] == store.db.hits == 15
+    assert live.hit_counts()[7] == store.db.hits == 15
 
 
 def test_points_are_bounded_and_even_and_hits_exact_where_all_parts_are_read():
@@ -131,7 +134,7 @@ def test_points_are_bounded_and_even_and_hits_exact_where_all_parts_are_read():
     assert 150 < len(live.cloud) <= 500
     by_tenth = np.histogram(live.cloud["scan"], bins=10, range=(0, 100))[0]
     assert by_tenth.min() > 0.3 * by_tenth.mean()
-    assert np.array_equal(live.hit_counts, store.hit_counts())
+    assert np.array_equal(live.hit_counts(), store.hit_counts())
 
 
 def test_of_many_parts_few_are_read_and_at_the_end_all_of_them_count(monkeypatch):
@@ -152,7 +155,7 @@ def test_of_many_parts_few_are_read_and_at_the_end_all_of_them_count(monkeypatch
     for _ in range(100):
         live.gather()
     assert len(opened) <= PARTS_NOTED
-    assert live.hit_counts.sum() == pytest.approx(store.db.hits)
+    assert live.hit_counts().sum() == pytest.approx(store.db.hits)
     by_tenth = np.histogram(live.cloud["scan"], bins=10, range=(0, 600))[0]
     assert by_tenth.min() > 0
     live.add(store.db.ordered)
@@ -160,7 +163,7 @@ def test_of_many_parts_few_are_read_and_at_the_end_all_of_them_count(monkeypatch
     store.remove()
     live.gather()
     assert len(live.cloud) == 500
-    assert live.hit_counts.tolist()[:10] == [60 * 40 * 5] * 10
+    assert live.hit_counts().tolist()[:10] == [60 * 40 * 5] * 10
     assert live.error == ""
 
 

@@ -42,7 +42,8 @@ class LivePoints:
         self._lock = threading.Lock()
         self._random = np.random.default_rng(0)
         self._share = 1.0  # of the points of a part that are taken
-        self._counts = np.zeros(len(store.job.scene.faces))
+        self._counts = np.zeros(len(store.job.scene.faces), np.int64)
+        self.hits = 0  # of the parts that were read
         self.version = 0  # counts up when there is something else to show
         self.cloud: Cloud | None = None
         self.error = ""  # why a part could not be read, a sentence
@@ -72,6 +73,7 @@ class LivePoints:
             self.error = str(error)
             return None
         self._counts[part.triangles] += part.hits
+        self.hits += int(part.hits.sum())
         rows = np.flatnonzero(self._random.random(len(part)) < self._share)
         return self._points.cloud_of(part, rows)
 
@@ -89,12 +91,10 @@ class LivePoints:
         with self._lock:
             self._waiting = []
             self.cloud, _ = result.points.sample(one_of_each_part, self._most, PARTS_NOTED)
-            self._counts = result.hit_counts.astype(np.float64)
+            self._counts, self.hits = result.hit_counts, result.hits
             self.version += 1
 
-    @property
     def hit_counts(self) -> NDArray[np.float64]:
         """Hits of each triangle, (f,), scaled up to all hits where not all parts were read."""
         with self._lock:
-            counted = self._counts.sum()
-            return self._counts * (self._store.db.hits / counted if counted else 1.0)
+            return np.asarray(self._counts * (self._store.db.hits / max(self.hits, 1)))

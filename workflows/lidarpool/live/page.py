@@ -187,7 +187,7 @@ def live_page(title: str, port: int = PORT) -> Iterator[LivePage]:
 
 
 @contextmanager
-def redrawn(draw: Callable[[], None], every_s: float, busy_share: float) -> Iterator[None]:
+def redrawn(draw: Callable[[], float], every_s: float) -> Iterator[None]:
     """Call a function again and again in a thread while the body runs, and once at its end.
 
     The function looks for what is new and draws that. An error is logged, and ends the drawing
@@ -195,22 +195,22 @@ def redrawn(draw: Callable[[], None], every_s: float, busy_share: float) -> Iter
 
     Parameters
     ----------
+    draw
+        Returns the share of one core that it may take of the time until it is called again.
     every_s
         Seconds between calls, at least.
-    busy_share
-        Share of the time that may go into calls, at most.
     """
     ended = threading.Event()
 
     def run() -> None:
         try:
             while True:
-                last, started = ended.is_set(), time.monotonic()
-                draw()
+                last, started = ended.is_set(), time.thread_time()
+                share = draw()
                 if last:
                     return
-                took = time.monotonic() - started
-                ended.wait(max(every_s, took / busy_share - took))
+                took = time.thread_time() - started  # of the processor: waiting slows nobody down
+                ended.wait(max(every_s, took / share - took))
         except Exception:
             _LOGGER.exception("the page cannot be drawn any more")
 

@@ -23,7 +23,7 @@ from .view import View, bounds_of
 
 CLOUD = "cloud.ply"
 VIEW_POINTS = 500_000  # in the browser at a time
-DRAW_EVERY_S, BUSY_SHARE = 0.1, 0.7  # nothing else is to be done
+DRAW_EVERY_S, BUSY_SHARE = 0.1, 0.7  # of a core: nothing else is to be done
 
 
 class ResultFile:
@@ -136,20 +136,21 @@ class ResultView:
         self._choose(*file.scans)
         self._view = View(page, scene, poses, file.table, origin, bounds)
 
-    def draw(self) -> None:
-        """Draw what has changed."""
+    def draw(self) -> float:
+        """Draw what has changed; returns the share of a core that this may take."""
         scans = self._scans.value if self._scans else self._file.scans
         if scans != self._chosen:
             self._choose(*scans)
         pictured = self._pictured
         names: tuple[str, ...] = ()
         if pictured is not None:
-            self._view.draw_scene(pictured.hit_counts, 0)
+            self._view.draw_scene(lambda: pictured.hit_counts, 0)
             self._view.draw_rays(pictured.sample_rays, 0)
             if pictured.plan is not None:
                 self._view.draw_path(pictured.plan.path, pictured.planning)
             names = pictured.scene.names
         self._view.draw_cloud(self._cloud, scans, names)
+        return BUSY_SHARE
 
     def _choose(self, first: int, last: int) -> None:
         self._chosen = (first, last)
@@ -209,7 +210,7 @@ def view_result(path: Path, *, port: int, browser: bool = True) -> None:
         if browser:
             open_browser(page.url)
         try:
-            with redrawn(view.draw, DRAW_EVERY_S, BUSY_SHARE):
+            with redrawn(view.draw, DRAW_EVERY_S):
                 while True:
                     time.sleep(1.0)
         except KeyboardInterrupt:

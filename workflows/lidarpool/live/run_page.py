@@ -6,6 +6,7 @@ noted, and drawn in another thread now and then, as much as a small share of the
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping
@@ -31,7 +32,8 @@ from .live_points import LivePoints
 from .page import PORT, LivePage, live_page, open_browser, redrawn
 from .view import View, bounds_of
 
-DRAW_EVERY_S, BUSY_SHARE = 0.5, 0.07
+DRAW_EVERY_S = 0.5
+BUSY_SHARE, IDLE_SHARE = 0.1, 0.7  # of a core, while the run goes on and when it is over
 ASK_EVERY_S = 2.0  # how busy the partitions are
 FRAMES_SHOWN = 40  # whose rays are shown
 
@@ -147,21 +149,25 @@ class LiveRun:
             self.paused.set()
         self._pause.label = "Go on" if self.paused.is_set() else "Pause"
 
-    def draw(self) -> None:
-        """Draw what is new."""
+    def draw(self) -> float:
+        """Draw what is new; returns the share of a core that this may take."""
+        share = IDLE_SHARE if self._over else BUSY_SHARE
         if not self.page.get_clients():  # whoever comes later has it drawn then
-            return
+            return share
         points, view, names = self._points, self._view, self._job.scene.names
         self._text.content = self._panel()
         if points is None:
-            view.draw_scene(np.zeros(len(self._job.scene.faces)), 0)
-            return
+            view.draw_scene(lambda: np.zeros(len(self._job.scene.faces)), 0)
+            return share
         points.gather()
         if points.cloud is not None:
             view.draw_cloud(points.cloud, points.version, names)
-        view.draw_scene(points.hit_counts, points.version)
+        # It is large, and looks another only when there are a tenth more hits.
+        grown = round(math.log1p(points.hits) / math.log(1.1))
+        view.draw_scene(points.hit_counts, (grown, self._over))
         self._draw_frames()
         self._draw_path()
+        return share
 
     def _draw_frames(self) -> None:
         frames = list(self._frames)
@@ -254,5 +260,5 @@ def live_run(job: Job, *, port: int = PORT, browser: bool = True) -> Iterator[Li
         click.echo(f"live page: {page.url}", err=True)
         if browser:
             open_browser(page.url)
-        with redrawn(live.draw, DRAW_EVERY_S, BUSY_SHARE):
+        with redrawn(live.draw, DRAW_EVERY_S):
             yield live

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
 import numpy as np
@@ -163,7 +163,7 @@ class View:
                     self._cloud.colors = colours
                     self._cloud.point_size = size_m
 
-    def draw_scene(self, hit_counts: NDArray[Any], version: Hashable) -> None:
+    def draw_scene(self, hit_counts: Callable[[], NDArray[Any]], version: Hashable) -> None:
         """Show the scene with the hits (f,) of each triangle; another version has other hits."""
         self._mesh.settle()
         if self._scene is None:
@@ -172,7 +172,7 @@ class View:
             self._surface = Surface(self._scene)
             self._look_around(self._surface)
         if self._changed("scene", version, self.cut):
-            colours, self._scene_legend.content = self._surface.coloured(hit_counts)
+            colours, self._scene_legend.content = self._surface.coloured(hit_counts())
             corners, kept = self._surface.below(self.cut)
             self._mesh.show(corners, colours[kept], self._show_scene.value)
         if self._changed("scene shown", self._show_scene.value):
