@@ -276,7 +276,7 @@ def test_the_panel_tells_stages_pace_points_and_slots(live):
     for words in ("running|, 5 s, 10 scans/s, 5 s left", "50 / 100", "2,000 points"):
         assert words in text
     assert "GPU, slots busy||1 / 2" in text
-    assert "plan path" not in text
+    assert "planning" not in text
     live.on_progress(progress(6.0, 60, waits_for="<GPU>"))
     assert "waiting for slots of &lt;GPU&gt;" in live._panel()
 

@@ -95,7 +95,7 @@ def test_progress_that_is_not_for_a_terminal_comes_as_short_lines(demo):
         assert len(line) <= 120
         assert not re.search(r"\bnan\b|\binf\b|\x1b", line)
     assert "survey  done: 108 scans" in ended.stderr
-    assert "plan    done: 100 trials" in ended.stderr
+    assert "planning  done: 100 trials" in ended.stderr
     assert "writing the cloud" in lines[-1]
 
 
@@ -252,7 +252,7 @@ def test_bars_on_a_terminal(colour, tmp_path, cluster):
     extra = {"COLUMNS": "100"} | ({} if colour else {"NO_COLOR": "1"})
     code, drawn = on_a_terminal([*arguments, "--scheduler", cluster], **extra)
     assert code == 0, drawn
-    for label in ("1 generate", "2 intersect", "3 sort frames", "4 collect", "plan path"):
+    for label in ("1 generate", "2 intersect", "3 sort", "4 collect", "planning"):
         assert label in drawn
     assert "108/108" in drawn and "4/4" in drawn
     assert bool(re.search(r"\x1b\[[0-9;]*3[0-9]", drawn)) == colour

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 STAGES: tuple[tuple[str, str, str], ...] = (
     ("1 generate", "generated", "scans"),
     ("2 intersect", "cast", "scans"),
-    ("3 sort frames", "framed", "scans"),
+    ("3 sort", "framed", "scans"),
     ("4 collect", "collected", "scans"),
-    ("plan path", "trials_done", "trials"),
+    ("planning", "trials_done", "trials"),
 )
 
 # The first items are slow, as workers warm up: what is left is told after this share of them, or
