@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 from distributed import Client
@@ -30,6 +30,7 @@ from .terminal import shown_progress, shown_status
 
 if TYPE_CHECKING:
     from ..live import LiveRun
+    from ..report.page import Recipe
 
 RUN_FOLDER = "run"  # of what is kept of a run until its result is whole, in the output folder
 NO_HITS = "no ray that was cast hit anything: look at poses, ranges and units"
@@ -73,9 +74,7 @@ def run_scenario(scenario: Scenario, options: RunOptions) -> None:
     LidarpoolError
         If something is wrong or fails; notes of the error say what was kept.
     """
-    # Matplotlib is a third of the time that --help would take.
-    from ..report.output import result_folder, write_result
-    from ..report.page import make_recipe
+    from ..report.page import make_recipe  # with Matplotlib, a third of the time of --help
 
     recipe = make_recipe(scenario, click.get_current_context(silent=True))
     if options.scheduler is None:  # before the scene is read, which may take long
@@ -90,48 +89,72 @@ def run_scenario(scenario: Scenario, options: RunOptions) -> None:
     if not options.quiet:
         for note in scenario.advice(job.scene):
             click.echo(f"note: {note}", err=True)
-    with _told_when_whole(options.out) as whole, _shown_live(job, options) as live:
-
-        def in_place() -> None:
-            whole.append(options.out)
-            store.remove()
-
-        with result_folder(options.out), logged_to(_log(options), options.verbose) as log:
-            store = _store(job, options)
-            with store.kept_on_error():
-                result = _conduct(scenario, store, options, live)
-                with shown_status(f"writing {_what(options)}", options.quiet):
-                    report = write_result(
-                        options.out,
-                        result,
-                        job.scene,
-                        job.survey,
-                        job.planning,
-                        recipe,
-                        in_place,
-                        only_cloud=options.only == "cloud",
-                    )
+    with ExitStack() as whole, _shown_live(job, options) as live:
+        result, report, log = _simulate(scenario, job, options, live, recipe, whole)
         if options.as_json:
-            figures = summary(options.out, report, _log(options) if log.written else None)
-            click.echo(json.dumps(figures, indent=1, allow_nan=False))
+            click.echo(json.dumps(summary(options.out, report, log), indent=1, allow_nan=False))
         else:
             _tell(options.out, result, job, report["files"])
-            if log.written and not options.quiet:
+            if log and not options.quiet:
                 name = click.format_filename(options.out / LOG)
                 click.echo(f"messages of Dask and other libraries are in {name}", err=True)
         if live is not None and options.stay:
             live.stay()
 
 
+def _simulate(
+    scenario: Scenario,
+    job: Job,
+    options: RunOptions,
+    live: LiveRun | None,
+    recipe: Recipe,
+    whole: ExitStack,
+) -> tuple[Result, dict[str, Any], Path | None]:
+    """Do what is not done yet, and write the result; returns also the report, and the log if any.
+
+    As soon as the result is in its place, an error or interrupt that ends `whole` says so.
+    """
+    from ..report.output import result_folder, write_result
+
+    log_file = options.out.absolute() / LOG  # its name is good in workers, too
+    with result_folder(options.out), logged_to(log_file, options.verbose) as log:
+        store = _store(job, options)
+
+        def in_place() -> None:
+            whole.enter_context(_noting_complete(options.out))
+            store.remove()
+
+        with store.kept_on_error():
+            if live is not None:
+                live.follow(store)
+            result = (
+                make_result(store) if store.complete else _drive(scenario, store, options, live)
+            )
+            if live is not None:
+                live.finish(result)
+            only_cloud = options.only == "cloud"
+            what = "the cloud" if only_cloud else "the cloud, the pictures and the report"
+            with shown_status(f"writing {what}", options.quiet):
+                report = write_result(
+                    options.out,
+                    result,
+                    job.scene,
+                    job.survey,
+                    job.planning,
+                    recipe,
+                    in_place,
+                    only_cloud=only_cloud,
+                )
+        return result, report, log_file if log.written else None
+
+
 @contextmanager
-def _told_when_whole(out: Path) -> Iterator[list[Path]]:
-    """Let an error say that the result is whole once that is in the list: so is an interrupt."""
-    whole: list[Path] = []
+def _noting_complete(out: Path) -> Iterator[None]:
+    """Let an error or interrupt say that the result is whole."""
     try:
-        yield whole
+        yield
     except BaseException as error:
-        if whole:
-            error.add_note(f"The result in {out} is complete.")
+        error.add_note(f"The result in {out} is complete.")
         raise
 
 
@@ -147,15 +170,6 @@ def _shown_live(job: Job, options: RunOptions) -> Iterator[LiveRun | None]:
         yield live
 
 
-def _what(options: RunOptions) -> str:
-    return "the cloud" if options.only == "cloud" else "the cloud, the pictures and the report"
-
-
-def _log(options: RunOptions) -> Path:
-    """File for messages of libraries; its name is good in workers, too."""
-    return options.out.absolute() / LOG
-
-
 def _store(job: Job, options: RunOptions) -> RunStore:
     """Where the run is kept, with what an earlier one has left if that is to be resumed."""
     if not options.resumable:
@@ -169,21 +183,10 @@ def _store(job: Job, options: RunOptions) -> RunStore:
     return store
 
 
-def _conduct(
-    scenario: Scenario, store: RunStore, options: RunOptions, live: LiveRun | None
-) -> Result:
-    """Do what is not done yet."""
-    if live is not None:
-        live.follow(store)
-    result = make_result(store) if store.complete else _drive(scenario, store, options, live)
-    if live is not None:
-        live.finish(result)
-    return result
-
-
 def _drive(
     scenario: Scenario, store: RunStore, options: RunOptions, live: LiveRun | None
 ) -> Result:
+    """Run on a cluster, on one of this machine if none is given."""
     if options.scheduler is None:
         check_backend_here(store.backend or store.job.backend, store.advice)
         cluster = _local_client(scenario, options, store.job.planning is not None)
@@ -194,7 +197,7 @@ def _drive(
         shown_progress(options.quiet) as show,
         shown_on_page(client, options.page, show) as show_both,
     ):
-        tell = _silent if options.quiet else _note
+        tell = (lambda words: None) if options.quiet else _note
         if live is None:
             return Run(client, store, tell=tell).drive(None, show_both)
         run = Run(client, store, live.wants_pause, tell)
@@ -205,25 +208,21 @@ def _note(words: str) -> None:
     click.echo(f"note: {words}", err=True)
 
 
-def _silent(words: str) -> None:
-    """Say nothing."""
-
-
 @contextmanager
 def _local_client(scenario: Scenario, options: RunOptions, planning: bool) -> Iterator[Client]:
     """Client of a cluster on this machine whose workers say nothing at the terminal."""
+    cluster = local_client(
+        gpu_workers=scenario.pool.gpu,
+        collectors=scenario.pool.collectors,
+        other_workers=scenario.pool.other,
+        planning=planning,
+        tls=options.tls,
+    )
     with ExitStack() as stack:
         with shown_status("starting the workers", options.quiet):
-            client = stack.enter_context(
-                local_client(
-                    gpu_workers=scenario.pool.gpu,
-                    collectors=scenario.pool.collectors,
-                    other_workers=scenario.pool.other,
-                    planning=planning,
-                    tls=options.tls,
-                )
-            )
-            client.register_plugin(QuietWorkers(_log(options) if options.verbose else None))
+            client = stack.enter_context(cluster)
+            log = options.out.absolute() / LOG if options.verbose else None
+            client.register_plugin(QuietWorkers(log))
         yield client
 
 

@@ -26,10 +26,12 @@ from .sections import (
     MeshFile,
     PlanningSection,
     PoolSection,
-    PoseSection,
+    PoseEntry,
     SceneSection,
     Section,
     SensorSection,
+    may_be_empty,
+    scene_in_short,
 )
 from .validation_errors import validation_error
 from .yamlfile import read_yaml
@@ -68,10 +70,10 @@ class Scenario(Section):
         If a value is out of range; `load`, `from_mesh` and `from_data` raise LidarpoolError.
     """
 
-    scene: SceneSection = SceneSection()
-    sensor: SensorSection = SensorSection()
+    scene: Annotated[SceneSection, scene_in_short] = SceneSection()
+    sensor: Annotated[SensorSection, may_be_empty(SensorSection)] = SensorSection()
     poses: Annotated[
-        tuple[PoseSection, ...] | None,
+        tuple[PoseEntry, ...] | None,
         Strict(False),
         Field(
             min_length=1,
@@ -84,19 +86,13 @@ class Scenario(Section):
     steps: Annotated[
         int, Field(ge=1, le=1_000_000, description="time steps (scans) from each pose")
     ] = 36
-    cloud: CloudSection = CloudSection()
-    planning: PlanningSection = PlanningSection()
-    pool: PoolSection = PoolSection()
+    cloud: Annotated[CloudSection, may_be_empty(CloudSection)] = CloudSection()
+    planning: Annotated[PlanningSection, may_be_empty(PlanningSection)] = PlanningSection()
+    pool: Annotated[PoolSection, may_be_empty(PoolSection)] = PoolSection()
 
     _folder: Path = PrivateAttr(default=Path())  # that relative file names start from
     _source: str = PrivateAttr(default="scenario")  # for messages
     _notes: list[str] = PrivateAttr(default_factory=list)  # of what was left out of the scene
-
-    @field_validator("scene", "sensor", "cloud", "planning", "pool", mode="before")
-    @classmethod
-    def _empty_section(cls, value: Any) -> Any:
-        """Take a section of which all fields are commented out as one of defaults."""
-        return {} if value is None else value
 
     @field_validator("poses", mode="before")
     @classmethod

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, Strict, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, Strict, model_validator
 
 from ..columns.table import OPTIONAL
 from ..scene.transform import Transform
@@ -27,6 +28,17 @@ Angles = Annotated[tuple[Angle, Angle, Angle], Strict(False)]
 Factors = Annotated[tuple[Factor, Factor, Factor], Strict(False)]
 Row = Annotated[tuple[Factor, Factor, Factor, Factor], Strict(False)]
 Matrix = Annotated[tuple[Row, Row, Row, Row], Strict(False)]
+
+
+def _short(is_short: Callable[[Any], bool], long: Callable[[Any], Any], allowed: Any) -> Any:
+    """Take a short form for what it stands for; `allowed` is the type, for the schema."""
+    return BeforeValidator(
+        lambda value: long(value) if is_short(value) else value, json_schema_input_type=allowed
+    )
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str)
 
 
 class Section(BaseModel):
@@ -63,20 +75,13 @@ class MeshFile(Section):
         Angles, Field(description="turned about the world's x, y and z axes, degrees")
     ] = (0, 0, 0)
     scale: Annotated[
-        Factors, Field(description="one factor, or one for each axis; applied first")
+        Factors,
+        _short(lambda v: type(v) in (int, float), lambda v: [v] * 3, Factor | Factors),
+        Field(description="one factor, or one for each axis; applied first"),
     ] = (1, 1, 1)
     matrix: Annotated[
         Matrix | None, Field(description="all of the placement at once, 4 rows of 4, metres")
     ] = None
-
-    @model_validator(mode="before")
-    @classmethod
-    def _short_forms(cls, value: Any) -> Any:
-        if isinstance(value, str):
-            return {"file": value}
-        if isinstance(value, dict) and type(value.get("scale")) in (int, float):
-            return value | {"scale": [value["scale"]] * 3}
-        return value
 
     @model_validator(mode="after")
     def _one_placement(self) -> MeshFile:
@@ -92,6 +97,11 @@ class MeshFile(Section):
         if self.matrix is not None:
             return Transform.from_matrix(self.matrix)
         return Transform.place(self.translation, self.rotation_deg, self.scale)
+
+
+Text = Annotated[str, Field(min_length=1)]
+MeshEntry = Annotated[MeshFile, _short(_is_text, lambda v: {"file": v}, Text | MeshFile)]
+MeshEntries = Annotated[tuple[MeshEntry, ...], Strict(False)]
 
 
 class Ground(Section):
@@ -117,8 +127,8 @@ class SceneSection(Section):
         ),
     ] = None
     files: Annotated[
-        tuple[MeshFile, ...],
-        Strict(False),
+        MeshEntries,
+        _short(lambda v: isinstance(v, (str, dict)), lambda v: [v], MeshEntry | MeshEntries),
         Field(
             max_length=10_000,
             description="mesh files, by name or with unit, up_axis, scale, rotation_deg, "
@@ -133,15 +143,6 @@ class SceneSection(Section):
             examples=[{"height_m": 0, "margin_m": 5}],
         ),
     ] = None
-
-    @model_validator(mode="before")
-    @classmethod
-    def _short_forms(cls, value: Any) -> Any:
-        if isinstance(value, str):
-            return {"preset": value} if value in ("seed", "none") else {"files": [value]}
-        if isinstance(value, dict) and isinstance(value.get("files"), (str, dict)):
-            return value | {"files": [value["files"]]}
-        return {"files": value} if isinstance(value, list) else value
 
     @model_validator(mode="after")
     def _something(self) -> SceneSection:
@@ -195,17 +196,18 @@ class SensorSection(Section):
 
 
 class PoseSection(Section):
-    """Where the sensor stands, in world coordinates; in YAML [x, y, z] will do."""
+    """Where the sensor stands, in world coordinates."""
 
     position: Annotated[Triple, Field(description="x, y and z, metres")]
     yaw_deg: Annotated[Angle, Field(description="turned about z, first")] = 0.0
     pitch_deg: Annotated[Angle, Field(description="turned about the new y, then")] = 0.0
     roll_deg: Annotated[Angle, Field(description="turned about the new x, last")] = 0.0
 
-    @model_validator(mode="before")
-    @classmethod
-    def _short_form(cls, value: Any) -> Any:
-        return {"position": value} if isinstance(value, list) else value
+
+PoseEntry = Annotated[
+    PoseSection,
+    _short(lambda v: isinstance(v, list), lambda v: {"position": v}, Triple | PoseSection),
+]
 
 
 class CloudSection(Section):
@@ -235,18 +237,13 @@ class Obstacle(Section):
     """
 
     object: Annotated[
-        Annotated[str, Field(min_length=1)] | None,
+        Text | None,
         Field(description="name of objects of the scene, may hold * and ?"),
     ] = None
     centre: Annotated[Pair | None, Field(description="x and y of a disc, metres")] = None
     radius_m: Annotated[
         Annotated[float, Field(gt=0, le=1e6)] | None, Field(description="of the disc, metres")
     ] = None
-
-    @model_validator(mode="before")
-    @classmethod
-    def _short_form(cls, value: Any) -> Any:
-        return {"object": value} if isinstance(value, str) else value
 
     @model_validator(mode="after")
     def _one_kind(self) -> Obstacle:
@@ -256,6 +253,12 @@ class Obstacle(Section):
         ):
             raise ValueError("give either object, or both centre and radius_m.")
         return self
+
+
+Obstacles = Annotated[
+    tuple[Annotated[Obstacle, _short(_is_text, lambda v: {"object": v}, Text | Obstacle)], ...],
+    Strict(False),
+]
 
 
 class PlanningSection(Section):
@@ -279,7 +282,8 @@ class PlanningSection(Section):
         Field(description="x and y, metres; the default objects have one", examples=[[-30, -20]]),
     ] = None
     obstacles: Annotated[
-        Annotated[tuple[Obstacle, ...], Strict(False)] | None,
+        Obstacles | None,
+        _short(lambda v: v == "auto", lambda v: None, Literal["auto"] | Obstacles | None),
         Field(
             description="circles about all objects that are not flat (auto), or names and discs",
             examples=["auto", ["Shelf*", {"centre": [-6, -1], "radius_m": 1}]],
@@ -299,13 +303,6 @@ class PlanningSection(Section):
     seed: Annotated[
         int, Field(ge=0, le=2**63 - 1, description="the same seed gives the same path")
     ] = 0
-
-    @model_validator(mode="before")
-    @classmethod
-    def _auto(cls, value: Any) -> Any:
-        if isinstance(value, dict) and value.get("obstacles") == "auto":
-            return value | {"obstacles": None}
-        return value
 
 
 class PoolSection(Section):
@@ -331,3 +328,20 @@ class PoolSection(Section):
         Literal[BACKENDS],  # type: ignore[valid-type]
         Field(description="cuda, embree or numpy; auto takes the fastest that is there"),
     ] = "auto"
+
+
+def may_be_empty(section: type[Section]) -> Any:
+    """Take a section of which all fields are commented out as one of defaults."""
+    return _short(lambda v: v is None, lambda v: {}, section | None)
+
+
+def _scene_of(value: str | list[Any] | None) -> dict[str, Any]:
+    return {"preset" if value in ("seed", "none") else "files": value} if value else {}
+
+
+# In place of a scene: the name of a mesh file or preset, or a list of files.
+scene_in_short = _short(
+    lambda v: v is None or isinstance(v, (str, list)),
+    _scene_of,
+    Text | MeshEntries | SceneSection | None,
+)
