@@ -131,7 +131,8 @@ class EmbreeBackend(Backend):
     def closest(self, rays: Rays) -> Found:
         """See `Backend.closest`."""
         desk, limits = self._desk(len(rays)), self._limits(rays.t_min, rays.t_max)
-        unit, starts = desk.aim(rays.directions), Starts(self._mesh.to_local(rays.origins))
+        unit, starts = rays.directions.T.copy(), Starts(self._mesh.to_local(rays.origins))
+        desk.aim(unit)
         hits = self._within(desk, unit, starts, limits)
         t, place = self._distance(hits, hits.ray, unit, starts, limits)
         u, v = self._refine.weights(starts.of(hits.ray), rays.directions[hits.ray], place)
@@ -199,7 +200,7 @@ class EmbreeBackend(Backend):
         rays, distances, places = [], [], []
         for ahead in _STARTS:
             directions, at = _columns_of(unit, ray), Starts(starts.of(ray))
-            desk.write(directions)
+            desk.aim(directions)
             rough, place = self._cast(desk, directions, at, limits.t_min + ahead)
             hit = np.flatnonzero(rough < np.inf)
             t = self._refined(hit, rough[hit], place[hit], directions, at)

@@ -34,9 +34,6 @@ class Starts:
     def __init__(self, points: Float, rays: int = 1, skip: int = 0) -> None:
         self.points, self.rays, self.skip = points, rays, skip
 
-    def __repr__(self) -> str:
-        return f"Starts({len(self.points)} points, {self.rays} rays each)"
-
     def of(self, ray: NDArray[np.intp]) -> Float:
         """Look up where some rays start: (len(ray), 3), or (1, 3) when one is that of all."""
         if len(self.points) == 1:
@@ -77,10 +74,6 @@ class Workspace:
         points = starts.points
         if len(points) > 1:
             self._origin = None
-            if starts.rays == 1:
-                for axis in range(3):
-                    self._rows[:n, axis] = points[:, axis]
-                return self._rows[:n]
             for at, length, point, count in _blocks(starts.skip, starts.skip + n, starts.rays):
                 rows = self._rows[at : at + length].reshape(count, -1, 6)
                 for axis in range(3):
@@ -90,19 +83,7 @@ class Workspace:
             self._rows[:, :3] = points
         return self._rows[:n]
 
-    def aim(self, directions: Float) -> Float:
-        """Write directions (n, 3) to the rows.
-
-        Returns
-        -------
-        (3, n) float64, valid until the next call: the same, one row an axis.
-        """
-        unit = self._turned[0, :, : len(directions)]
-        np.copyto(unit, directions.T)
-        self.write(unit)
-        return unit
-
-    def write(self, unit: Float) -> None:
+    def aim(self, unit: Float) -> None:
         """Write directions (3, n) to the rows."""
         for axis in range(3):
             self._rows[: unit.shape[1], 3 + axis] = unit[axis]
@@ -152,7 +133,7 @@ class Workspace:
         n = given.shape[1]
         if poses.rotations is None:
             if written:
-                self.write(given)
+                self.aim(given)
             return given
         for at, length, pose, count in _blocks(start, start + n, poses.rays):
             block = slice(at, at + length)

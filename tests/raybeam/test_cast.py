@@ -73,8 +73,11 @@ def test_agrees_with_brute_force(caster, backend, shapes, kind, offset):
     directions[::10] = rng.normal(size=(len(directions[::10]), 3))
     size = np.ptp(vertices, axis=0).max()
     graze = size * (4e-6 if backend == "embree" else 1e-12) + 1e-8
-    hits = caster(vertices, faces).cast(origins, directions)
-    sure = check(hits, vertices, faces, origins, directions, graze)
+    engine = caster(vertices, faces)
+    check(
+        engine.cast(origins, directions, 5, 25), vertices, faces, origins, directions, graze, 5, 25
+    )
+    sure = check(engine.cast(origins, directions), vertices, faces, origins, directions, graze)
     if kind in ("random", "huge") or (kind == "tiny" and backend != "embree"):
         assert sure > 0.8 * n  # else the comparison says little
 
@@ -104,17 +107,6 @@ def test_axis_parallel_rays_over_a_fine_grid(caster):
         np.testing.assert_array_equal(hits.distance, 3)
 
 
-def test_length_of_direction_does_not_matter(caster, shapes):
-    vertices, faces = shapes["vase"]()
-    vase = caster(vertices, faces)
-    directions = np.random.default_rng(3).normal(size=(200, 3))
-    want = vase.cast([0.1, 0, 0], directions)
-    assert want.hit.all()
-    for factor in (1e-200, 1e-3, 1e3, 1e200):
-        got = vase.cast([0.1, 0, 0], directions * factor)
-        np.testing.assert_allclose(got.distance, want.distance, rtol=1e-12)
-
-
 def test_limits_count_on_both_ends(exact_caster, shapes):
     cube = exact_caster(*shapes["cube"]())
     ray = [-4, 0.25, 0.5], [[1, 0, 0]]
@@ -125,16 +117,6 @@ def test_limits_count_on_both_ends(exact_caster, shapes):
     assert cube.cast(*ray, t_max=3).distance == 3
     assert not cube.cast(*ray, t_max=np.nextafter(3, 0)).hit
     assert not cube.cast(*ray, t_min=3.5, t_max=4.5).hit
-
-
-def test_limits_agree_with_brute_force(caster, backend, shapes):
-    vertices, faces = shapes["soup"]("random")
-    rng = np.random.default_rng(4)
-    origins, directions = rng.uniform(-20, 20, (300, 3)), rng.normal(size=(300, 3))
-    graze = 2e-4 if backend == "embree" else 1e-8
-    hits = caster(vertices, faces).cast(origins, directions, 5, 25)
-    sure = check(hits, vertices, faces, origins, directions, graze, 5, 25)
-    assert 50 < sure < 290
 
 
 def test_start_on_a_surface(exact_caster, shapes):

@@ -103,24 +103,22 @@ def test_any_triangles(built, points):
     assert_same_as_numpy(built, mesh)
 
 
-@pytest.mark.parametrize(("triangles", "called"), [(3, 0), (12, 1)])
-def test_device_builds_where_it_pays(source_backend, shapes, monkeypatch, triangles, called):
-    monkeypatch.setattr(source_backend, "device_build", 10)
+@pytest.mark.parametrize(
+    ("pays_from", "lacking", "called"), [(301, 0, 0), (300, 0, 1), (300, 1, 0)]
+)
+def test_device_builds_where_it_pays_and_has_room(
+    source_backend, shapes, monkeypatch, pays_from, lacking, called
+):
+    mesh = local_mesh(*shapes["soup"]("random", count=300))
+    room = cuda_build.BYTES * 300 + cuda_backend._WORK - lacking
+    runtime = source_backend._library().cuda.runtime
+    monkeypatch.setattr(runtime, "memGetInfo", lambda: (room, 1 << 35))
+    monkeypatch.setattr(source_backend, "device_build", pays_from)
     calls = []
     build = cuda_build.build
     monkeypatch.setattr(cuda_build, "build", lambda *given: calls.append(given) or build(*given))
-    points, faces = shapes["cube"]()
-    source_backend(local_mesh(points, faces[:triangles]))
+    assert len(source_backend(mesh)._faces) == 300
     assert len(calls) == called
-
-
-def test_host_builds_where_only_the_tables_fit(source_backend, shapes, monkeypatch):
-    mesh = local_mesh(*shapes["soup"]("random", count=4000))
-    need = cuda_build.BYTES * len(mesh.corners) + cuda_backend._WORK - 1
-    runtime = source_backend._library().cuda.runtime
-    monkeypatch.setattr(runtime, "memGetInfo", lambda: (need, 1 << 35))
-    monkeypatch.setattr(cuda_build, "build", None)
-    assert len(source_backend(mesh)._faces) == len(mesh.corners)
 
 
 @pytest.mark.parametrize("least", [1, 1 << 20], ids=["device builds", "host builds"])

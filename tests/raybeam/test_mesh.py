@@ -24,6 +24,7 @@ POINTS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
         (POINTS, [[0.0, 1, 2]], "faces must be integers"),
         (POINTS, [[0, 1, 2], [0, 1, 3]], r"Face 1 is \[0, 1, 3\].*indices must be 0 to 2"),
         (POINTS, [[0, 1, -1]], "Face 0 is"),
+        (POINTS, np.broadcast_to(np.int8(0), (2**28, 3)), "268435456 triangles are too many"),
         ([[0, 0, 0], [1, 0, 0], [0, np.nan, 0]], [[0, 1, 2]], "Vertex 2 is .*nan"),
         ([[0, 0, 0], [1, 0, 0], [0, np.inf, 0]], [[0, 1, 2]], "Vertex 2 is .*inf"),
         (POINTS, [[0, 1, 1], [2, 2, 2]], "No triangle of the mesh has an area"),

@@ -41,12 +41,10 @@ def test_refused(origins, directions, words):
         caster.cast(origins, directions)
 
 
-@pytest.mark.parametrize(
-    "limits", [(-1, 5), (np.nan, 5), (0, np.nan), (3, 2), (np.inf, np.inf)], ids=str
-)
-def test_limits_refused(limits):
-    with pytest.raises(ValueError, match="t_min is"):
-        check_rays([0, 0, 0], DOWN, *limits)
+def test_limits_refused():
+    for limits in ((-1, 5), (np.nan, 5), (0, np.nan), (3, 2), (np.inf, np.inf)):
+        with pytest.raises(ValueError, match="t_min is"):
+            check_rays([0, 0, 0], DOWN, *limits)
 
 
 def test_no_rays(backend):

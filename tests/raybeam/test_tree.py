@@ -142,19 +142,6 @@ def under(levels, depth, node):
     return out
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 10, 137])
-def test_every_box_is_in_one_place(count):
-    levels = divide(*boxes(count), np.ones(count))
-    if count == 1:
-        assert levels == []
-        return
-    assert sorted(under(levels, 0, 0)) == list(range(count))
-    assert sum(len(level) for level in levels) == count - 1
-    for above, below in zip(levels, [*levels[1:], np.zeros((0, 2))], strict=True):
-        nodes = -1 - above[above < 0]
-        assert nodes.tolist() == list(range(len(below)))
-
-
 @pytest.mark.parametrize("seed", range(6))
 def test_no_division_of_the_root_is_cheaper(seed):
     count = 40
