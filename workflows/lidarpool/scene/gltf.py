@@ -208,6 +208,8 @@ class _Reader:
         buffer = self._header["buffers"][_natural(index)]
         uri = buffer.get("uri")
         if uri is None:
+            if index:
+                raise MeshFileError("has a buffer without content, as packed files have: unpack it")
             content = self._body
         elif uri.startswith("data:"):
             kind, _, text = uri.partition(",")

@@ -18,8 +18,8 @@ def triangulated(
 ) -> NDArray[np.int64]:
     """Cut polygons into triangles with the same corners and the same outside.
 
-    Convex ones and quadrangles become fans, all of one size at once; of others ears are clipped
-    off by mapbox_earcut.
+    Convex ones become fans, all of one size at once; of others ears are clipped off by
+    mapbox_earcut.
 
     Parameters
     ----------
@@ -47,22 +47,24 @@ def triangulated(
     out = np.full((int(ends[-1]) if len(ends) else 0, 3), -1, dtype=np.int64)
     for size in np.unique(sizes[sizes > 2]).tolist():
         which = np.flatnonzero(sizes == size)
-        rows = _begun_well(vertices, corners[first[which, None] + np.arange(size)])
+        rows = corners[first[which, None] + np.arange(size)]
         places = ends[which, None] - (size - 2) + np.arange(size - 2)
         out[places, 0] = rows[:, :1]
         out[places, 1] = rows[:, 1:-1]
         out[places, 2] = rows[:, 2:]
-        if size > 4:
-            for i in np.flatnonzero(_turns(vertices, rows).any(axis=1)).tolist():
-                clipped = _clipped(vertices[rows[i]])
+        if size > 3:
+            for i in np.flatnonzero(_turns(vertices[rows]).any(axis=1)).tolist():
+                clipped = with_holes(vertices, [rows[i]])
                 if len(clipped):  # else it has no area, and the fan has none that matters
                     out[places[i]] = -1
-                    out[places[i, : len(clipped)]] = rows[i][clipped]
+                    out[places[i, : len(clipped)]] = clipped
     return out[out[:, 0] >= 0]
 
 
 def with_holes(vertices: NDArray[np.float64], rings: list[NDArray[np.int64]]) -> NDArray[np.int64]:
-    """Triangles (t, 3) of one polygon: its outline, and outlines of holes in it.
+    """Clip the ears off one polygon: an outline, and the outlines of holes in it.
+
+    The triangles (t, 3) have the same outside as the outline; none where it has no area.
 
     Raises
     ------
@@ -70,9 +72,18 @@ def with_holes(vertices: NDArray[np.float64], rings: list[NDArray[np.int64]]) ->
         As `triangulated`.
     """
     corners = np.concatenate(rings)
+    if len(corners) > MOST_CORNERS:
+        raise ValueError(f"a face has {len(corners):,} corners and is not convex: triangulate it")
     _check(vertices, corners)
-    flat = _plane(vertices[corners], len(rings[0]))
+    points = vertices[corners] - vertices[corners[0]]  # far from zero nothing is lost
+    outline = points[: len(rings[0])]
+    normal = np.cross(outline, np.roll(outline, -1, axis=0)).sum(axis=0)  # Newell
+    drop = int(np.abs(normal).argmax())
+    across, up = (drop + 1) % 3, (drop + 2) % 3
+    if normal[drop] < 0:  # the clipper's triangles run anticlockwise, whatever the polygon does
+        across, up = up, across
     ends = np.cumsum([len(ring) for ring in rings]).astype(np.uint32)
+    flat = np.ascontiguousarray(points[:, [across, up]])
     found = mapbox_earcut.triangulate_float64(flat, ends).astype(np.int64)
     return corners[found].reshape(-1, 3)
 
@@ -85,53 +96,13 @@ def _check(vertices: NDArray[np.float64], corners: NDArray[np.int64]) -> None:
         )
 
 
-def _begun_well(vertices: NDArray[np.float64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Rows (p, k) of corners; of four that are not convex the one that turns back is first.
-
-    A fan from there fills it.
-    """
-    if rows.shape[1] != 4:
-        return rows
-    back = _turns(vertices, rows)
-    begin = np.where(back.sum(axis=1) == 1, back.argmax(axis=1), 0)
-    return np.take_along_axis(rows, (begin[:, None] + np.arange(4)) % 4, axis=1)
-
-
-def _turns(vertices: NDArray[np.float64], rows: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which corners (p, k) turn back, against the sense of the whole polygon."""
-    if rows.shape[1] == 3:
-        return np.zeros(rows.shape, dtype=np.bool_)
-    points = vertices[rows]
-    points = points - points[:, :1]  # of coordinates far from zero nothing is lost
+def _turns(points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which of the corners (p, k, 3) turn back, against the sense of the whole polygon: (p, k)."""
+    points = points - points[:, :1]
     into = points - np.roll(points, 1, axis=1)
     out_of = np.roll(into, -1, axis=1)
     turn = np.cross(into, out_of)
-    normal = np.cross(points, np.roll(points, -1, axis=1)).sum(axis=1)  # Newell
+    normal = np.cross(points, np.roll(points, -1, axis=1)).sum(axis=1)
     along = (turn * normal[:, None]).sum(axis=2)
     scale = np.linalg.norm(into, axis=2) * np.linalg.norm(out_of, axis=2)
-    return along < -_FLAT * scale * np.linalg.norm(normal, axis=1)[:, None]
-
-
-def _clipped(points: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Triangles (t, 3) of the corners (k, 3) of one polygon; none where it has no area."""
-    if len(points) > MOST_CORNERS:
-        raise ValueError(f"a face has {len(points):,} corners and is not convex: triangulate it")
-    rings = np.array([len(points)], dtype=np.uint32)
-    found = mapbox_earcut.triangulate_float64(_plane(points), rings)
-    return found.astype(np.int64).reshape(-1, 3)
-
-
-def _plane(points: NDArray[np.float64], outline: int | None = None) -> NDArray[np.float64]:
-    """Corners (k, 3) of a polygon as seen from its outside, anticlockwise: (k, 2).
-
-    The clipper makes triangles that run anticlockwise, whatever the polygon does. Of a polygon
-    with holes only the first corners are its `outline`.
-    """
-    points = points - points[0]  # of coordinates far from zero nothing is lost
-    around = points[:outline]
-    normal = np.cross(around, np.roll(around, -1, axis=0)).sum(axis=0)
-    drop = int(np.abs(normal).argmax())
-    across, up = (drop + 1) % 3, (drop + 2) % 3
-    if normal[drop] < 0:
-        across, up = up, across
-    return np.ascontiguousarray(points[:, [across, up]])
+    return np.asarray(along < -_FLAT * scale * np.linalg.norm(normal, axis=1)[:, None])
