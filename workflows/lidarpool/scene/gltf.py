@@ -24,7 +24,9 @@ from .mesh import Mesh
 from .nodes import Content, MeshFileError, Node, fanned, instances, joined, unrolled
 
 # Extensions that change looks, not shapes, or that are read here.
-_READ = re.compile(r"KHR_materials_|\w+_texture_|KHR_texture|KHR_lights|KHR_mesh_quantization")
+_READ = re.compile(
+    r"KHR_materials_|KHR_techni|\w+_texture_|KHR_texture|KHR_lights|KHR_mesh_quantization"
+)
 _DRACO = "KHR_draco_mesh_compression"
 _INSTANCING = "EXT_mesh_gpu_instancing"
 
