@@ -6,6 +6,7 @@ import sys
 import threading
 import time
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from importlib.metadata import version
 
 import msgspec
@@ -16,10 +17,12 @@ from tests.lidarpool.test_live_page import CAMERA
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from lidarpool import Column, Planning, Scene, Sensor, Survey
+from lidarpool import Column, LidarpoolError, Planning, Scene, Sensor, Survey
 from lidarpool.columns.parts import PartColumns, pack
 from lidarpool.live import LiveRun, live_points, live_run
 from lidarpool.live.live_points import PARTS_AT_ONCE, PARTS_NOTED, LivePoints
+from lidarpool.live.page import live_page
+from lidarpool.live.result_page import ResultView, open_result
 from lidarpool.run.connection import local_client
 from lidarpool.run.job import Job
 from lidarpool.run.progress import Progress
@@ -202,7 +205,7 @@ def test_what_comes_while_somebody_looks_is_drawn_and_the_last_picture_is_whole(
             wait_for(lambda: "done" in panel(live))
             wait_for(lambda: displayed(live) == len(live._points.cloud) > 500)
         menu = live._view._colour.options
-        assert menu == ("z", "channel", "object")
+        assert menu == ("z", "scan", "channel", "object")
 
 
 def test_a_resumed_run_shows_what_the_earlier_one_has_left(tmp_path):
@@ -218,6 +221,28 @@ def test_a_resumed_run_shows_what_the_earlier_one_has_left(tmp_path):
         wait_for(lambda: "600 points" in panel(live) and "60 / 100" in panel(live))
         assert "starting" in panel(live)
         wait_for(lambda: displayed(live) == 600)
+
+
+def test_what_there_is_of_an_unfinished_run_can_be_viewed(tmp_path):
+    store = RunStore(make_job(100, [WETNESS]), tmp_path / "run")
+    for scan in range(60):
+        commit(store, scan, 10, wetness=np.float32([scan] * 10))
+    with pytest.raises(LidarpoolError, match=r"locked.*While it goes on, --live shows it"):
+        open_result(tmp_path)
+    store.db.close()
+    file, pictured, note = open_result(tmp_path)
+    assert (len(file), pictured) == (600, None)
+    assert "not finished" in note
+    assert file.table[-1] == replace(WETNESS, source="")
+    cloud, count = file.choose(0, 0, 100)
+    assert (len(cloud), count) == (100, 600)
+    assert set(cloud.positions[:, 2]) == {3 + SCENE.origin[2]}
+    assert cloud["wetness"].tolist() == cloud["scan"].tolist()
+    with live_page("what there is", port=0) as page:
+        view = ResultView(page, file, None, note)
+        view.draw()
+        assert len(page.scene.get_handle_by_name("/cloud").points) == 600
+        assert view._view._colour.options == ("z", "scan", "channel", "object", "wetness")
 
 
 def test_a_run_is_watched_from_its_first_part_to_its_path():

@@ -27,13 +27,14 @@ from ..run.checks import check_backend_here, find_workers, slots_needed
 from ..run.database import FILE
 from ..run.job import Job
 from ..run.local import default_workers
+from ..run.store import RUN_FOLDER
 from ..scan import GPU, LIDAR, OTHER
 from ..scan.driver import BATCH_RAYS
 from ..scan.rig import PATTERN_RAYS, Rig, RigPlan
 from ..scenario.sections import PoolSection
 from ..scene.scene import Scene
 from ..sensor import Survey
-from .run_command import NO_HITS, RUN_FOLDER
+from .run_command import NO_HITS
 
 # Measured on Linux: a process of ours with Dask and Open3D loaded, and what a triangle takes at
 # most while a caster is built (Embree 300, NumPy 320, CUDA up to 400, there on the device).

@@ -22,7 +22,7 @@ from ..run.connection import TlsFiles, connected, local_client
 from ..run.job import Job, make_job
 from ..run.result import Result
 from ..run.run import Run, make_result
-from ..run.store import RunStore, remove_run
+from ..run.store import RUN_FOLDER, RunStore, remove_run
 from ..scan import PATIENCE_S, WAIT_S
 from ..scenario.scenario import Scenario
 from .log_file import LOG, QuietWorkers, logged_to
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from ..live import LiveRun
     from ..report.page import Recipe
 
-RUN_FOLDER = "run"  # of what is kept of a run until its result is whole, in the output folder
 NO_HITS = "no ray that was cast hit anything: look at poses, ranges and units"
 
 

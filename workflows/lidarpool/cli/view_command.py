@@ -18,7 +18,7 @@ import click
 )
 @click.option("--no-browser", is_flag=True, help="Only say where the page is.")
 def view(result: Path, port: int, no_browser: bool) -> None:
-    """Show a result, a folder or a cloud, in the browser until Ctrl-C.
+    """Show a result, what there is of an unfinished run, or a cloud in the browser.
 
     \b
     Examples:

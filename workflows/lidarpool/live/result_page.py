@@ -1,4 +1,4 @@
-"""The live page of a finished result: the command `view`."""
+"""The live page of a result, or of what there is of one: the command `view`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud
 from ..columns.table import TABLE, Column
 from ..export.ply_format import AXES, layout
+from ..run.database import FILE
 from ..run.picture_file import PICTURE_FILE, Pictured
+from ..run.store import RUN_FOLDER, committed_points
 from .page import LivePage, live_page, open_browser, redrawn
 from .view import View, bounds_of
 
@@ -94,6 +96,26 @@ def _table(row: np.dtype[np.void]) -> tuple[Column, ...]:
     return (*known, *rest)
 
 
+class UnfinishedRun:
+    """The points that a run has committed so far, in parts; as `ResultFile`.
+
+    Which scans are shown cannot be chosen.
+    """
+
+    scans = (0, 0)
+
+    def __init__(self, folder: Path) -> None:
+        self._points = committed_points(folder)
+        self.table = self._points.table
+
+    def __len__(self) -> int:
+        return len(self._points)
+
+    def choose(self, first: int, last: int, most: int) -> tuple[Cloud, int]:
+        """Choose at most so many points evenly; see `ResultFile.choose`."""
+        return self._points.sample(one_of_each_part, most)
+
+
 class ResultView:
     """A result on a page.
 
@@ -114,7 +136,7 @@ class ResultView:
     def __init__(
         self,
         page: LivePage,
-        file: ResultFile,
+        file: ResultFile | UnfinishedRun,
         pictured: Pictured | None = None,
         note: str = "",
         most: int = VIEW_POINTS,
@@ -164,7 +186,7 @@ class ResultView:
         self._facts.content = f'<div style="padding:0 0.8em">{"<br>".join(lines)}</div>'
 
 
-def _around(file: ResultFile) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _around(file: ResultFile | UnfinishedRun) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Whole metres near the points of a file, (3,), and the box (2, 3) around them from there."""
     positions = file.choose(*file.scans, 100_000)[0].positions
     if not len(positions):
@@ -181,7 +203,7 @@ def view_result(path: Path, *, port: int, browser: bool = True) -> None:
     Parameters
     ----------
     path
-        Folder of a result, or a cloud.
+        Folder of a result or of an unfinished run, or a cloud.
     port
         Port to listen on, or the next that is free.
     browser
@@ -192,19 +214,10 @@ def view_result(path: Path, *, port: int, browser: bool = True) -> None:
     LidarpoolError
         If there is no cloud, or it is damaged.
     """
-    pictured, note = None, ""
-    if path.is_dir():
-        pictured, note = _pictured_in(path)
-        path /= CLOUD
-        if not path.exists():
-            raise LidarpoolError(
-                f"{path.parent} holds no {CLOUD}: give the folder of a finished run (its --out), "
-                "or a cloud."
-            )
-    file = ResultFile(path)
+    file, pictured, note = open_result(path)
     if note:
         click.echo(f"note: {note}", err=True)
-    with live_page(f"lidarpool: {path.parent.name or path.name}", port) as page:
+    with live_page(f"lidarpool: {path.resolve().name}", port) as page:
         view = ResultView(page, file, pictured, note)
         click.echo(f"{page.url} shows {len(file):,} points; Ctrl-C ends it", err=True)
         if browser:
@@ -215,6 +228,20 @@ def view_result(path: Path, *, port: int, browser: bool = True) -> None:
                     time.sleep(1.0)
         except KeyboardInterrupt:
             return
+
+
+def open_result(path: Path) -> tuple[ResultFile | UnfinishedRun, Pictured | None, str]:
+    """Open a cloud or the folder of a run; with the scene if there is one, and a note."""
+    if not path.is_dir():
+        return ResultFile(path), None, ""
+    if (path / CLOUD).exists():
+        return ResultFile(path / CLOUD), *_pictured_in(path)
+    if (path / RUN_FOLDER / FILE).exists():
+        note = "The run is not finished; this is what there is of its cloud."
+        return UnfinishedRun(path / RUN_FOLDER), None, note
+    raise LidarpoolError(
+        f"{path} holds no {CLOUD}: give the folder of a run (its --out), or a cloud."
+    )
 
 
 def _pictured_in(folder: Path) -> tuple[Pictured | None, str]:

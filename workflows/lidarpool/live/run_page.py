@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from poolpart import Partition
 
+from ..columns.table import SCAN
 from ..plan import best
 from ..run.job import Job
 from ..run.picture_file import sensor_places
@@ -61,7 +62,7 @@ class LiveRun:
         self._stop.on_click(lambda _: self.stopped.set())
         poses = sensor_places(job.survey)
         bounds = bounds_of(job.scene, poses, job.planning)
-        columns = job.survey.stored_columns
+        columns = (SCAN, *job.survey.stored_columns)
         self._view = View(page, job.scene, poses, columns, job.scene.origin, bounds)
         self._store: RunStore | None = None
         self._points: LivePoints | None = None

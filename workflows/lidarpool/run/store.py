@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import secrets
 import shutil
+import sqlite3
 import tempfile
 import weakref
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +21,7 @@ from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud
 from ..columns.parts import SUFFIX, StoredCloud, read_part, read_tally
 from ..columns.storage import Storage
+from ..columns.table import TABLE, Column
 from ..scan.messages import Receipt, samples_of_scan, summary_type
 from .checks import AUTO_TAKES
 from .database import FILE, RunDatabase, parts_place
@@ -27,6 +30,7 @@ from .job import Job
 from .progress import Progress
 
 PARTS = "parts"  # the folder of the parts, in the run's folder
+RUN_FOLDER = "run"  # the run's folder in that of the output, until the result is whole
 SAMPLE_RAYS = 400  # of the pictures
 TALLIED_PARTS = 2000  # read for the hits of each triangle; of more, an even choice
 
@@ -118,7 +122,11 @@ class RunStore:
         self.folder.mkdir(exist_ok=True)
         db = RunDatabase(path, count, durable=self.lasting)
         place = "" if parts is None else f"{Storage.at(parts).url}/run-{secrets.token_hex(4)}"
-        db.set(identity=json.dumps(here), parts=place)
+        survey = self.job.survey
+        table = [asdict(replace(column, source="")) for column in survey.stored_columns]
+        cloud = {"precision_m": survey.precision_m, "columns": table}
+        cloud["origin"] = self.job.scene.origin.tolist()
+        db.set(identity=json.dumps(here), parts=place, cloud=json.dumps(cloud))
         return db
 
     def _go_on(self, here: dict[str, str], resume: bool, sizes: dict[str, int]) -> None:
@@ -291,6 +299,34 @@ class RunStore:
             elif (self.folder / FILE).exists():
                 error.add_note(f"{self.kept} are kept in {self.folder}: continue with {_RESUME}.")
             raise
+
+
+def committed_points(folder: Path) -> StoredCloud:
+    """Points that an unfinished run has committed, to be looked at without its scenario.
+
+    Raises
+    ------
+    LidarpoolError
+        If its database cannot be read; as long as the run goes on, it is locked.
+    """
+    try:
+        with closing(sqlite3.connect(folder / FILE, timeout=1.0)) as sql:
+            meta = dict(sql.execute("SELECT name, value FROM meta"))
+            parts = sql.execute("SELECT name, rows FROM parts ORDER BY first").fetchall()
+        told = json.loads(meta["cloud"])
+        return StoredCloud(
+            _storage(folder, meta["parts"]),
+            [name for name, _ in parts],
+            [rows for _, rows in parts],
+            [TABLE.get(column["name"]) or Column(**column) for column in told["columns"]],
+            None,
+            told["precision_m"],
+            np.array(told["origin"]),
+        )
+    except (sqlite3.Error, KeyError, TypeError, ValueError) as error:
+        raise LidarpoolError(
+            f"The run in {folder} cannot be looked at ({error}). While it goes on, --live shows it."
+        ) from error
 
 
 def _storage(folder: Path, place: str, *, durable: bool = True) -> Storage:
