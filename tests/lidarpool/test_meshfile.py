@@ -304,7 +304,7 @@ def test_missing_and_folders(tmp_path):
     (tmp_path / "d.glb").mkdir()
     with pytest.raises(LidarpoolError, match="does not exist"):
         load_meshes(tmp_path / "no.glb")
-    with pytest.raises(LidarpoolError, match="is not a file"):
+    with pytest.raises(LidarpoolError, match="cannot be read: Is a directory"):
         load_meshes(tmp_path / "d.glb")
 
 

@@ -31,22 +31,7 @@ _SURFACES = ("triangles", "polylist", "polygons", "tristrips", "trifans")
 
 
 def read_dae(data: bytes, path: Path) -> Content:
-    """Read the default scene of a file.
-
-    Parameters
-    ----------
-    data
-        The whole file.
-    path
-        Where it is; its name is that of geometries without one.
-
-    Raises
-    ------
-    MeshFileError
-        For what cannot be read, or would be read wrong.
-    Exception
-        What one stumbles over in a file that is broken.
-    """
+    """Read the scene that a file shows."""
     # Comments are dropped, entities neither read from files nor expanded without end.
     root = ElementTree.fromstring(data)
     for element in root.iter():
@@ -191,7 +176,7 @@ def _faces(primitive: Element, points: Float, offset: int, stride: int) -> Itera
     elif primitive.tag == "polylist" and lists:
         sizes = np.array((primitive.findtext("vcount") or "").split(), np.int64)
         corners = np.concatenate(lists)
-        if sizes.sum() != len(corners):
+        if (sizes < 0).any() or sizes.sum() != len(corners):
             raise ValueError(f"polygons of {sizes.sum():,} corners, {len(corners):,} are there")
         yield triangulated(points, corners, sizes)
     elif primitive.tag == "polygons":

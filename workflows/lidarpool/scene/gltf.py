@@ -37,19 +37,7 @@ _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 def read_gltf(data: bytes, path: Path) -> Content:
     """Read the default scene of a file, or all nodes where it has no scenes.
 
-    Parameters
-    ----------
-    data
-        The whole file.
-    path
-        Where it is: buffers of their own are read from beside it and below.
-
-    Raises
-    ------
-    MeshFileError
-        For what cannot be read, or would be read wrong.
-    Exception
-        What one stumbles over in a file that is broken.
+    Buffers that are files are read from beside `path` and below, and from nowhere else.
     """
     header, body = _chunks(data)
     _check(header)

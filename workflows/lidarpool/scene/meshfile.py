@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import codecs
-import errno
 import logging
 import re
-import stat
 from collections.abc import Callable
 from pathlib import Path
 
@@ -22,8 +20,9 @@ from .polygon_files import read_obj, read_off, read_ply_mesh, read_stl
 from .threemf import read_3mf
 from .transform import UNITS_M, UP_AXES, Transform
 
-# A reader takes the content of a file and its path, and raises whatever it stumbles over. Each is
-# our own; why no library serves is said in its module.
+# A reader takes the content of a file and its path. It raises MeshFileError for what it refuses,
+# and whatever it stumbles over in a file that is broken. Each is our own; why no library serves is
+# said in its module.
 _READERS: dict[str, Callable[[bytes, Path], Content]] = {
     ".glb": read_gltf,
     ".gltf": read_gltf,
@@ -133,26 +132,21 @@ def _read_whole(path: Path, data: bytes) -> Content:
 
 
 def _bytes_of(path: Path) -> bytes:
-    """Check that `path` is a readable file of a known kind, and read it."""
-    try:
-        kind = path.stat().st_mode
-        if stat.S_ISREG(kind) and path.suffix.lower() in SUFFIXES:
-            data = path.read_bytes()
-    except OSError as error:
-        if error.errno in (errno.ENOENT, errno.ENOTDIR):
-            raise LidarpoolError(
-                f"{path} does not exist: check the name and the folder.{_like(path)}"
-            ) from error
-        raise LidarpoolError(f"{path} cannot be read: {error.strerror}.") from error
-    except ValueError as error:  # a zero in the name
-        raise LidarpoolError(f"{path} is not the name of a file: {error}.") from error
-    if not stat.S_ISREG(kind):
-        raise LidarpoolError(f"{path} is not a file: give a mesh file ({' '.join(SUFFIXES)}).")
+    """Content of a file of a known kind."""
     if path.suffix.lower() not in SUFFIXES:
         raise LidarpoolError(
             f"{path} has the ending {path.suffix or '(none)'}, which is not a mesh format that "
             f"can be read; these are: {' '.join(SUFFIXES)}."
         )
+    try:
+        data = path.read_bytes()
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise LidarpoolError(
+            f"{path} does not exist: check the name and the folder.{_like(path)}"
+        ) from error
+    except (OSError, ValueError) as error:  # a zero in the name
+        reason = getattr(error, "strerror", None) or error
+        raise LidarpoolError(f"{path} cannot be read: {reason}.") from error
     if not data:
         raise LidarpoolError(f"{path} is empty (0 bytes): export the mesh again.")
     return data.removeprefix(codecs.BOM_UTF8)  # which editors put before text

@@ -24,45 +24,24 @@ class MeshFileError(Exception):
 class Content:
     """What a mesh file holds.
 
-    Parameters
-    ----------
-    meshes
-        In the file's unit and axes.
-    unit_m
-        Metres in its unit; None where it states none.
-    up_axis
-        'x', 'y' or 'z'; None where neither the file nor its format states one.
-    skipped
-        Names of objects that were left out, since their nodes scale them to nothing.
+    `meshes` are in the file's unit and axes.
     """
 
     meshes: list[Mesh]
-    unit_m: float | None = None
-    up_axis: str | None = None
-    skipped: list[str] = field(default_factory=list)
+    unit_m: float | None = None  # metres in its unit; None where it states none
+    up_axis: str | None = None  # 'x', 'y' or 'z'; None where neither it nor its format states one
+    skipped: list[str] = field(default_factory=list)  # names of what nodes scale to nothing
 
 
 @dataclass
 class Node(Generic[K]):
-    """A place for meshes and for other nodes.
+    """A place for meshes and for other nodes."""
 
-    Parameters
-    ----------
-    name
-        Empty where the file has none.
-    matrix
-        float64 (4, 4), from its coordinates to those of its parent.
-    meshes
-        Makes the meshes that stand here, in the node's coordinates; called once for each place
-        of the node. An empty name of a mesh stands for that of the node.
-    children
-        Keys of the nodes in it.
-    """
-
-    name: str
-    matrix: NDArray[np.float64]
+    name: str  # empty where the file has none
+    matrix: NDArray[np.float64]  # (4, 4), from its coordinates to those of its parent
+    # Makes the meshes that stand here, in the node's coordinates; called for each of its places.
     meshes: Callable[[], Iterable[Mesh]] = list
-    children: Iterable[K] = ()
+    children: Iterable[K] = ()  # keys of the nodes in it
 
 
 def instances(roots: Iterable[K], node_of: Callable[[K], Node[K]], stem: str) -> Content:

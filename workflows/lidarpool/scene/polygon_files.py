@@ -50,18 +50,6 @@ def read_obj(data: bytes, path: Path) -> Content:
     """Read a Wavefront file: an object for each name after 'o', or 'g' where there is no 'o'.
 
     Objects come in the order in which they begin; materials divide nothing.
-
-    Parameters
-    ----------
-    data
-        The whole file.
-    path
-        Where it is; its name is that of faces that belong to no named object.
-
-    Raises
-    ------
-    ValueError
-        If a vertex has no three numbers, or a face names a vertex that is not there.
     """
     text = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     text = text.replace(b"\\\n", b" ").replace(b"\t", b" ")
@@ -123,13 +111,7 @@ _OFF = re.compile(rb"(?:ST)?C?N?OFF(?![A-Z])", re.IGNORECASE)
 
 
 def read_off(data: bytes, path: Path) -> Content:
-    """Read an Object File Format file: one mesh, with or without colours.
-
-    Raises
-    ------
-    ValueError
-        If it has fewer or more vertices and faces than announced, or is binary.
-    """
+    """Read an Object File Format file: one mesh, with or without colours."""
     text = re.sub(rb"#[^\r\n]*", b"", data).lstrip()
     found = _OFF.match(text)
     text = text[found.end() if found else 0 :]
@@ -179,13 +161,7 @@ def _rows(words: list[bytes], points: int, polygons: int) -> list[list[bytes]]:
 
 
 def read_stl(data: bytes, path: Path) -> Content:
-    """Read a stereolithography file: one mesh if it is binary, one for each solid if it is text.
-
-    Raises
-    ------
-    MeshFileError, ValueError
-        If it is cut short.
-    """
+    """Read a stereolithography file: one mesh if it is binary, one a solid if it is text."""
     announced = int.from_bytes(data[80:84], "little")
     # A few more bytes may follow; of a text, the number does not fit.
     if len(data) >= 84 and 0 <= len(data) - 84 - 50 * announced < 50:
@@ -230,29 +206,16 @@ _PLY_LISTS = ("vertex_indices", "vertex_index")
 
 @dataclass
 class _Element:
-    """What a .ply header says of an element.
-
-    Parameters
-    ----------
-    properties
-        {name: (type of the number, type of the length where it is a list, else '')}
-    """
+    """What a .ply header says of an element."""
 
     name: str
     count: int
+    # {name: (type of the number, type of the length where it is a list, else '')}
     properties: dict[str, tuple[str, str]] = field(default_factory=dict)
 
 
 def read_ply_mesh(data: bytes, path: Path) -> Content:
-    """Read a Stanford polygon file: text or binary, faces of any mixture, or strips.
-
-    Raises
-    ------
-    MeshFileError
-        If there are no faces.
-    ValueError
-        If it is no .ply file, or holds more or less than announced.
-    """
+    """Read a Stanford polygon file: text or binary, faces of any mixture, or strips."""
     elements, order, body = _ply_header(data)
     counts = {element.name: element.count for element in elements}
     if not counts.get("face") and not counts.get("tristrips"):

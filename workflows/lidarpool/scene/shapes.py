@@ -127,19 +127,10 @@ def _revolved_faces(rings: int, segments: int) -> NDArray[np.int64]:
 
 
 def smooth(outline: ArrayLike, rounds: int = 5) -> NDArray[np.float64]:
-    """Round off a polygon by cutting its corners (Chaikin 1974); both ends stay.
+    """Round off a polygon (n, 2) by cutting its corners (Chaikin 1974); both ends stay.
 
-    Parameters
-    ----------
-    outline
-        (n, 2) control points.
-    rounds
-        How often the corners are cut; the limit is a quadratic B-spline, which never leaves
-        the convex hull of three neighbouring control points, so radii stay positive.
-
-    Returns
-    -------
-    (m, 2) float64
+    The limit is a quadratic B-spline, which never leaves the convex hull of three neighbouring
+    control points, so radii stay positive.
     """
     line = np.asarray(outline, dtype=np.float64)
     for _ in range(rounds):
@@ -151,17 +142,7 @@ def smooth(outline: ArrayLike, rounds: int = 5) -> NDArray[np.float64]:
 
 
 def resample(line: ArrayLike, count: int) -> NDArray[np.float64]:
-    """Place `count` points on a polyline at equal distances along it, both ends included.
-
-    Parameters
-    ----------
-    line
-        (n, d) points; neighbours may coincide.
-
-    Returns
-    -------
-    (count, d) float64
-    """
+    """Place points (count, d) at equal distances along a polyline (n, d), both ends included."""
     points = np.asarray(line, dtype=np.float64)
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     at = np.linspace(0.0, length[-1], count)

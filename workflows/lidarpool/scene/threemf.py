@@ -52,22 +52,7 @@ class _Placement:
 
 
 def read_3mf(data: bytes, path: Path) -> Content:
-    """Read what a file builds.
-
-    Parameters
-    ----------
-    data
-        The whole file.
-    path
-        Where it is; its name is that of objects without one.
-
-    Raises
-    ------
-    MeshFileError
-        If it requires an extension that is not read.
-    Exception
-        What one stumbles over in a file that is broken.
-    """
+    """Read what a file builds."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         package = _Package(archive)
         root = package.model(_start(archive))
