@@ -12,6 +12,7 @@ from lidarpool import Beams, Column, Pose, Scene, Sensor, Spin, Survey
 from lidarpool.scan.failures import naming_scans
 from lidarpool.scan.rig import Rig, RigPlan
 from lidarpool.scene.shapes import seed_objects
+from lidarpool.sensor.models import load_sensor
 from poolpart import WorkerLeft
 from raybeam import RayCaster
 
@@ -45,6 +46,16 @@ SURVEYS = {
     "turns of no whole number": survey(per_turn=90.449, poses=TURNED),
     "on the move": survey(trajectory=Cart()),
     "on the move, no whole number": survey(per_turn=90.449, trajectory=Cart(yaw_rate_deg=-700)),
+}
+
+MODELS = {
+    name: Survey(load_sensor(name, step_deg=step), poses=TURNED, steps=14, columns=COLUMNS)
+    for name, step in (
+        ("velodyne/vlp16", 10),
+        ("ouster/os0-32", 10),
+        ("livox/mid40", 30),
+        ("airborne/riegl-vq780i", 90),
+    )
 }
 
 
@@ -120,9 +131,9 @@ def test_what_is_cast_is_what_each_ray_by_itself_meets(name, scene):
     assert scans == survey.scan_count
 
 
-@pytest.mark.parametrize("name", SURVEYS)
+@pytest.mark.parametrize("name", SURVEYS | MODELS)
 def test_however_scans_are_batched_their_columns_have_the_same_bits(name, scene):
-    survey = SURVEYS[name]
+    survey = (SURVEYS | MODELS)[name]
     rig = Rig(RigPlan(scene, survey, "numpy"))
 
     def columns(cuts):

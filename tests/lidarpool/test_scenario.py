@@ -75,14 +75,40 @@ def test_the_default_survey(source, scenario):
 
 def test_the_seed_example_writes_out_the_defaults():
     stated = read_yaml(EXAMPLES / "seed.yaml")
-    plain = Scenario().model_dump()
-    loaded = Scenario.load(EXAMPLES / "seed.yaml").model_dump()
-    for section in ("sensor", "cloud"):
-        assert stated[section].keys() == plain[section].keys()
-        assert loaded[section] == plain[section]
+    plain, scenario = Scenario().model_dump(), Scenario.load(EXAMPLES / "seed.yaml")
+    loaded = scenario.model_dump()
+    assert stated["cloud"].keys() == plain["cloud"].keys()
+    assert loaded["cloud"] == plain["cloud"]
+    sensors = (scenario.sensor.sensor(Path()), Sensor(), Sensor.grid())
+    assert len({fingerprint(sensor) for sensor in sensors}) == 1
     for section in ("planning", "pool"):
         for name in set(stated[section]) - {"enabled", "start", "target", "obstacles"}:
             assert stated[section][name] == plain[section][name]
+
+
+def test_a_model_and_a_unit_of_it(tmp_path):
+    (tmp_path / "unit.csv").write_text(
+        "Channel,Elevation,Azimuth\n" + "\n".join(f"{i},{16.1 - i},0" for i in range(1, 33))
+    )
+    (tmp_path / "s.yaml").write_text(
+        "sensor: {calibration: unit.csv, rate_hz: 20, max_range_m: 60, step_deg: 30}\nsteps: 12\n"
+    )
+    survey = Scenario.load(tmp_path / "s.yaml").survey(Scenario().build_scene())
+    sensor = survey.sensor
+    assert (sensor.name, sensor.min_range_m, sensor.max_range_m) == (
+        "Hesai PandarXT-32, unit.csv",
+        0.05,
+        60,
+    )
+    assert survey.ray_count == 3 * 32 * 1000, "one turn from each pose"
+    missing = Scenario.from_data({"sensor": {"calibration": "none.csv"}}, folder=tmp_path)
+    with pytest.raises(LidarpoolError, match=r"none\.csv cannot be read: No such file"):
+        missing.survey(Scenario().build_scene())
+    (tmp_path / "mine.yaml").write_text(
+        "{name: Mine, sources: {}, firings_per_turn: 90, beams: {elevation_deg: [0]}}"
+    )
+    mine = Scenario.from_data({"sensor": {"model": "mine.yaml"}}, folder=tmp_path)
+    assert mine.survey(Scenario().build_scene()).ray_count == 3 * 90
 
 
 def test_the_warehouse_example_with_a_mesh_beside_it(tmp_path):
@@ -198,7 +224,7 @@ def test_an_upright_line_is_no_obstacle_unless_there_is_clearance(tmp_path, scen
 def test_numbers_as_everybody_writes_them(scenario):
     loaded = scenario("cloud: {precision_m: 1e-3}\nsensor: {max_range_m: .inf, step_deg: 20}")
     assert loaded.cloud.precision_m == 0.001
-    assert fingerprint(loaded.sensor.sensor()) == fingerprint(Sensor.grid(step_deg=20.0))
+    assert fingerprint(loaded.sensor.sensor(Path())) == fingerprint(Sensor.grid(step_deg=20.0))
 
 
 def test_the_units_of_the_schema_are_those_that_can_be_read():
@@ -228,6 +254,14 @@ BAD = [
     ("sensor: {step_deg: 0.1}", "less than one firing"),
     ("sensor: {min_range_m: 5, max_range_m: 2}", "must be above min_range_m"),
     ("sensor: {layers: 65535, rays_per_revolution: 36000}", "at most 100,000,000 rays"),
+    ("sensor: {model: velodyne/vlp61}", "no sensor model .* Did you mean 'velodyne/vlp16'"),
+    ("sensor: {model: ouster/os1-64, layers: 64}", "a model has beams of its own: leave layers"),
+    ("sensor: {calibration: a.json, rays_per_revolution: 512}", "leave rays_per_revolution out"),
+    ("sensor: {columns: 512, rays_per_revolution: 512}", "are the same: give one of them"),
+    ("sensor: {model: velodyne/vlp16, columns: 1800}", "follow from rate_hz: leave columns out"),
+    ("sensor: {model: livox/mid360}", "has no rays of its own: give calibration: FILE"),
+    ("sensor: {model: ouster/os1-64, columns: 0}", r"sensor\.columns is 0; input should be"),
+    ("sensor: {model: velodyne/vlp16, min_range_m: 200}", "max_range_m is 130"),
     ("sensor: [1]", r"sensor is \[1\]; input should be a valid dictionary"),
     ("poses: []", r"poses is \[\]; .* at least 1 item"),
     ("poses: [0, 0, 1]", r"must be in a list: \[\[x, y, z\]\]"),

@@ -38,7 +38,7 @@ def test_every_field_is_in_it_with_a_comment_of_its_own():
 
 def test_every_default_is_written_out():
     data = yaml.safe_load(TEXT)
-    assert data["sensor"]["layers"] == 40 and data["sensor"]["max_range_m"] == float("inf")
+    assert data["sensor"]["layers"] == 40 and data["sensor"]["step_deg"] == 10
     assert data["planning"]["trials"] == 100 and data["pool"]["backend"] == "auto"
     assert data["steps"] == 36
 

@@ -115,3 +115,22 @@ def test_what_is_misspelt_is_answered_with_what_was_meant(arguments, meant, lida
     outcome = lidarpool(*arguments)
     assert outcome.code == 2 and outcome.out == ""
     assert re.search(rf"Did you mean (one of: )?.*{meant}", outcome.err), outcome.err
+
+
+def test_sensors_lists_models_and_draws_the_beams_of_one(tmp_path, lidarpool, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    outcome = lidarpool("sensors")
+    assert outcome.code == 0
+    rows = {line.split()[0]: " ".join(line.split()[1:]) for line in outcome.out.splitlines()}
+    assert rows["velodyne/vlp16"] == "16 360° x -15.0° to 15.0° 0.4 to 130 m 5 to 20 289,352"
+    assert rows["livox/mid70"].startswith("1 70.4° circle ahead")
+    assert max(map(len, outcome.out.splitlines())) <= 110
+    outcome = lidarpool("sensors", "velodyne/vlp16")
+    assert outcome.out.startswith("Velodyne VLP-16, 16 channels\nangles ")
+    assert outcome.out.endswith("\nvelodyne-vlp16.png\n")
+    for name, target in (("livox/mid40", "rose.png"), ("airborne/riegl-vq780i", "lines.png")):
+        assert lidarpool("sensors", name, "--out", target).code == 0
+    pictures = ("velodyne-vlp16.png", "rose.png", "lines.png")
+    assert {(tmp_path / name).read_bytes()[:4] for name in pictures} == {b"\x89PNG"}
+    outcome = lidarpool("sensors", "velodyne/vlp61")
+    assert outcome.code == 2 and "Did you mean 'velodyne/vlp16'?" in outcome.err

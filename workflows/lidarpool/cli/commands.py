@@ -28,6 +28,7 @@ from .plot_command import plot
 from .run_command import RunOptions, run_scenario
 from .scenario_commands import init, schema
 from .scene_commands import scene
+from .sensor_command import sensors
 from .view_command import view
 
 PROGRAM = "lidarpool"
@@ -90,7 +91,7 @@ def cli() -> None:
     """Simulate lidar surveys on a partitioned Dask cluster."""
 
 
-for _command in (init, check, schema, scene, view, plot):
+for _command in (init, check, schema, scene, sensors, view, plot):
     cli.add_command(_command)
 
 

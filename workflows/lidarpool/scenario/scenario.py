@@ -165,7 +165,8 @@ class Scenario(Section):
             raise LidarpoolError(validation_error(error, _field_names(), source)) from error
         scenario._folder, scenario._source = Path(folder), source
         with scenario._named():
-            scenario.sensor.sensor()
+            if scenario.sensor.calibration is None:  # files are read when they are needed
+                scenario.sensor.sensor(scenario._folder)
         return scenario
 
     def advice(self, scene: Scene) -> list[str]:
@@ -219,7 +220,7 @@ class Scenario(Section):
         ]
         with self._named():
             return Survey(
-                sensor=self.sensor.sensor(),
+                sensor=self.sensor.sensor(self._folder),
                 poses=poses,
                 steps=self.steps,
                 keep_every=self.cloud.keep_every,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, Strict, model_validator
@@ -10,6 +11,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, Strict, mode
 from ..columns.table import OPTIONAL
 from ..scene.transform import Transform
 from ..sensor import Sensor
+from ..sensor.models import load_sensor
 
 # Their directions take 2.4 GB; real lidars have five million.
 RAY_LIMIT = 100_000_000
@@ -157,28 +159,64 @@ class SceneSection(Section):
 
 
 class SensorSection(Section):
-    """The lidar: a turning head with evenly spaced azimuths and elevations; see `Sensor`."""
+    """The lidar: a model, a calibrated unit, or a turning head with evenly spaced beams.
 
+    See `load_sensor` for the first two, and `Sensor` for the grid.
+    """
+
+    model: Annotated[
+        str | None,
+        Field(
+            min_length=1,
+            description="as its maker specifies it, see `lidarpool sensors`; or a .yaml of one's "
+            "own, from the scenario's folder",
+            examples=["velodyne/vlp16"],
+        ),
+    ] = None
+    calibration: Annotated[
+        str | None,
+        Field(
+            min_length=1,
+            description="file of the unit itself: Velodyne, Ouster, Hesai, RoboSense, Livox, or a "
+            "table of beams",
+            examples=["unit.json"],
+        ),
+    ] = None
+    columns: Annotated[
+        Annotated[int, Field(ge=1, le=100_000)] | None,
+        Field(description="of an Ouster or a table of beams: azimuths in one turn", examples=[512]),
+    ] = None
     rays_per_revolution: Annotated[
-        int, Field(ge=1, le=10_000_000, description="azimuths in one turn")
+        int, Field(ge=1, le=10_000_000, description="of a grid: azimuths in one turn")
     ] = 1000
-    layers: Annotated[int, Field(ge=1, le=65_535, description="elevations (rings)")] = 40
+    layers: Annotated[int, Field(ge=1, le=65_535, description="of a grid: elevations (rings)")] = 40
     vertical_fov_deg: Annotated[
-        float, Field(gt=0, le=180, description="degrees, half of it below the horizon")
+        float, Field(gt=0, le=180, description="of a grid: degrees, half of it below the horizon")
     ] = 60.0
     step_deg: Annotated[
         float, Field(gt=0, le=360, description="degrees turned in one time step")
     ] = 10.0
     rate_hz: Annotated[
-        float, Field(gt=0, le=1e6, description="turns a second: when each ray is fired")
-    ] = 10.0
+        Annotated[float, Field(gt=0, le=1e6)] | None,
+        Field(
+            description="turns, lines or frames a second; by default the model's, or 10",
+            examples=[20.0],
+        ),
+    ] = None
     min_range_m: Annotated[
-        float, Field(ge=0, le=1e8, description="metres; nearer returns are not seen")
-    ] = 0.0
+        Annotated[float, Field(ge=0, le=1e8)] | None,
+        Field(
+            description="nearer returns are not seen; by default the model's, or 0",
+            examples=[0.5],
+        ),
+    ] = None
     max_range_m: Annotated[
-        float,
-        Field(gt=0, allow_inf_nan=True, description="metres; farther returns are not seen"),
-    ] = float("inf")
+        Annotated[float, Field(gt=0, allow_inf_nan=True)] | None,
+        Field(
+            description="farther returns are not seen; by default the model's, or .inf",
+            examples=[100.0],
+        ),
+    ] = None
 
     @model_validator(mode="after")
     def _bounded(self) -> SensorSection:
@@ -188,11 +226,43 @@ class SensorSection(Section):
                 f"rays_per_revolution times layers is {rays:,}; at most {RAY_LIMIT:,} rays make "
                 "a revolution."
             )
+        own = [name for name in ("model", "calibration") if getattr(self, name) is not None]
+        # Defaults that `lidarpool init` has written out are in nobody's way.
+        grid = [name for name in _GRID if getattr(self, name) != _GRID[name]]
+        if own and grid:
+            raise ValueError(f"a {own[0]} has beams of its own: leave {grid[0]} out.")
+        if self.columns is not None and "rays_per_revolution" in grid:
+            raise ValueError("columns and rays_per_revolution are the same: give one of them.")
         return self
 
-    def sensor(self) -> Sensor:
-        """Return the lidar; LidarpoolError where the fields do not fit together."""
-        return Sensor.grid(**self.model_dump())
+    def sensor(self, folder: Path) -> Sensor:
+        """Return the lidar, its files from a folder; LidarpoolError if they cannot be used."""
+        given = {
+            name: value
+            for name in ("rate_hz", "min_range_m", "max_range_m")
+            if (value := getattr(self, name)) is not None
+        }
+        if self.model is None and self.calibration is None:
+            azimuths = self.columns or self.rays_per_revolution
+            fov = self.vertical_fov_deg
+            return Sensor.grid(azimuths, self.layers, fov, self.step_deg, **given)
+        model = self.model
+        if model is not None and model.endswith((".yaml", ".yml")):
+            model = str(folder / Path(model).expanduser())
+        unit = self.calibration
+        return load_sensor(
+            model,
+            calibration=None if unit is None else folder / Path(unit).expanduser(),
+            columns=self.columns,
+            step_deg=self.step_deg,
+            **given,
+        )
+
+
+_GRID = {  # {field of a grid: its default}
+    name: SensorSection.model_fields[name].default
+    for name in ("rays_per_revolution", "layers", "vertical_fov_deg")
+}
 
 
 class PoseSection(Section):

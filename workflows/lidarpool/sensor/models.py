@@ -155,7 +155,6 @@ def model_names() -> tuple[str, ...]:
     ))  # fmt: skip
 
 
-@cache
 def read_model(name: str | Path) -> SensorModel:
     """Read a model: one that comes with the package by name, or a data file (.yaml).
 
@@ -171,6 +170,11 @@ def read_model(name: str | Path) -> SensorModel:
             f"There is no sensor model {str(name)!r}.{did_you_mean(str(name), model_names())} "
             "lidarpool sensors lists them; one's own is given as a file, such as mine.yaml."
         )
+    return _built_in(str(name))
+
+
+@cache
+def _built_in(name: str) -> SensorModel:
     with as_file(_BUILT_IN / f"{name}.yaml") as path:
         return _read(path)
 
@@ -243,8 +247,8 @@ def load_sensor(
         described = described.model_copy(update=unit.head)
     elif described.needs_calibration:
         raise LidarpoolError(
-            f"{described.name} has no rays of its own: give calibration: FILE, "
-            f"{next(iter(described.sources.values()))}."
+            f"{described.name} has no rays of its own: give calibration: FILE "
+            f"({next(iter(described.sources.values()), 'of the unit')})."
         )
     firings, rate = described.turn(rate_hz, columns)
     low, high = described.range_m or (0.0, float("inf"))
