@@ -2,8 +2,6 @@
 
 import signal
 
-from hypothesis import HealthCheck, settings
-
 # A shell starts jobs in the background with interrupts ignored, and whatever they start inherits
 # that: programs that tests interrupt would not notice.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -19,5 +17,11 @@ else:
     dask.config.set({"distributed.deploy.lost-worker-timeout": "1h"})
 
 # An example may take as long as a busy machine needs.
-settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
-settings.load_profile("patient")
+try:
+    from hypothesis import HealthCheck, settings
+except ImportError:
+    pass
+else:
+    slow = [HealthCheck.too_slow]
+    settings.register_profile("patient", deadline=None, suppress_health_check=slow)
+    settings.load_profile("patient")

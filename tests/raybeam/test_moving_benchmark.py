@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 from benchmarks import raycast_moving
@@ -11,18 +9,13 @@ from benchmarks import raycast_moving
 from raybeam import available_backends
 
 
-def test_all_numbers_of_beams(tmp_path, capsys):
+def test_all_numbers_of_beams(capsys):
     if reason := available_backends()["embree"]:
         pytest.skip(f"embree: {reason}")
-    out = tmp_path / "out.json"
-    assert raycast_moving.main(["--quick", "--json", str(out)]) == 0
-    rows = json.loads(out.read_text())["moving"]
-    assert [row["beams"] for row in rows] == [40, 40, 64, 64, 128, 128]
-    for row in rows:
-        assert row["hit_share"] > 0.1
-        assert all(len(seconds) == 2 for seconds in row["seconds"].values())
-        assert row["still_to_bare"] > 0
-    assert capsys.readouterr().out.count("x bare; moving") == 6
+    assert raycast_moving.main(["--quick"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [int(line.split()[0]) for line in lines] == [40, 40, 64, 64, 128, 128]
+    assert all("x bare; moving" in line and "hits 0 %" not in line for line in lines)
 
 
 def test_track_is_made_of_rotations():
