@@ -4,7 +4,6 @@ The rays are trivial (a few towards one cube), so what is measured is the pipeli
 scheduler, parts. All on one local cluster:
 
 - throughput of the four stages; several runs, the median counts;
-- the way of a scan from stage 1 to `on_frame`, with scans at a sensor's pace;
 - processor time of driver and scheduler, which share a process, for a million rays, in
   surveys of growing length.
 """
@@ -25,11 +24,9 @@ from distributed import Client
 from lidarpool import Result, Scene, Sensor, Survey, simulate
 from lidarpool.run.local import local_cluster
 from lidarpool.scene.mesh import Mesh
-from poolpart import trace_to
 
 STAGES = ("generate", "intersect", "sort", "collect")
 COST_RAYS = 64  # a scan, where the time for a million rays is measured
-WARM_SCANS = 3  # of a paced run, which are not judged
 
 
 def cube() -> Scene:
@@ -72,32 +69,6 @@ def throughput(client: Client, scans: int, rays: int, runs: int) -> dict[str, An
     }
 
 
-def latency(client: Client, scans: int, rays: int, pace: float) -> dict[str, float]:
-    """Time from when stage 1 puts a scan until its frame is handed out."""
-    framed: dict[int, float] = {}
-    client.run(_note_puts)
-    try:
-        start, cpu = time.monotonic(), time.process_time()
-        measure(
-            client,
-            scans,
-            rays,
-            scans_per_second=pace,
-            on_frame=lambda frame: framed.setdefault(frame.scan, time.time()),
-        )
-        share = (time.process_time() - cpu) / (time.monotonic() - start)
-        put = {scan: at for found in client.run(_noted_puts).values() for scan, at in found.items()}
-    finally:
-        client.run(trace_to, None)
-    ways = sorted(1e3 * (framed[s] - put[s]) for s in framed if s >= min(WARM_SCANS, scans - 1))
-    return {
-        "scans_per_second": pace,
-        "median_ms": round(statistics.median(ways), 1),
-        "p95_ms": round(ways[int(0.95 * len(ways))], 1),
-        "driver_and_scheduler_cpu": round(share, 3),
-    }
-
-
 def cost(client: Client, sizes: Sequence[int], rays: int) -> dict[str, float]:
     """Processor seconds of driver and scheduler for a million rays, by the number of scans."""
     seconds = {}
@@ -108,29 +79,11 @@ def cost(client: Client, sizes: Sequence[int], rays: int) -> dict[str, float]:
     return seconds
 
 
-def _note_puts(dask_worker: Any) -> None:
-    """Have a worker note when stage 1 puts a scan; runs there."""
-    # With the worker, not in a global: a function of a script travels without its module.
-    noted = dask_worker.noted_puts = {}
-
-    def sink(point: str, fields: Mapping[str, Any]) -> None:
-        if point == "generate.put":
-            noted.update(dict.fromkeys(fields["scans"], time.time()))
-
-    trace_to(sink)
-
-
-def _noted_puts(dask_worker: Any) -> dict[int, float]:
-    return dask_worker.noted_puts
-
-
 def main(arguments: list[str] | None = None) -> dict[str, Any]:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--scans", type=int, default=3600)
     parser.add_argument("--rays", type=int, default=4, help="rays a scan")
     parser.add_argument("--runs", type=int, default=5)
-    parser.add_argument("--pace", type=float, default=10.0, help="scans a second, for the latency")
-    parser.add_argument("--paced-scans", type=int, default=100)
     parser.add_argument("--sizes", type=int, nargs="+", default=[100, 1000, 10_000])
     parser.add_argument("--json", type=Path, help="also write the figures to this file")
     options = parser.parse_args(arguments)
@@ -138,7 +91,6 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     with local_cluster() as cluster, Client(cluster) as client:
         measure(client, 36, options.rays)  # the first run imports everything on the workers
         figures = throughput(client, options.scans, options.rays, options.runs)
-        figures["latency"] = latency(client, options.paced_scans, options.rays, options.pace)
         figures["cpu_seconds_per_million_rays"] = cost(client, options.sizes, COST_RAYS)
 
     show(figures)
@@ -155,11 +107,6 @@ def show(figures: Mapping[str, Any]) -> None:
     print(f"driver and scheduler: {figures['driver_and_scheduler_ms_per_scan']} ms CPU a scan")
     for stage, milliseconds in figures["stage_ms_per_scan"].items():
         print(f"  {stage:<10} {milliseconds:8.3f} ms a scan, waiting included")
-    way = figures["latency"]
-    print(
-        f"from stage 1 to its frame at {way['scans_per_second']} scans/s: {way['median_ms']} ms "
-        f"(median), {way['p95_ms']} ms (95 %), with {way['driver_and_scheduler_cpu']:.0%} of a core"
-    )
     for scans, seconds in figures["cpu_seconds_per_million_rays"].items():
         print(f"  {scans:>6} scans: {seconds} s of driver and scheduler for a million rays")
 

@@ -36,6 +36,15 @@ def test_whoever_dies_each_scan_arrives_once(arena, what, known):
 
 
 @pytest.mark.slow
+def test_more_deaths_than_dask_allows_a_task(arena, what, known):
+    """Dask gives a task up for good when its fourth worker dies."""
+    faults = [Fault(number, "kill", "sort.get", 50 * number) for number in range(5)]
+    outcome = disturbed(arena, what, known, faults, **PATIENT)
+    assert outcome.sound, outcome.error or outcome.verdict
+    assert outcome.done == {("kill", "sort.get"): 5}
+
+
+@pytest.mark.slow
 def test_twenty_faults_are_survived(arena, what, known):
     campaign = Campaign(PLANNED, SEED, what, crossed=False)
     while not campaign.over:

@@ -1,12 +1,12 @@
-"""A worker that is stopped until the scheduler has given it up, and then wakes up.
+"""A worker that is stopped until it was given up, and then wakes up.
 
-It has no nanny, which would have killed it: what it did before, it goes on with, beside
-those who have taken its work over.
+What it did before, it goes on with, beside those who have taken its work over.
 """
 
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -15,7 +15,12 @@ from importlib import import_module
 import pytest
 from tests.chaos.events import STOP
 from tests.chaos.nemesis import Fault
-from tests.chaos.survey import disturbed
+from tests.chaos.survey import PLANNING, Reference, disturbed, room
+
+import poolpart.task_locations
+from lidarpool import simulate
+from lidarpool.scan import SurveyDriver
+from poolpart import trace_to
 
 JOIN_S = 300.0
 STOP_S = 2.0  # for others to take over
@@ -23,7 +28,10 @@ STOP_S = 2.0  # for others to take over
 
 @pytest.fixture
 def lonely(arena):
-    """Start a worker without a nanny, as the only one of its partition; returns its name."""
+    """Start a worker, as the only one of its partition; returns its name.
+
+    It has no nanny, which would kill it when the scheduler gives it up.
+    """
     started: list[subprocess.Popen[bytes]] = []
 
     def start(partition: str, slots: int) -> str:
@@ -58,7 +66,7 @@ def lonely(arena):
 @pytest.mark.parametrize(
     ("partition", "slots", "point"), [("GPU", 1, "intersect.cast"), ("LIDAR", 4, "collect.part")]
 )
-def test_what_it_does_when_it_wakes_up_counts_once(
+def test_given_up_by_the_scheduler_what_it_does_counts_once(
     arena, what, known, lonely, partition, slots, point
 ):
     name = lonely(partition, slots)
@@ -67,3 +75,48 @@ def test_what_it_does_when_it_wakes_up_counts_once(
     assert outcome.sound, outcome.error or outcome.verdict
     assert outcome.done == {(STOP, point): 1}  # there was no other worker that could come to it
     assert outcome.verdict.recovered
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("stage", "reason"),
+    [
+        ("collect-0", "the worker of collect-0 died"),
+        ("prepare", "its worker is gone or silent"),  # a casting worker, prepared for stage 2
+    ],
+)
+def test_given_up_by_the_driver_it_does_no_harm(arena, what, known, monkeypatch, stage, reason):
+    """The scheduler would take it for dead after five minutes, and wait that long."""
+    monkeypatch.setattr(SurveyDriver, "_wished_scans", lambda *_: 10)
+    seen, stopped, reasons = [], [], set()
+
+    def on_frame(frame) -> None:
+        seen.append(frame.scan)
+        if frame.scan == 60:
+            stopped.append(_worker_of(arena, stage))
+            os.kill(stopped[0], signal.SIGSTOP)
+            # Only now: on a busy machine others that are well may be silent for so long.
+            patience.setattr(poolpart.task_locations, "SILENT_S", 2.0)
+        elif frame.scan == 300:
+            patience.undo()
+            os.kill(stopped[0], signal.SIGCONT)
+
+    trace_to(lambda point, fields: reasons.add(fields.get("reason")))
+    try:
+        with monkeypatch.context() as patience:
+            result = simulate(
+                room(), what, PLANNING, client=arena.client, backend="numpy", on_frame=on_frame
+            )
+    finally:
+        trace_to(None)
+        os.kill(stopped[0], signal.SIGCONT)
+    assert seen == list(range(what.scan_count))
+    assert Reference.of(result) == known
+    assert reason in reasons
+
+
+def _worker_of(arena, stage) -> int:
+    """Process of the worker that runs a stage, or has prepared itself for one."""
+    scheduler = arena.cluster.scheduler
+    tasks = [task for key, task in list(scheduler.tasks.items()) if str(key).startswith(stage)]
+    return next(w.pid for t in tasks for w in (t.processing_on, *(t.who_has or ())) if w)

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import pytest
 from tests.chaos.soak import draw, soak
-
-SCANS, SEED = 360, 1
+from tests.chaos.survey import reference
 
 
 @pytest.mark.slow
-def test_scans_in_kills_leave_nothing_and_lose_nothing(tmp_path):
-    # Its memory is judged in a long one; what is left, as descriptors or files, here as well.
-    soaked = soak(SCANS, SEED)
+def test_scans_in_kills_leave_nothing_and_lose_nothing(arena, what, tmp_path):
+    # Memory is judged in a long one.
+    soaked = soak(arena, what, reference(arena, what, None), seed=1)
     assert soaked.sound, soaked
     assert soaked.verdict.recovered
     assert soaked.faults.total() >= 3

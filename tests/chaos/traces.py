@@ -1,23 +1,13 @@
-"""What a run may leave behind: on the scheduler, in the process, on the disk."""
+"""What a run may leave behind on the scheduler."""
 
 from __future__ import annotations
 
-import gc
-import os
-import tempfile
 import time
-from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
-from multiprocessing import resource_tracker
-from pathlib import Path
 from typing import Any
 
-import psutil
 from distributed import Client
 
-SETTLE_S = 120.0  # for what was closed to be gone: connections and processes end a moment later
+SETTLE_S = 120.0  # for what was closed to be gone: connections end a moment later
 
 
 def scheduler_state(client: Client) -> dict[str, Any]:
@@ -78,78 +68,7 @@ def differences(before: dict[str, Any], after: dict[str, Any]) -> list[str]:
 
 def settled_differences(client: Client, before: dict[str, Any]) -> list[str]:
     """Say what a scheduler knows that it did not, once it has heard of all that was closed."""
-    return _settled(lambda: differences(before, scheduler_state(client)))
-
-
-def _settled(look: Callable[[], list[str]]) -> list[str]:
-    """Look until there is nothing, or nothing will change any more."""
     deadline = time.monotonic() + SETTLE_S
-    while (left := look()) and time.monotonic() < deadline:
+    while (left := differences(before, scheduler_state(client))) and time.monotonic() < deadline:
         time.sleep(0.2)
     return left
-
-
-@dataclass(frozen=True)
-class Footprint:
-    """What this process holds of the machine."""
-
-    descriptors: Counter[str]  # what they lead to
-    processes: frozenset[str]
-    files: frozenset[str]
-
-    @classmethod
-    def now(cls, folder: Path) -> Footprint:
-        """Look; `folder` is the one for temporary files."""
-        gc.collect()
-        resource_tracker.ensure_running()  # it stays as long as this process
-        children = psutil.Process().children(recursive=True)
-        return cls(
-            descriptors=Counter(_targets()),
-            processes=frozenset(
-                f"{child.pid} {' '.join(child.cmdline())}"
-                for child in children
-                if child.status() != psutil.STATUS_ZOMBIE
-                and "resource_tracker" not in " ".join(child.cmdline())
-            ),
-            files=frozenset(
-                str(path.relative_to(folder))
-                for path in folder.rglob("*")
-                if path.is_file() and path.stat().st_size
-            ),
-        )
-
-    def left_in(self, folder: Path) -> list[str]:
-        """Say what there is in the end that there was not at first."""
-        return _settled(lambda: self._more_in(Footprint.now(folder)))
-
-    def _more_in(self, after: Footprint) -> list[str]:
-        left = [f"process {process}" for process in sorted(after.processes - self.processes)]
-        left += [f"file {file}" for file in sorted(after.files - self.files)]
-        left += [
-            f"{count} descriptors of {target}"
-            for target, count in sorted((after.descriptors - self.descriptors).items())
-        ]
-        return left
-
-
-def _targets() -> Iterator[str]:
-    """What the descriptors of this process lead to; sockets and pipes without their numbers."""
-    for path in Path("/proc/self/fd").iterdir():
-        with suppress(OSError):  # the one that lists them is gone again
-            target = str(path.readlink())
-            yield target.partition(":[")[0]
-
-
-@contextmanager
-def own_temporary_folder() -> Iterator[Path]:
-    """Have this process, and those that it starts, put temporary files into a new folder."""
-    with tempfile.TemporaryDirectory(prefix="chaos-") as name:
-        earlier = tempfile.tempdir, os.environ.get("TMPDIR")
-        tempfile.tempdir = os.environ["TMPDIR"] = name
-        try:
-            yield Path(name)
-        finally:
-            tempfile.tempdir = earlier[0]
-            del os.environ["TMPDIR"]
-            if earlier[1] is not None:
-                os.environ["TMPDIR"] = earlier[1]

@@ -16,7 +16,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import dask
 import numpy as np
 import pytest
 from distributed import Client, Scheduler, SpecCluster, Worker, WorkerPlugin
@@ -26,17 +25,14 @@ import lidarpool.scan.driver
 from lidarpool import Cloud
 from lidarpool.cli.commands import main
 from lidarpool.run.local import local_cluster
-from poolpart import fetch_available, trace_to, worker_identities
+from poolpart import fetch_available, trace_to
 
 
 @pytest.fixture(scope="session")
 def local_client() -> Iterator[Client]:
-    """A local cluster of processes: three casting workers, one each of LIDAR and OTHER."""
-    # Dask's memory manager drops what no task needs at that moment; here it does so very often.
-    often = {"distributed.scheduler.active-memory-manager.interval": "200ms"}
+    """A local cluster of processes: two casting workers, one each of LIDAR and OTHER."""
     with (
-        dask.config.set(often),
-        local_cluster(gpu_workers=3, other_workers=1) as cluster,
+        local_cluster(gpu_workers=2, other_workers=1) as cluster,
         Client(cluster, set_as_default=False) as client,
     ):
         yield client
@@ -45,7 +41,7 @@ def local_client() -> Iterator[Client]:
 @pytest.fixture
 def client(local_client: Client, wait_for_all: Callable[[Client, int], None]) -> Client:
     """The local cluster with all its workers: an earlier test may have killed some."""
-    wait_for_all(local_client, 5)
+    wait_for_all(local_client, 4)
     return local_client
 
 
@@ -57,12 +53,12 @@ def cluster_client(cluster: str) -> Iterator[Client]:
 
 
 class _Saboteur(WorkerPlugin):
-    """Ends a worker that comes to a point with one of some scans, as long as lives are left."""
+    """Ends a worker that comes to a point with a scan, as long as a file is there."""
 
     name = "saboteur"
 
-    def __init__(self, point: str, scans: set[int], lives: Path) -> None:
-        self.point, self.scans, self.lives = point, scans, lives
+    def __init__(self, point: str, scan: int, armed: Path) -> None:
+        self.point, self.scan, self.armed = point, scan, armed
 
     def setup(self, worker: Worker) -> None:
         trace_to(self._strike)
@@ -71,41 +67,22 @@ class _Saboteur(WorkerPlugin):
         trace_to(None)
 
     def _strike(self, point: str, fields: dict[str, Any]) -> None:
-        if point == self.point and self.scans & set(fields["scans"]):
-            left = self.lives.stat().st_size
-            if left:
-                os.truncate(self.lives, left - 1)
-                os.kill(os.getpid(), signal.SIGKILL)
+        if point == self.point and self.scan in fields["scans"] and self.armed.exists():
+            os.kill(os.getpid(), signal.SIGKILL)
 
 
 @pytest.fixture
 def sabotage(client: Client, tmp_path: Path) -> Iterator[Callable[..., Path]]:
-    """Have workers die when they pass a point with one of some scans, so many times.
+    """Have workers die when they pass a point with a scan, as long as the file returned exists."""
 
-    Returns a file with as many bytes as lives are left; an empty one ends the sabotage.
-    """
-
-    def sabotage(point: str, scans: set[int], lives: int = 1000) -> Path:
-        file = tmp_path / "lives"
-        file.write_bytes(bytes(lives))
-        client.register_plugin(_Saboteur(point, scans, file))
+    def sabotage(point: str, scan: int) -> Path:
+        file = tmp_path / "armed"
+        file.touch()
+        client.register_plugin(_Saboteur(point, scan, file))
         return file
 
     yield sabotage
     client.unregister_worker_plugin("saboteur")
-
-
-@pytest.fixture
-def kill(client: Client) -> Callable[[str], None]:
-    """Kill the first worker of a partition with SIGKILL."""
-
-    def kill(partition: str) -> None:
-        workers = worker_identities(client)
-        address = next(a for a, w in workers.items() if partition in w["resources"])
-        pid = client.run(os.getpid, workers=[address])[address]
-        os.kill(pid, signal.SIGKILL)
-
-    return kill
 
 
 @pytest.fixture(scope="session")
@@ -194,10 +171,11 @@ class OutsideCluster:
     def __init__(self, folder: Path, *options: str, **environment: str) -> None:
         self.folder, self.options = folder, options  # of scheduler and workers
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
+        self.others = 0  # workers beyond one a process
         file = folder / "scheduler.json"
         self._start(
             "scheduler", "scheduler", "--port", "0", "--no-dashboard",
-            "--scheduler-file", str(file), **environment,
+            "--scheduler-file", str(file), "--host", "127.0.0.1", **environment,
         )  # fmt: skip
         _wait(lambda: file.exists() and file.read_text().endswith("}"))  # it is written in pieces
         self.address = json.loads(file.read_text())["address"]
@@ -205,13 +183,7 @@ class OutsideCluster:
     def _start(self, name: str, *arguments: str, **environment: str) -> None:
         log = (self.folder / f"{name}.log").open("wb")
         self.processes[name] = subprocess.Popen(
-            [
-                Path(sys.executable).with_name("dask"),
-                *arguments,
-                *self.options,
-                "--host",
-                "127.0.0.1",
-            ],
+            [Path(sys.executable).with_name("dask"), *arguments, *self.options],
             stdout=log,
             stderr=log,
             env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), **environment},
@@ -230,18 +202,32 @@ class OutsideCluster:
                 options += ["--preload", str(file)]
             self._start(
                 name, "worker", self.address, "--name", name, "--no-dashboard", "--no-nanny",
-                "--local-directory", str(self.folder), *options, **environment,
+                "--host", "127.0.0.1", "--local-directory", str(self.folder), *options,
+                **environment,
             )  # fmt: skip
+
+    def add_threads(self, *workers: tuple[str, int], **environment: str) -> str:
+        """Start workers, (partition, slots) each, all in one process; its name."""
+        name = f"workers-{len(self.processes)}"
+        common = {"host": "127.0.0.1", "dashboard": False, "local_directory": str(self.folder)}
+        spec = {}
+        for number, (partition, slots) in enumerate(workers):
+            own = {"name": f"{partition}-{name}-{number}", "resources": {partition: slots}}
+            options = {"nthreads": slots, **own, **common}
+            spec[own["name"]] = {"cls": "distributed.Worker", "opts": options}
+        self._start(name, "spec", self.address, "--spec", json.dumps(spec), **environment)
+        self.others += len(workers) - 1
+        return name
 
     def wait(self) -> None:
         """Wait until all workers are there."""
         with Client(self.address, set_as_default=False) as client:
-            client.wait_for_workers(len(self.processes) - 1, timeout=120)
+            client.wait_for_workers(len(self.processes) - 1 + self.others, timeout=300)
 
     def kill(self, name: str) -> None:
         """Kill a process, without goodbye."""
         self.processes[name].kill()
-        self.processes.pop(name).wait(120)
+        self.processes.pop(name).wait(300)
 
     def log(self) -> str:
         """What all processes have logged."""

@@ -12,16 +12,19 @@ import select
 import shlex
 import subprocess
 import sys
+import threading
 import time
+import uuid
 from collections.abc import Callable
+from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import trimesh
 from distributed import Client
+from tests.system.sockets import Address, listened_on
 
 import lidarpool.report.output
 from lidarpool import LidarpoolError, read_cloud, simulate
@@ -33,7 +36,7 @@ WAREHOUSE = Path(__file__).parents[3] / "shared" / "scenes" / "warehouse.glb"
 COMMAND = [sys.executable, "-c", "from lidarpool.cli.commands import main; main()"]
 # Of the default survey, with Embree as well as with NumPy.
 CLOUD_SHA256 = "9012bcbf7aa44d9d07c95fae78e707887c40225f1bde1fcb304c674c220c0228"
-SHORT = "sensor: {layers: 8}\nplanning: {trials: 4}\n"
+SHORT = "sensor: {layers: 8}\nplanning: {trials: 4, iterations: 20}\n"
 
 
 # A run does without the records of stages that end too late on a busy machine.
@@ -67,16 +70,34 @@ def without_hint(said: str, folder: Path) -> list[str]:
     return [line for line in lines if line != hint]
 
 
-@pytest.fixture(scope="module")
-def demo(tmp_path_factory) -> tuple[Path, subprocess.CompletedProcess[str]]:
+@dataclass
+class Demo:
     """The demo, run as a newcomer does, with a home that Matplotlib cannot write to."""
+
+    out: Path
+    ended: subprocess.CompletedProcess[str]
+    sockets: list[list[Address]]  # listened on, at several moments
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory) -> Demo:
     out = tmp_path_factory.mktemp("demo") / "made" / "here"
-    ended = command("demo", "--out", out, MPLCONFIGDIR="/dev/null/config")
-    return out, ended
+    over, sockets, tag = threading.Event(), [], uuid.uuid4().hex
+
+    def look() -> None:
+        while Path("/proc/net/tcp").exists() and not over.wait(0.5):
+            sockets.append(listened_on(tag))
+
+    looker = threading.Thread(target=look)
+    looker.start()
+    ended = command("demo", "--out", out, MPLCONFIGDIR="/dev/null/config", TEST_RUN_TAG=tag)
+    over.set()
+    looker.join()
+    return Demo(out, ended, sockets)
 
 
 def test_the_demo_makes_all_files_and_says_so(demo):
-    out, ended = demo
+    out, ended = demo.out, demo.ended
     assert ended.returncode == 0, ended.stderr
     assert without_log(out) == {*FILES}
     for name in FILES[1:5]:
@@ -88,7 +109,7 @@ def test_the_demo_makes_all_files_and_says_so(demo):
 
 
 def test_progress_that_is_not_for_a_terminal_comes_as_short_lines(demo):
-    out, ended = demo
+    out, ended = demo.out, demo.ended
     lines = without_hint(ended.stderr, out)
     for line in lines:
         assert re.fullmatch(r"\d\d:\d\d:\d\d  [a-z].*", line), line  # and no log of a library
@@ -100,7 +121,7 @@ def test_progress_that_is_not_for_a_terminal_comes_as_short_lines(demo):
 
 
 def test_the_report_has_all_that_is_promised(demo):
-    out, _ = demo
+    out = demo.out
     text = (out / "report.json").read_text()
     report = json.loads(text, parse_constant=pytest.fail)  # NaN and Infinity are no JSON
     assert report["files"] == list(FILES)
@@ -124,7 +145,7 @@ def test_the_report_has_all_that_is_promised(demo):
 
 
 def test_the_page_tells_what_the_report_does(demo):
-    out, _ = demo
+    out = demo.out
     page, report = (out / "report.html").read_text(), json.loads((out / "report.json").read_text())
     assert f"<code>lidarpool demo --out {out}</code>" in page
     for name, count in report["points_by_object"].items():
@@ -147,11 +168,11 @@ def test_the_page_names_the_command_that_repeats_it(run, tmp_path, no_pictures):
     assert "layers: 8" in page
 
 
-def test_times_in_the_report_are_rounded(demo):
-    report = json.loads((demo[0] / "report.json").read_text())
-    times = [*report["seconds"].values()]
-    times += [s[key] for s in report["stages"].values() for key in ("task_seconds", "span_seconds")]
-    assert all(time == round(time, 4) for time in times)
+@pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="looks for sockets in /proc")
+def test_the_demo_listens_on_loopback_only(demo):
+    # Scheduler and dashboard, and of each of three partitions at least a nanny and a worker.
+    assert max(map(len, demo.sockets)) >= 2 + 3 * 2
+    assert all(address.is_loopback for addresses in demo.sockets for address in addresses)
 
 
 @pytest.fixture
@@ -185,24 +206,19 @@ def test_a_path_that_there_is_not(run, no_pictures):
     assert "no path free of collisions was found; none is possible" in outcome.out
 
 
-@pytest.mark.parametrize("deaf", ["stdout", "stderr"])
-def test_nobody_reads_the_output(deaf, tmp_path, cluster):
-    """As under `| head -1`, or when a terminal is closed: the result is there, nothing failed."""
+def test_nobody_reads_the_output(tmp_path, cluster):
+    """As under `| head -1`, or when a terminal is closed: the result is whole before it fails."""
     (tmp_path / "s.yaml").write_text(SHORT)
     arguments = ["run", "s.yaml", "--scheduler", cluster, "--only", "cloud", "--no-plan"]
-    arguments += ["--out", "out"]
     env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     reader, writer = os.pipe()
     os.close(reader)
-    heard = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | {deaf: writer}
-    ended = subprocess.run([*COMMAND, *arguments], cwd=tmp_path, env=env, check=False, **heard)
+    ended = subprocess.run(
+        [*COMMAND, *arguments], cwd=tmp_path, env=env, check=False, stdout=writer, stderr=writer
+    )
     os.close(writer)
-    assert ended.returncode == (1 if deaf == "stdout" else 0)  # after the result is whole
-    said = ended.stderr if deaf == "stdout" else ended.stdout
-    assert (b"survey  done" if deaf == "stdout" else b"results in out") in said
-    assert b"Traceback" not in said
-    assert b"BrokenPipe" not in said
-    assert without_log(tmp_path / "out") == {"cloud.ply", "report.json"}
+    assert ended.returncode == 1
+    assert without_log(tmp_path / "lidarpool-out") == {"cloud.ply", "report.json"}
 
 
 def test_version_and_help(lidarpool):
@@ -234,7 +250,7 @@ def on_a_terminal(arguments: list[str], **environment: str) -> tuple[int, str]:
     )
     os.close(slave)
     drawn = b""
-    stop = time.monotonic() + 120
+    stop = time.monotonic() + 300
     while time.monotonic() < stop:
         if select.select([master], [], [], 0.2)[0]:
             try:
@@ -245,27 +261,14 @@ def on_a_terminal(arguments: list[str], **environment: str) -> tuple[int, str]:
     return process.wait(300), drawn.decode()
 
 
-@pytest.mark.parametrize("colour", [True, False])
-def test_bars_on_a_terminal(colour, tmp_path, cluster):
+def test_bars_on_a_terminal(tmp_path, cluster):
     (tmp_path / "s.yaml").write_text(SHORT)
     arguments = ["run", str(tmp_path / "s.yaml"), "--out", str(tmp_path / "o"), "--only", "cloud"]
-    extra = {"COLUMNS": "100"} | ({} if colour else {"NO_COLOR": "1"})
-    code, drawn = on_a_terminal([*arguments, "--scheduler", cluster], **extra)
+    code, drawn = on_a_terminal([*arguments, "--scheduler", cluster], COLUMNS="100")
     assert code == 0, drawn
     for label in ("1 generate", "2 intersect", "3 sort", "4 collect", "planning"):
         assert label in drawn
     assert "108/108" in drawn and "4/4" in drawn
-    assert bool(re.search(r"\x1b\[[0-9;]*3[0-9]", drawn)) == colour
-
-
-def test_a_dumb_terminal_gets_lines(tmp_path, cluster):
-    (tmp_path / "s.yaml").write_text(SHORT)
-    arguments = ["run", str(tmp_path / "s.yaml"), "--out", str(tmp_path / "o"), "--no-plan"]
-    arguments += ["--only", "cloud"]
-    code, drawn = on_a_terminal([*arguments, "--scheduler", cluster], TERM="dumb")
-    assert code == 0
-    assert "survey  done: 108 scans" in drawn
-    assert "\x1b" not in drawn
 
 
 # -- the output folder ---------------------------------------------------------------------------
@@ -311,51 +314,6 @@ def test_a_file_that_cannot_be_written_leaves_the_earlier_result(
     assert {path.name for path in (tmp_path / "out").iterdir()} == before.keys()
 
 
-@pytest.mark.slow
-def test_full_disks_of_every_size(made, tmp_path):
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    fits = False
-    for kilobytes in range(40, 4000, 400):
-        size = ["-o", f"size={kilobytes}k"]
-        mounted = ["mount", "-t", "tmpfs", *size, "tmpfs", str(disk)]
-        if subprocess.run(mounted, capture_output=True, check=False).returncode:
-            pytest.skip("small disks can be mounted by root only")
-        try:
-            before = earlier(disk)
-            try:
-                write_result(disk, *made)
-                fits = True
-            except LidarpoolError as error:
-                assert str(disk) in str(error) and ".writing" not in str(error)
-                assert content(disk) == before
-        finally:
-            subprocess.run(["umount", str(disk)], check=True)
-        if fits:
-            break
-    assert fits and kilobytes > 300
-
-
-def test_a_crash_while_moving_into_place_is_made_good(made, tmp_path, monkeypatch, no_pictures):
-    out = tmp_path / "out"
-    earlier(out)
-    replace = Path.replace
-
-    def crash(self: Path, target: Path) -> Path:
-        if self.name == "cloud.png":
-            raise SystemExit("as if killed here")
-        return replace(self, target)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Path, "replace", crash)
-        with pytest.raises(SystemExit):
-            write_result(out, *made)
-    assert not (out / "report.json").exists() and not (out / "report.html").exists()
-    with result_folder(out):  # as the next run begins
-        assert sorted(path.name for path in out.iterdir()) == sorted(FILES)
-        assert not any(data.startswith(b"an earlier") for data in content(out).values())
-
-
 def test_what_a_killed_run_left_is_removed(tmp_path):
     out = tmp_path / "out"
     before = earlier(out)
@@ -396,22 +354,11 @@ def test_shelves_of_the_warehouse_stand_upright(lidarpool, cluster, tmp_path, no
     assert shelves >= 3
 
 
-def test_a_run_doubts_a_size_that_speaks_of_another_unit(lidarpool, cluster, tmp_path, no_pictures):
-    (tmp_path / "room.stl").write_bytes(
-        trimesh.creation.box((8000, 6000, 3000)).export(file_type="stl")
-    )
-    options = ["--out", tmp_path / "o", "--scheduler", cluster, "--json"]
-    outcome = lidarpool("run", tmp_path / "room.stl", *options)
-    assert outcome.code == 0, outcome.err
-    assert "room.stl states no unit, and in metres the scene is 8,000 m long" in outcome.err
-    assert json.loads(outcome.out)["rays"] == 120_000
-
-
 # -- drawn again ---------------------------------------------------------------------------------
 
 
 def test_the_pictures_of_a_run_are_drawn_again_to_the_bit(demo, lidarpool, tmp_path):
-    out, _ = demo
+    out = demo.out
     again = lidarpool("plot", out, "--out", tmp_path)
     assert (again.code, again.err) == (0, "")
     for name in ("scene.png", "intensity.png", "cloud.png", "path.png"):

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
-from distributed import Worker, WorkerPlugin
+from distributed import Client
 
 import lidarpool.scan.driver
-from lidarpool import Frame, LidarpoolError, Scene, Sensor, Survey, simulate
-from poolpart import placement_violations, trace_to
+from lidarpool import Frame, LidarpoolError, Planning, Scene, Sensor, Survey, simulate
+from lidarpool.run.trials import TrialPump
+from lidarpool.scan import SurveyDriver
+from poolpart import placement_violations, worker_identities
 
 # Enough batches that the run is still under way when something happens to it.
 SURVEY = Survey(
@@ -45,7 +43,7 @@ def test_frames_come_in_order_and_every_scan_once(
     assert left_over(client) == ([], [], [])
 
 
-def test_points_of_a_frame_are_in_storage_when_it_comes(client, undisturbed):
+def test_points_of_a_frame_are_in_storage_when_it_comes(cluster_client, undisturbed):
     cloud = undisturbed.cloud
 
     def on_frame(frame: Frame) -> None:
@@ -55,84 +53,86 @@ def test_points_of_a_frame_are_in_storage_when_it_comes(client, undisturbed):
             assert len(points) == frame.count == mine.sum()
             assert np.array_equal(points.positions, cloud.positions[mine])
 
-    simulate(Scene.seed(), SURVEY, client=client, on_frame=on_frame)
+    simulate(Scene.seed(), SURVEY, client=cluster_client, on_frame=on_frame)
 
 
-@pytest.mark.parametrize("partition", ["GPU", "LIDAR"])
-def test_a_killed_worker_changes_nothing(client, undisturbed, same_cloud, kill, partition):
-    seen = []
-
+def test_a_partition_that_stays_empty_ends_the_run(threads, tmp_path):
     def on_frame(frame: Frame) -> None:
-        seen.append(frame.scan)
-        if frame.scan == 200:
-            kill(partition)
+        if frame.scan == 100:
+            gpu = [a for a, w in worker_identities(client).items() if "GPU" in w["resources"]]
+            client.retire_workers(gpu, close_workers=True, remove=True)
 
-    result = simulate(Scene.seed(), SURVEY, client=client, on_frame=on_frame)
-    assert seen == list(range(SURVEY.scan_count))
-    assert same_cloud(result.cloud, undisturbed.cloud)
-    assert result.hits == undisturbed.hits
-    assert placement_violations(result.records) == []
+    with (
+        threads(GPU=1, LIDAR=4) as address,
+        Client(address, set_as_default=False) as client,
+        pytest.raises(LidarpoolError, match="Partition 'GPU' has had no workers for 2 s") as end,
+    ):
+        simulate(
+            Scene.seed(), SURVEY, client=client, on_frame=on_frame, folder=tmp_path / "run",
+            patience_s=2.0,
+        )  # fmt: skip
+    assert '--resources "GPU=1"' in str(end.value)
+    assert "of 720 scans are kept" in end.value.__notes__[0]
 
 
-def test_a_failing_task_ends_the_run_with_stage_and_scan(client, monkeypatch, left_over):
+def test_a_failing_task_ends_the_run_with_stage_and_scan(cluster_client, monkeypatch, left_over):
     monkeypatch.setattr(lidarpool.scan.driver, "intersect", failing_intersect)
     message = r"stage intersect, scan \d+ failed: the lens is dirty"
     with pytest.raises(LidarpoolError, match=message):
-        simulate(Scene.seed(), SURVEY, client=client)
-    assert left_over(client) == ([], [], [])
+        simulate(Scene.seed(), SURVEY, client=cluster_client)
+    assert left_over(cluster_client) == ([], [], [])
 
 
 def failing_intersect(handle, first, stop, run):
     raise ValueError("the lens is dirty")
 
 
-@pytest.mark.parametrize("kind", [ZeroDivisionError, OSError, KeyboardInterrupt])
+@pytest.mark.parametrize("kind", [ZeroDivisionError, KeyboardInterrupt])
 def test_an_error_in_the_callback_passes_through_and_stops_the_run(
-    client, undisturbed, same_cloud, kind, left_over
+    cluster_client, undisturbed, same_cloud, kind, left_over
 ):
     def on_frame(frame: Frame) -> None:
         if frame.scan == 100:
             raise kind("mine")
 
     with pytest.raises(kind, match="mine"):
-        simulate(Scene.seed(), SURVEY, client=client, on_frame=on_frame)
-    assert left_over(client) == ([], [], [])
+        simulate(Scene.seed(), SURVEY, client=cluster_client, on_frame=on_frame)
+    assert left_over(cluster_client) == ([], [], [])
     if kind is KeyboardInterrupt:  # and the cluster can be used again
-        assert same_cloud(simulate(Scene.seed(), SURVEY, client=client).cloud, undisturbed.cloud)
+        again = simulate(Scene.seed(), SURVEY, client=cluster_client)
+        assert same_cloud(again.cloud, undisturbed.cloud)
 
 
-class BuildCount(WorkerPlugin):
-    """Notes in a file which process has built a tree."""
+@pytest.mark.parametrize("pump", [SurveyDriver, TrialPump])
+def test_an_interrupt_while_starting_leaves_nothing(cluster_client, monkeypatch, pump, left_over):
+    method = "start" if pump is SurveyDriver else "step"
+    original = getattr(pump, method)
 
-    name = "build-count"
+    def interrupted(self) -> None:
+        original(self)
+        raise KeyboardInterrupt
 
-    def __init__(self, file: str) -> None:
-        self.file = file
-
-    def setup(self, worker: Worker) -> None:
-        trace_to(self._note)
-
-    def teardown(self, worker: Worker) -> None:
-        trace_to(None)
-
-    def _note(self, point: str, fields: dict[str, Any]) -> None:
-        if point == "intersect.built":
-            with Path(self.file).open("a") as file:
-                file.write(f"{os.getpid()}\n")
+    monkeypatch.setattr(pump, method, interrupted)
+    planning = Planning((25, 25), (-30, -20), trials=3, particles=50, iterations=20)
+    with pytest.raises(KeyboardInterrupt):
+        simulate(Scene.seed(), SURVEY, planning, client=cluster_client)
+    assert left_over(cluster_client) == ([], [], [])
 
 
-def test_a_tree_is_built_once_in_each_worker(client, tmp_path):
-    """Also where workers idle and Dask's memory manager drops what nobody needs."""
-    builds = tmp_path / "builds"
-    builds.touch()
-    client.register_plugin(BuildCount(str(builds)))
-    try:
-        survey = Survey(poses=[(0, 0, 1)])
-        result = simulate(Scene.seed(), survey, client=client, scans_per_second=12)
-    finally:
-        client.unregister_worker_plugin(BuildCount.name)
-    assert client.amm.running()
-    assert result.seconds > 2.5
-    built = builds.read_text().split()
-    assert len(built) == 3
-    assert len(set(built)) == 3
+def test_trials_cancelled_by_somebody_end_the_run(cluster_client, left_over):
+    planning = Planning((25, 25), (-30, -20), trials=500)
+    pumps = []
+    original = TrialPump.__init__
+
+    def spy(self, *arguments) -> None:
+        original(self, *arguments)
+        pumps.append(self)
+
+    def cancel(progress) -> None:
+        cluster_client.cancel(list(pumps[0]._running), force=True)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(TrialPump, "__init__", spy)
+        with pytest.raises(LidarpoolError, match=r"trial \d+ was cancelled"):
+            simulate(Scene.seed(), SURVEY, planning, client=cluster_client, on_progress=cancel)
+    assert left_over(cluster_client)[1:] == ([], [])

@@ -42,25 +42,15 @@ def environment() -> Iterator[dict[str, str]]:
     store.stop()
 
 
-@pytest.fixture(scope="module")
-def cluster_there(environment, outside) -> Any:
-    """A cluster whose workers know of the server."""
-    cluster = outside()
-    cluster.add("GPU", **environment)
-    cluster.add("LIDAR", slots=4, **environment)
-    cluster.wait()
-    return cluster
-
-
 @pytest.fixture
-def run(cluster_there, lidarpool, tmp_path) -> Callable[..., Any]:
+def run(environment, cluster, lidarpool, tmp_path) -> Callable[..., Any]:
     """Run the default survey without planning, with its parts in a folder of the bucket."""
     (tmp_path / "s.yaml").write_text(SCENARIO)
 
-    def run(folder: str, *options: str) -> Any:
+    def run(folder: str, *options: str, scheduler: str = cluster) -> Any:
         return lidarpool(
             "run", tmp_path / "s.yaml", "--out", tmp_path / "out", "--only", "cloud", "-q",
-            "--scheduler", cluster_there.address, "--parts", f"{BUCKET}/{folder}", *options,
+            "--scheduler", scheduler, "--parts", f"{BUCKET}/{folder}", *options,
         )  # fmt: skip
 
     return run
@@ -116,14 +106,17 @@ Storage.write = write_and_die
 """
 
 
-def test_a_collector_dies_while_it_uploads(run, check, cluster_there, environment):
+@pytest.mark.slow
+def test_a_collector_dies_while_it_uploads(run, check, outside, environment):
     """The stages begin on the worker with more slots, which dies, and go on on the other."""
-    cluster_there.add("LIDAR", slots=8, preload=DIES, **environment)
-    cluster_there.wait()
-    doomed = list(cluster_there.processes)[-1]
-    done = run("died")
+    cluster = outside()
+    cluster.add_threads(("GPU", 1), ("LIDAR", 4), **environment)
+    cluster.add("LIDAR", slots=8, preload=DIES, **environment)
+    cluster.wait()
+    doomed = list(cluster.processes)[-1]
+    done = run("died", scheduler=cluster.address)
     assert (done.code, done.err) == (0, "")
-    assert cluster_there.processes.pop(doomed).wait(60) == -9
+    assert cluster.processes.pop(doomed).wait(300) == -9
     report = check("died")
     assert report["replayed"] > 0
 
@@ -137,16 +130,10 @@ def test_a_place_that_there_cannot_be(place, run, tmp_path):
     assert not (tmp_path / "out" / "run").exists()
 
 
-def test_a_bucket_that_the_workers_cannot_reach(
-    lidarpool, check, cluster, environment, tmp_path, monkeypatch
-):
+def test_a_bucket_that_the_workers_cannot_reach(run, check, monkeypatch):
     """Parts come to it through the driver."""
     monkeypatch.setattr(Storage, "sees", lambda *_: False)
-    (tmp_path / "s.yaml").write_text(SCENARIO)
-    done = lidarpool(
-        "run", tmp_path / "s.yaml", "--out", tmp_path / "out", "--only", "cloud", "-q",
-        "--scheduler", cluster, "--parts", f"{BUCKET}/far",
-    )  # fmt: skip
+    done = run("far")
     assert (done.code, done.err) == (0, "")
     (note,) = (n for n in check("far")["notes"] if "cannot see" in n)
     assert note.startswith(f"LIDAR of partition LIDAR cannot see {BUCKET}/far/run-")

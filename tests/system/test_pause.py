@@ -187,12 +187,9 @@ def test_a_paused_run_can_be_ended_and_resumed(client, tmp_path, how, left_over,
     again.kept.remove()
 
 
-@pytest.mark.slow  # starts a cluster of processes
 def test_a_cluster_that_is_lost_during_a_pause_ends_the_run(outside, tmp_path):
     cluster = outside()
-    cluster.add("GPU")
-    cluster.add("LIDAR", slots=4)
-    cluster.add("OTHER")
+    cluster.add_threads(("GPU", 1), ("LIDAR", 4), ("OTHER", 1))
     cluster.wait()
     with Client(cluster.address, set_as_default=False) as client:
         driven = Driven(client, tmp_path, make_job(400))  # not to be over before the pause

@@ -201,3 +201,12 @@ def test_a_failure_anywhere_ends_the_run_and_says_where(
         simulate(room(), survey, planning, client=client)
     monkeypatch.undo()
     assert len(simulate(room(), survey, client=client).cloud) > 0
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"collectors": 0}, {"queue_capacity": 0}, {"gpu_workers": 0}, {"other_workers": -1}]
+)
+def test_numbers_below_one_are_refused(wrong):
+    ((name, value),) = wrong.items()
+    with pytest.raises(LidarpoolError, match=f"{name} is {value}; it must be at least 1"):
+        simulate(room(), Survey(SENSOR, [(0, 0, 0)]), **wrong)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Callable
 
 import dask
 import pytest
@@ -89,39 +88,29 @@ def test_workers_that_die_when_a_run_starts_are_waited_for(client, lose_gpu):
     assert result.hits > 0
 
 
-@pytest.fixture
-def lost(outside) -> Iterator[tuple[Any, Client]]:
-    """A cluster that is to lose something, and notices it within seconds, as its client does."""
-    cluster = outside(DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT="2s")
-    cluster.add("GPU")
-    cluster.add("LIDAR", slots=4)
+def test_what_a_starting_run_waits_for_and_what_not(outside, lose_gpu):
+    """Workers that come late, those that do not come back, and a scheduler that is gone."""
+    soon = "2s"  # for others to notice what is lost
+    cluster = outside(DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT=soon)
+    cluster.add_threads(("LIDAR", 4))
     cluster.wait()
     with (
-        dask.config.set({"distributed.comm.timeouts.connect": "2s"}),
+        dask.config.set({"distributed.comm.timeouts.connect": soon}),
         Client(cluster.address, set_as_default=False) as client,
     ):
-        yield cluster, client
 
+        def run(**options: float) -> int:
+            return simulate(Scene.seed(), SURVEY, client=client, backend="numpy", **options).hits
 
-def test_workers_that_do_not_come_back_are_named(lost, lose_gpu):
-    cluster, client = lost
-    name = next(name for name in cluster.processes if name.startswith("GPU"))
-    lose_gpu(lambda: cluster.kill(name))
-    with pytest.raises(LidarpoolError, match="GPU"):
-        simulate(Scene.seed(), SURVEY, client=client, backend="numpy", wait_s=0)
-
-
-def test_workers_that_come_late_are_waited_for(lost):
-    cluster, client = lost
-    cluster.kill(next(name for name in cluster.processes if name.startswith("GPU")))
-    comes = threading.Timer(0.5, cluster.add, ["GPU"])
-    comes.start()
-    assert simulate(Scene.seed(), SURVEY, client=client, backend="numpy").hits > 0
-    comes.join()
-
-
-def test_a_cluster_that_is_lost_before_the_run_has_begun_is_named(lost, lose_gpu):
-    cluster, client = lost
-    lose_gpu(lambda: cluster.kill("scheduler"))
-    with pytest.raises(LidarpoolError, match=f"{cluster.address} cannot be reached any more"):
-        simulate(Scene.seed(), SURVEY, client=client, backend="numpy")
+        comes = threading.Timer(0.5, cluster.add, ["GPU"])
+        comes.start()
+        assert run(wait_s=300) > 0
+        comes.join()
+        lose_gpu(lambda: cluster.kill(list(cluster.processes)[-1]))
+        with pytest.raises(LidarpoolError, match="GPU"):
+            run(wait_s=0)
+        cluster.add("GPU")
+        cluster.wait()
+        lose_gpu(lambda: cluster.kill("scheduler"))
+        with pytest.raises(LidarpoolError, match=f"{cluster.address} cannot be reached any more"):
+            run()
