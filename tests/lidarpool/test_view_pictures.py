@@ -12,7 +12,6 @@ from lidarpool.render.pictures import draw_cloud, draw_intensity, draw_scene
 from lidarpool.render.shot import take_shot
 from lidarpool.render.theme import object_colours
 from lidarpool.report.path_picture import draw_path
-from lidarpool.run.picture_file import TrialPath
 from lidarpool.scene.mesh import Mesh
 from lidarpool.scene.scene import Scene
 from lidarpool.scene.shapes import seed_objects
@@ -190,7 +189,7 @@ def planned():
         trials=3, particles=60, iterations=40,
     )  # fmt: skip
     trials = [run_trial(planning, k) for k in range(3)]
-    return planning, best(trials, planning), [TrialPath(trial.waypoints) for trial in trials]
+    return planning, best(trials, planning), [trial.waypoints for trial in trials]
 
 
 def test_the_path_is_drawn_with_its_discs_and_trials(pixels, planned):

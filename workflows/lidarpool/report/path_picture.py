@@ -21,7 +21,6 @@ from ..plan import Plan, Planning
 from ..render import theme
 from ..render.page import FONT, Page
 from ..render.stage import make_axis, nice_step
-from ..run.picture_file import TrialPath
 
 Floats = NDArray[np.float64]
 
@@ -34,7 +33,7 @@ def draw_path(
     path: Path,
     planning: Planning,
     plan: Plan,
-    trials: Sequence[TrialPath],
+    trials: Sequence[Floats],
     origin: Floats,
     size: tuple[int, int],
 ) -> None:
@@ -43,7 +42,8 @@ def draw_path(
     Parameters
     ----------
     trials
-        What the best was chosen from; of more than 1000 an even choice is drawn.
+        What the best was chosen from, the corners of each, (w, 2); of more than 1000 an even
+        choice is drawn.
     origin
         x and y of the local origin: the axes tell world coordinates, local + origin.
     size
@@ -57,7 +57,7 @@ def draw_path(
     page = Page(size)
     unit = page.unit
     best = plan.path
-    every = [np.concatenate([best[:1], trial.waypoints, best[-1:]]) for trial in trials]
+    every = [np.concatenate([best[:1], trial, best[-1:]]) for trial in trials]
     others = [every[k] for k in one_of_each_part(len(every), MOST_TRIALS)]
     axes = page.figure.add_axes(FRAME)
     _frame(axes, page, _limits(best, others, planning, size), origin)

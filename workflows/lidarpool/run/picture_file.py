@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import io
 import json
-import zipfile
-import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -23,26 +20,10 @@ from .result import Result
 
 PICTURE_FILE = "pictures.npz"
 PICTURES = ("scene", "intensity", "cloud", "path")  # that are drawn
-# Of a triangle of an ordinary mesh: half a vertex, three indices, its object and its hits. The
-# file is compressed, to a quarter of this or so.
-TRIANGLE_BYTES = 36
 
 PLACES_MOST = 200  # of a sensor that moves
 _FORMAT = 1
 _PLAN_NUMBERS = ("length", "shortest_possible", "clearance", "trial", "trials")
-
-
-@dataclass(frozen=True, eq=False)
-class TrialPath:
-    """The path of a trial.
-
-    Parameters
-    ----------
-    waypoints
-        float64 (k, 2): its corners between the two ends, metres, local coordinates.
-    """
-
-    waypoints: NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +43,8 @@ class Pictured:
     planning, plan
         What was planned and the best path; None where nothing was.
     trials
-        What the best path was chosen from.
+        What the best path was chosen from, float64 (w, 2) each: corners of the paths between the
+        two ends, metres, local coordinates.
     """
 
     scene: Scene
@@ -71,7 +53,7 @@ class Pictured:
     sample_rays: NDArray[np.float32]
     planning: Planning | None
     plan: Plan | None
-    trials: tuple[TrialPath, ...]
+    trials: Sequence[NDArray[np.float64]]
 
     @classmethod
     def of(
@@ -85,7 +67,7 @@ class Pictured:
             result.sample_rays,
             planning if result.plan is not None else None,
             result.plan if planning is not None else None,
-            tuple(TrialPath(trial.waypoints) for trial in result.trials),
+            [trial.waypoints for trial in result.trials],
         )
 
     def save(self, path: Path) -> None:
@@ -96,15 +78,8 @@ class Pictured:
         OSError
             If it cannot be written.
         """
-        # At the end of a full disk an archive that is written directly leaves a handle behind.
-        memory = io.BytesIO()
-        np.savez_compressed(memory, **self._arrays())
-        path.write_bytes(memory.getbuffer())
-
-    def _arrays(self) -> dict[str, Any]:
-        """Content of the archive: {name: array}."""
         arrays: dict[str, Any] = {
-            "format": np.array(_FORMAT),
+            "format": _FORMAT,
             "vertices": self.scene.vertices,
             "faces": self.scene.faces,
             "face_object": self.scene.face_object,
@@ -117,14 +92,17 @@ class Pictured:
         }
         if self.planning is not None and self.plan is not None:
             arrays |= {
-                "ends": np.array([self.planning.start, self.planning.target]),
+                "ends": [self.planning.start, self.planning.target],
                 "centres": self.planning.centres,
                 "radii": self.planning.radii,
                 "path": self.plan.path,
-                "waypoints": np.array([trial.waypoints for trial in self.trials]),
+                "waypoints": np.array(self.trials),
             }
-            arrays |= {name: np.array(getattr(self.plan, name)) for name in _PLAN_NUMBERS}
-        return arrays
+            arrays |= {name: getattr(self.plan, name) for name in _PLAN_NUMBERS}
+        # At the end of a full disk an archive that is written directly leaves a handle behind.
+        memory = io.BytesIO()
+        np.savez_compressed(memory, **arrays)
+        path.write_bytes(memory.getbuffer())
 
     @classmethod
     def load(cls, path: Path) -> Pictured:
@@ -138,26 +116,20 @@ class Pictured:
         try:
             # NumPy leaves a file open that it opened itself and cannot read.
             with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-                made = int(archive["format"])
-                if made == _FORMAT:
-                    return cls._from_arrays(archive)
+                return cls._from_arrays(archive)
         except OSError as error:
             raise LidarpoolError(f"{path} cannot be read: {error.strerror or error}.") from error
-        except (
-            LidarpoolError, AttributeError, EOFError, KeyError, MemoryError, OverflowError,
-            RuntimeError, SyntaxError, TokenError, TypeError, ValueError, zipfile.BadZipFile,
-            zlib.error,
-        ) as error:  # fmt: skip
+        except Exception as error:  # zipfile, zlib, NumPy and Scene have many
+            reason = " ".join(str(error).split())
             raise LidarpoolError(
-                f"{path} is damaged or not of lidarpool ({error}): run the survey again."
+                f"{path} is damaged or not of this version of lidarpool ({reason}): run the "
+                "survey again."
             ) from error
-        raise LidarpoolError(
-            f"{path} is of format {made}, and this version reads {_FORMAT}: draw with the "
-            "version that ran the survey, or run it again."
-        )
 
     @classmethod
     def _from_arrays(cls, arrays: Mapping[str, Any]) -> Pictured:
+        if (made := int(arrays["format"])) != _FORMAT:
+            raise ValueError(f"it is of format {made}, not {_FORMAT}")
         scene = Scene(
             arrays["vertices"],
             arrays["faces"],
@@ -165,24 +137,16 @@ class Pictured:
             tuple(map(str, json.loads(arrays["names"].tobytes()))),
             arrays["origin"],
         )
-        planning, plan = None, None
-        trials: tuple[TrialPath, ...] = ()
-        if "path" in arrays:
-            start, target = arrays["ends"]
-            planning = Planning(start, target, arrays["centres"], arrays["radii"])
-            numbers = {name: arrays[name].item() for name in _PLAN_NUMBERS}
-            plan = Plan(path=arrays["path"], **numbers)
-            trials = tuple(TrialPath(waypoints) for waypoints in arrays["waypoints"])
         counts = arrays["hit_counts"]
-        if counts.shape != (len(scene.faces),) or counts.dtype.kind not in "iu":
+        if counts.shape != (len(scene.faces),):
             raise ValueError(f"hit_counts of {counts.shape} for {len(scene.faces)} triangles")
-        poses, rays = arrays["poses"], arrays["sample_rays"]
-        for name, array, shape in (("poses", poses, (3,)), ("sample_rays", rays, (2, 3))):
-            if array.shape[1:] != shape or not np.isfinite(array).all():
-                raise ValueError(f"{name} of {array.shape}, or not finite")
-        if not len(poses):
-            raise ValueError("no poses")
-        return cls(scene, poses, counts, rays, planning, plan, trials)
+        if "path" not in arrays:
+            return cls(scene, arrays["poses"], counts, arrays["sample_rays"], None, None, ())
+        start, target = arrays["ends"]
+        planning = Planning(start, target, arrays["centres"], arrays["radii"])
+        numbers = {name: arrays[name].item() for name in _PLAN_NUMBERS}
+        plan, trials = Plan(path=arrays["path"], **numbers), tuple(arrays["waypoints"])
+        return cls(scene, arrays["poses"], counts, arrays["sample_rays"], planning, plan, trials)
 
 
 def sensor_places(survey: Survey) -> NDArray[np.float64]:

@@ -53,15 +53,15 @@ class Result:
     hits: int
     records: tuple[TaskRecord, ...]
     stages: tuple[StageTotals, ...]
-    seconds: float
-    survey_seconds: float
-    planning_seconds: float
-    replayed: int
-    duplicates_dropped: int
     resumed: int
     notes: tuple[str, ...]
     _hit_counts: Callable[[], NDArray[np.int64]] = field(repr=False)
     _sample_rays: Callable[[], NDArray[np.float32]] = field(repr=False)
+    seconds: float = 0.0
+    survey_seconds: float = 0.0
+    planning_seconds: float = 0.0
+    replayed: int = 0
+    duplicates_dropped: int = 0
 
     @cached_property
     def cloud(self) -> Cloud:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from typing import TypeVar
+from dataclasses import replace
+from typing import Any, TypeVar
 
 from distributed import Client
 from distributed.client import FutureCancelledError
@@ -28,7 +29,6 @@ from ..scan import (
     LIDAR,
     OTHER,
     Frame,
-    Receipt,
     RigPlan,
     SurveyDriver,
     SurveyOptions,
@@ -49,10 +49,6 @@ PROGRESS_EVERY_S = 0.1
 SAVE_EVERY_S = 1.0  # how many frames were handed out
 LOST_S = 0.5  # for a client to notice that its scheduler is gone
 PAUSED_S = 0.1  # from one look at a paused run to the next
-
-
-def _silent(words: str) -> None:
-    """Tell nobody."""
 
 
 class Run:
@@ -80,7 +76,7 @@ class Run:
         client: Client,
         store: RunStore,
         wants_pause: Callable[[], bool] = lambda: False,
-        tell: Callable[[str], None] = _silent,
+        tell: Callable[[str], None] = lambda words: None,
     ) -> None:
         job = store.job
         self.client, self.job, self.store = client, job, store
@@ -89,12 +85,11 @@ class Run:
         # For when it is lost; a client that was never connected is refused in a moment.
         self.address: str = getattr(client.scheduler, "address", "")
         try:
-            planning, backend = job.planning is not None, store.backend or job.backend
             pool, casting, backend = find_workers(
                 client,
                 job.collectors,
-                planning,
-                backend,
+                job.planning is not None,
+                store.backend or job.backend,
                 store.advice,
                 wait_s=job.wait_s,
                 tell=tell,
@@ -110,10 +105,7 @@ class Run:
         self.partitions: dict[str, Partition] = pool.partitions()
         self.notes: list[str] = []
         if not any(worker.gpus for worker in casting):
-            self.notes.append(
-                f"no GPU in partition GPU: {len(casting)} CPU worker{'s' * (len(casting) > 1)} "
-                f"cast{'s' * (len(casting) == 1)} the rays with {backend}"
-            )
+            self.notes.append(f"no GPU in partition GPU: CPU workers cast the rays with {backend}")
         self.callers_error: BaseException | None = None  # raised by a callback
 
     def _told_lost(self) -> LidarpoolError:
@@ -164,23 +156,19 @@ class Run:
             self.notes.append(f"the run was paused for {self._paused_s:.0f} s, in its times too")
         return make_result(
             self.store,
-            books=[survey.book, *([trials.book] if trials else [])],
+            [survey.book, *([trials.book] if trials else [])],
+            self.notes,
             seconds=time.monotonic() - started,
             survey_seconds=times[SurveyDriver],
             planning_seconds=times.get(TrialPump, 0.0),
             replayed=survey.offered_again,
             duplicates_dropped=survey.duplicates_dropped,
-            notes=self.notes,
         )
 
     def _survey_driver(self, on_frame: Callable[[Frame], None] | None) -> SurveyDriver:
         def take(frame: Frame) -> None:
             if on_frame:
                 self._call(on_frame, frame)
-
-        def on_parts(parts: list[Receipt]) -> None:
-            if self.store.on_parts:
-                self.store.on_parts(parts)
 
         job = self.job
         return SurveyDriver(
@@ -191,7 +179,7 @@ class Run:
             self.store.storage,
             self.store.points_of_scan,
             take,
-            on_parts,
+            lambda parts: self.store.on_parts(parts) if self.store.on_parts else None,
             SurveyOptions(job.queue_capacity, job.collectors, job.patience_s),
         )
 
@@ -269,15 +257,10 @@ class Run:
     def _progress(
         self, survey: SurveyDriver, trials: TrialPump | None, seconds: float, paused: bool
     ) -> Progress:
-        db = self.store.db
-        return Progress(
-            scans=self.job.survey.scan_count,
+        return replace(
+            self.store.progress(),
             generated=survey.generated,
             cast=min(self.store.resumed + survey.cast, self.job.survey.scan_count),
-            framed=db.frames,
-            collected=db.scans_done,
-            points=db.point_count,
-            trials=self.job.trials,
             trials_done=len(trials.trials) if trials else 0,
             seconds=seconds,
             replayed=survey.offered_again,
@@ -287,16 +270,9 @@ class Run:
 
 
 def make_result(
-    store: RunStore,
-    books: Sequence[TaskBook] = (),
-    seconds: float = 0.0,
-    survey_seconds: float = 0.0,
-    planning_seconds: float = 0.0,
-    replayed: int = 0,
-    duplicates_dropped: int = 0,
-    notes: Iterable[str] = (),
+    store: RunStore, books: Sequence[TaskBook] = (), notes: Iterable[str] = (), **figures: Any
 ) -> Result:
-    """Put the result together once everything is committed; see `Result`."""
+    """Put the result together once everything is committed; `figures` are others of `Result`."""
     job = store.job
     trials = tuple(sorted(store.db.trials, key=lambda trial: trial.trial))
     return Result(
@@ -308,15 +284,11 @@ def make_result(
         hits=store.db.hits,
         records=tuple(record for book in books for record in book.records),
         stages=tuple(totals for book in books for totals in book.stages.values()),
-        seconds=seconds,
-        survey_seconds=survey_seconds,
-        planning_seconds=planning_seconds,
-        replayed=replayed,
-        duplicates_dropped=duplicates_dropped,
         resumed=store.resumed,
         notes=(*store.notes, *notes),
         _hit_counts=store.hit_counts,
         _sample_rays=store.sample_rays,
+        **figures,
     )
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field, PrivateAttr, Strict, ValidationError, field_validator, model_validator
+from pydantic import Field, PrivateAttr, Strict, ValidationError, model_validator
 
 from ..base.errors import LidarpoolError
 from ..base.words import did_you_mean
@@ -67,7 +67,7 @@ class Scenario(Section):
     Raises
     ------
     pydantic.ValidationError
-        If a value is out of range; `load`, `from_mesh` and `from_data` raise LidarpoolError.
+        If a value is out of range; `load` and `from_data` raise LidarpoolError.
     """
 
     scene: Annotated[SceneSection, scene_in_short] = SceneSection()
@@ -94,16 +94,6 @@ class Scenario(Section):
     _source: str = PrivateAttr(default="scenario")  # for messages
     _notes: list[str] = PrivateAttr(default_factory=list)  # of what was left out of the scene
 
-    @field_validator("poses", mode="before")
-    @classmethod
-    def _not_one_pose(cls, value: Any) -> Any:
-        """Answer the slip of giving a pose instead of a list of them in words of its own."""
-        if isinstance(value, dict) or (
-            isinstance(value, list) and value and all(type(n) in (int, float) for n in value)
-        ):
-            raise ValueError("a single pose is given, and must be in a list: [[x, y, z]].")
-        return value
-
     @model_validator(mode="after")
     def _bounded(self) -> Scenario:
         scans = len(self.poses or _HEIGHTS_M) * self.steps
@@ -129,15 +119,9 @@ class Scenario(Section):
         """
         path = Path(path)
         if path.suffix.lower() in SUFFIXES:
-            return cls.from_mesh(path)
+            data = {"scene": {"files": [path.name]}}
+            return cls.from_data(data, source=str(path), folder=path.parent)
         return cls.from_data(read_yaml(path), source=str(path), folder=path.parent)
-
-    @classmethod
-    def from_mesh(cls, path: str | Path) -> Scenario:
-        """Return the scenario that surveys one mesh file from its middle."""
-        path = Path(path)
-        data = {"scene": {"files": [path.name]}}
-        return cls.from_data(data, source=str(path), folder=path.parent)
 
     @classmethod
     def from_data(
