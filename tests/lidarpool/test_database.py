@@ -48,7 +48,7 @@ def test_what_is_committed_is_there_once(db):
         assert [p.name for p in found.ordered] == ["0.npz", "10.npz"]
         assert (found.scans_done, found.point_count, found.hits) == (7, 9, 27)
         assert found.committed.nonzero()[0].tolist() == [0, 1, 2, 3, 4, 10, 11]
-        assert found.parts_done == 2 and not found.complete
+        assert len(found.parts) == 2 and not found.complete
     again.close()
 
 

@@ -93,14 +93,14 @@ def test_schema_prints_what_init_writes(tmp_path, lidarpool):
 
 
 @pytest.mark.parametrize("name", sorted(cli.commands))
-def test_help_of_each_command_shows_two_examples(name, lidarpool):
+def test_help_of_each_command_shows_examples(name, lidarpool):
     commands = getattr(cli.commands[name], "commands", {"": None})
     for inner in commands:
         words = [name, *([inner] if inner else [])]
         outcome = lidarpool(*words, "--help")
         assert outcome.code == 0
         examples = outcome.out.partition("Examples:")[2].partition("\n\n")[0]
-        assert len(re.findall(rf"\blidarpool {' '.join(words)}\b", examples)) == 2, words
+        assert len(re.findall(rf"\blidarpool {' '.join(words)}\b", examples)) >= 1, words
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import click
 from dask.utils import format_bytes
@@ -16,13 +16,10 @@ from poolpart.wording import counted
 
 from ..base.errors import LidarpoolError
 from ..run.connection import TlsFiles, connected
-from ..run.job import make_job
+from ..run.job import Job, make_job
 from ..scenario.scenario import Scenario
 from . import options
 from .terminal import shown_status
-
-if TYPE_CHECKING:
-    from .forecast import Forecast
 
 
 @click.command()
@@ -57,15 +54,15 @@ def check(
     job = make_job(read, backend, no_plan)
     cluster = nullcontext() if scheduler is None else connected(scheduler, files)
     with cluster as client, shown_status("casting some rays", as_json):
-        made = forecast(job, read.pool, out, client)
-    made.notes += read.advice(job.scene)
+        found = forecast(job, read.pool, out, client)
+    found["notes"] += read.advice(job.scene)
     if as_json:
-        click.echo(json.dumps(made.as_data(), indent=1, allow_nan=False))
+        click.echo(json.dumps(found, indent=1, allow_nan=False))
     else:
-        for line in told(made):
+        for line in told(job, found):
             click.echo(line)
-    if made.reasons:
-        raise LidarpoolError("it cannot run. " + " ".join(made.reasons))
+    if found["reasons"]:
+        raise LidarpoolError("it cannot run. " + " ".join(found["reasons"]))
     if not as_json:
         words = ["lidarpool", "run", str(scenario)]
         for name, value in (("--out", out), ("--scheduler", scheduler), ("--backend", backend)):
@@ -73,37 +70,37 @@ def check(
         click.echo(f"it can run: {shlex.join([*words, *['--no-plan'] * no_plan])}")
 
 
-def told(made: Forecast) -> Iterator[str]:
-    """Tell of it in lines for people."""
-    job, sample = made.job, made.sample
-    survey, sensor = job.survey, job.survey.sensor
+def told(job: Job, found: dict[str, Any]) -> Iterator[str]:
+    """Tell of a forecast in lines for people."""
+    sensor, estimate, disk = job.survey.sensor, found["estimate"], found["disk"]
     turn = f"{sensor.channels:,} a firing"
     if sensor.period is not None:
         turn = f"{sensor.period:,} x {sensor.channels:,} a turn"
-    objects = counted(len(job.scene.names), "object")
-    yield f"scene       {objects}, {len(job.scene.faces):,} triangles"
-    low, high = job.scene.bounds + job.scene.origin
-    yield f"size        {' x '.join(f'{side:,.2f}' for side in high - low)} m; " + ", ".join(
-        f"{axis} {a:,.2f} to {b:,.2f}" for axis, a, b in zip("xyz", low, high, strict=True)
+    yield f"scene       {counted(found['objects'], 'object')}, {found['triangles']:,} triangles"
+    sides = list(zip("xyz", *found["bounds"], strict=True))
+    yield (
+        f"size        {' x '.join(f'{high - low:,.2f}' for _, low, high in sides)} m; "
+        + ", ".join(f"{axis} {low:,.2f} to {high:,.2f}" for axis, low, high in sides)
     )
     yield (
-        f"survey      {counted(survey.scan_count, 'scan')} from "
-        f"{counted(survey.path.stations, 'pose')}, {survey.ray_count:,} rays ({turn})"
+        f"survey      {counted(found['scans'], 'scan')} from {counted(found['poses'], 'pose')}, "
+        f"{found['rays']:,} rays ({turn})"
     )
-    if sample is not None:
+    if estimate:
         yield (
-            f"points      about {sample.points:,} of {sample.hits:,} hits; an estimate from "
-            f"{sample.rays:,} rays cast here"
+            f"points      about {estimate['points']:,} of {estimate['hits']:,} hits; an estimate "
+            f"from {estimate['rays']:,} rays cast here"
         )
     yield f"planning    {f'{job.trials:,} trials' if job.trials else 'none'}"
-    yield f"backend     {made.backend or 'none yet'}" + (" (auto)" if job.backend == "auto" else "")
-    for name, (needed, there) in made.slots.items():
-        yield f"{name:<10}  {counted(there, 'slot')}, at least {needed:,} needed"
-    limit = f" of {format_bytes(made.memory)}" if made.memory else ""
-    yield f"memory      about {format_bytes(made.memory_needed)}{limit}"
+    yield f"backend     {found['backend'] or 'none yet'}{' (auto)' * (job.backend == 'auto')}"
+    for name, slots in found["slots"].items():
+        yield f"{name:<10}  {counted(slots['there'], 'slot')}, at least {slots['needed']:,} needed"
+    there = found["memory"]["there"]
+    limit = f" of {format_bytes(there)}" if there else ""
+    yield f"memory      about {format_bytes(found['memory']['needed'])}{limit}"
     yield (
-        f"disk        about {format_bytes(made.parts)} meanwhile and "
-        f"{format_bytes(made.result)} for the result; {format_bytes(made.free)} free"
+        f"disk        about {format_bytes(disk['parts'])} meanwhile and "
+        f"{format_bytes(disk['result'])} for the result; {format_bytes(disk['free'])} free"
     )
-    for note in made.notes:
+    for note in found["notes"]:
         yield f"note: {note}"

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from pathlib import Path
 from typing import Any, NoReturn
 
 import click
+from dask.utils import parse_timedelta
 
 from poolpart import Pool, PoolError
 from poolpart.probe import visible_gpus
@@ -63,19 +63,12 @@ _SHOWN = (
 )
 
 
-class Duration(click.ParamType[float]):
-    """A time such as 90, 90s, 10m or 2h, in seconds."""
-
-    name = "time"
-
-    def convert(self, value: Any, param: Any, ctx: Any) -> float:
-        """Take a text apart."""
-        if isinstance(value, (int, float)):
-            return float(value)
-        found = re.fullmatch(r"(\d+(?:\.\d+)?)(s|m|h|)", value.strip())
-        if not found:
-            self.fail(f"{value!r} is no time: give a number with s, m or h, as 10m.", param, ctx)
-        return float(found[1]) * {"": 1, "s": 1, "m": 60, "h": 3600}[found[2]]
+def _seconds(_: click.Context, __: click.Parameter, text: str) -> float:
+    """Take a time such as 90, 90s, 10m or 2h."""
+    try:
+        return float(parse_timedelta(text))
+    except (KeyError, ValueError) as error:
+        raise click.BadParameter(f"{text!r} is no time: give a number with s, m or h.") from error
 
 
 def _shown(command: options.Command) -> options.Command:
@@ -125,18 +118,20 @@ def demo(out: Path, **shown: Any) -> None:
 @click.option(
     "--wait",
     "wait_s",
-    type=Duration(),
-    default=WAIT_S,
+    default=f"{WAIT_S:g}s",
+    callback=_seconds,
+    show_default=True,
     metavar="TIME",
-    help=f"Wait so long for partitions that are still empty, 90s or 10m.  [default: {WAIT_S:g}s]",
+    help="Wait so long for partitions that are still empty, 90s or 10m.",
 )
 @click.option(
     "--patience",
     "patience_s",
-    type=Duration(),
-    default=PATIENCE_S,
+    default=f"{PATIENCE_S:g}s",
+    callback=_seconds,
+    show_default=True,
     metavar="TIME",
-    help=f"Wait so long for partitions that become empty.  [default: {PATIENCE_S:g}s]",
+    help="Wait so long for partitions that become empty.",
 )
 @_shown
 def run(scenario: Path, **given: Any) -> None:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -68,72 +67,9 @@ class Sample:
     points: int
 
 
-@dataclass
-class Forecast:
-    """What a run would do and take; filled in by `forecast`.
-
-    Parameters
-    ----------
-    job, out
-        What is to be run, and the folder of the result.
-    backend
-        Ray-casting backend that stage 2 would use; empty where it is not to be had.
-    slots
-        Slots of each partition: those needed, and those there.
-    sample
-        Estimate of hits and points; None where no ray could be cast.
-    memory, memory_needed
-        Bytes that there are and that are needed: of this machine and by all processes, or, on
-        another cluster, those of a GPU worker. 0 where there is no limit.
-    parts, result, free
-        Bytes on the disk of `out`: of the run, about, of its result, and those that are free.
-    reasons
-        Why it cannot run, each with what to do.
-    notes
-        What should be known besides.
-    """
-
-    job: Job
-    out: Path
-    backend: str = ""
-    slots: dict[str, tuple[int, int]] = field(default_factory=dict)
-    sample: Sample | None = None
-    memory: int = 0
-    memory_needed: int = 0
-    parts: int = 0
-    result: int = 0
-    free: int = 0
-    reasons: list[str] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-
-    def as_data(self) -> dict[str, Any]:
-        """Return it as plain data for JSON; sizes in bytes."""
-        scene, survey = self.job.scene, self.job.survey
-        return {
-            "can_run": not self.reasons,
-            "reasons": self.reasons,
-            "notes": self.notes,
-            "objects": len(scene.names),
-            "triangles": len(scene.faces),
-            "bounds": (scene.bounds + scene.origin).tolist(),
-            "poses": survey.path.stations,
-            "scans": survey.scan_count,
-            "rays": survey.ray_count,
-            "estimate": asdict(self.sample) if self.sample else None,
-            "trials": self.job.trials,
-            "backend": self.backend or None,
-            "slots": {n: {"needed": needed, "there": t} for n, (needed, t) in self.slots.items()},
-            "memory": {"needed": self.memory_needed, "there": self.memory or None},
-            "disk": {
-                "parts": self.parts,
-                "result": self.result,
-                "free": self.free,
-                "folder": str(self.out),
-            },
-        }
-
-
-def forecast(job: Job, pool: PoolSection, out: Path, client: Client | None = None) -> Forecast:
+def forecast(
+    job: Job, pool: PoolSection, out: Path, client: Client | None = None
+) -> dict[str, Any]:
     """Find out what a run would do and take, and whether it can.
 
     Parameters
@@ -144,23 +80,67 @@ def forecast(job: Job, pool: PoolSection, out: Path, client: Client | None = Non
         Sizes of a cluster on this machine, which is not started.
     client
         Client of the cluster to run on instead.
+
+    Returns
+    -------
+    dict
+        Plain data for JSON, sizes in bytes. `reasons` say why it cannot run, each with what to
+        do. `memory` is of all processes on this machine, or, on another cluster, of a GPU worker.
     """
-    made = Forecast(job, out)
+    reasons, notes = _look_at_folder(out)
+    slots = _slots(job, pool, client)
+    backend, memory = None, MEMORY_LIMIT
     try:
         if client is None:
-            _look_here(made, pool)
+            backend = _backend_here(job.backend)
         else:
-            _look_there(made, client)
+            planning = job.planning is not None
+            _, casting, backend = find_workers(client, job.collectors, planning, job.backend)
+            memory = min((worker.memory for worker in casting if worker.memory), default=0)
+            if not any(worker.gpus for worker in casting):
+                notes.append(f"no GPU in partition GPU: CPU workers cast the rays with {backend}")
     except (LidarpoolError, PoolError) as error:
-        made.reasons.append(str(error))
-    _look_at_folder(made)
+        reasons.append(str(error))
+    sample = None
     # Casting here takes what it takes on a worker: it would be refused, or killed.
     if _worker_bytes(job) <= MEMORY_LIMIT:
-        made.sample = sample_survey(job.scene, job.survey)
-        if not made.sample.hits:
-            made.notes.append(NO_HITS)
-    _reckon(made, alone=client is None)
-    return made
+        sample = sample_survey(job.scene, job.survey)
+        if not sample.hits:
+            notes.append(NO_HITS)
+    # Without a sample every ray may hit.
+    points = sample.points if sample else job.survey.ray_count // job.survey.keep_every
+    needed = _worker_bytes(job) if client else _machine_bytes(job, points, slots)
+    parts, result = _disk_bytes(job, points)
+    free = shutil.disk_usage(_existing(out)).free
+    if free < parts + result:
+        reasons.append(
+            f"The disk of {out} has {format_bytes(free)} free and the run needs about "
+            f"{format_bytes(parts + result)}: make room, name another folder with --out, or take "
+            "a larger keep_every."
+        )
+    if memory and memory < needed:
+        reasons.append(
+            f"There are {format_bytes(memory)} of memory and the run needs about "
+            f"{format_bytes(needed)}: take a smaller scene, fewer workers (pool.gpu), "
+            "rays_per_revolution or planning.particles, or a machine with more."
+        )
+    return {
+        "can_run": not reasons,
+        "reasons": reasons,
+        "notes": notes,
+        "objects": len(job.scene.names),
+        "triangles": len(job.scene.faces),
+        "bounds": (job.scene.bounds + job.scene.origin).tolist(),
+        "poses": job.survey.path.stations,
+        "scans": job.survey.scan_count,
+        "rays": job.survey.ray_count,
+        "estimate": asdict(sample) if sample else None,
+        "trials": job.trials,
+        "backend": backend,
+        "slots": slots,
+        "memory": {"needed": needed, "there": memory or None},
+        "disk": {"parts": parts, "result": result, "free": free, "folder": str(out)},
+    }
 
 
 def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> Sample:
@@ -177,49 +157,44 @@ def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> Sample
     return Sample(rays, round(hits * share), round(points * share))
 
 
-def _look_here(made: Forecast, pool: PoolSection) -> None:
-    """Find out what a cluster of this machine would have."""
-    needed = slots_needed(made.job.collectors, made.job.planning is not None)
-    workers = default_workers(usable_cores(), len(visible_gpus()))
-    there = {GPU: pool.gpu or workers[GPU], OTHER: pool.other or workers[OTHER]}
-    there[LIDAR] = needed[LIDAR]  # one worker with as many threads
-    made.slots = {name: (needed[name], there[name]) for name in needed}
-    made.memory = MEMORY_LIMIT
-    wanted = made.job.backend
+def _slots(job: Job, pool: PoolSection, client: Client | None) -> dict[str, dict[str, int]]:
+    """Slots of each partition: those needed, and those that there are or would be here."""
+    needed = slots_needed(job.collectors, job.planning is not None)
+    if client is not None:
+        everybody = Pool.from_client(client)
+        there = {n: int(sum(w.resources.get(n, 0) for w in everybody)) for n in needed}
+    else:
+        workers = default_workers(usable_cores(), len(visible_gpus()))
+        there = {GPU: pool.gpu or workers[GPU], OTHER: pool.other or workers[OTHER]}
+        there[LIDAR] = needed[LIDAR]  # one worker with as many threads
+    return {name: {"needed": needed[name], "there": there[name]} for name in needed}
+
+
+def _backend_here(wanted: str) -> str:
+    """Ray-casting backend that stage 2 would use on this machine."""
     check_backend_here(wanted)
     usable = (name for name, reason in available_backends().items() if not reason)
-    made.backend = next(usable) if wanted == "auto" else wanted
+    return next(usable) if wanted == "auto" else wanted
 
 
-def _look_there(made: Forecast, client: Client) -> None:
-    """Find out what a cluster has that is running already."""
-    job, planning = made.job, made.job.planning is not None
-    everybody = Pool.from_client(client)
-    for name, needed in slots_needed(job.collectors, planning).items():
-        made.slots[name] = needed, int(sum(w.resources.get(name, 0) for w in everybody))
-    _, casting, made.backend = find_workers(client, job.collectors, planning, job.backend)
-    made.memory = min((worker.memory for worker in casting if worker.memory), default=0)
-    if not any(worker.gpus for worker in casting):
-        made.notes.append(f"no GPU in partition GPU: CPU workers cast the rays with {made.backend}")
+def _existing(out: Path) -> Path:
+    """Return the folder itself, or the innermost around it that is there."""
+    return next(path for path in (out, *out.absolute().parents) if path.exists())
 
 
-def _look_at_folder(made: Forecast) -> None:
-    """See whether the result can go there; nothing is made or changed."""
-    there = next(path for path in (made.out, *made.out.absolute().parents) if path.exists())
-    made.free = shutil.disk_usage(there).free
+def _look_at_folder(out: Path) -> tuple[list[str], list[str]]:
+    """Return reasons why the result cannot go there, and notes; nothing is made or changed."""
+    reasons, there = [], _existing(out)
     if not there.is_dir():
-        made.reasons.append(f"{there} is a file: give a folder for the results with --out.")
+        reasons.append(f"{there} is a file: give a folder for the results with --out.")
     elif not os.access(there, os.W_OK | os.X_OK):
-        made.reasons.append(f"Cannot write to the folder {there}: give another with --out.")
-    elif obstacle := folder_in_the_way(made.out):
-        made.reasons.append(obstacle)
-    for part in made.out.absolute().relative_to(there.absolute()).parts:
-        with suppress(FileNotFoundError, NotADirectoryError):
-            os.lstat(there / part)  # OSError for a name that no folder of that disk can have
-    if (made.out / RUN_FOLDER / FILE).exists():
-        made.notes.append(
-            f"{made.out} holds an unfinished run: --resume goes on with it, --fresh drops it"
-        )
+        reasons.append(f"Cannot write to the folder {there}: give another with --out.")
+    elif obstacle := folder_in_the_way(out):
+        reasons.append(obstacle)
+    if not (out / RUN_FOLDER / FILE).exists():
+        return reasons, []
+    note = f"{out} holds an unfinished run: --resume goes on with it, --fresh drops it"
+    return reasons, [note]
 
 
 def _worker_bytes(job: Job) -> int:
@@ -229,38 +204,28 @@ def _worker_bytes(job: Job) -> int:
     return PROCESS_BYTES + triangles + RAY_BYTES * rays
 
 
-def _reckon(made: Forecast, alone: bool) -> None:
-    """Compare what a run takes of memory and disk, about, with what there is.
+def _machine_bytes(job: Job, points: int, slots: dict[str, dict[str, int]]) -> int:
+    """Memory of all workers and of the driver, on one machine."""
+    swarm = job.planning.particles * job.planning.waypoints if job.planning else 0
+    other = PROCESS_BYTES + PARTICLE_BYTES * swarm
+    piece = 6 * (_point_bytes(job) + 24) * min(points, CHUNK_POINTS)  # merged, written, read back
+    driver = 2 * SCENE_BYTES * len(job.scene.faces) + SCAN_BYTES * job.survey.scan_count + piece
+    workers = _worker_bytes(job) * slots[GPU]["there"]
+    if OTHER in slots:
+        workers += other * slots[OTHER]["there"]
+    return workers + driver + 2 * PROCESS_BYTES  # of LIDAR and the driver
 
-    `alone` says that workers and driver share this machine.
-    """
-    job, survey, faces = made.job, made.job.survey, len(made.job.scene.faces)
-    # Without a sample every ray may hit.
-    points = made.sample.points if made.sample else survey.ray_count // survey.keep_every
-    point = sum(np.dtype(column.dtype).itemsize for column in survey.stored_columns)
+
+def _disk_bytes(job: Job, points: int) -> tuple[int, int]:
+    """Disk that parts and database take meanwhile, and that the result takes."""
+    survey, faces, point = job.survey, len(job.scene.faces), _point_bytes(job)
     parts = min(survey.scan_count, max(16, survey.ray_count // BATCH_RAYS + 1))
     tally = 12 * min(faces, BATCH_RAYS // 10)  # names each triangle that the rays of a part hit
-    made.parts = point * points + (PART_BYTES + tally) * parts + SUMMARY_BYTES * survey.scan_count
+    run = point * points + (PART_BYTES + tally) * parts + SUMMARY_BYTES * survey.scan_count
     # A row of the PLY has doubles for the coordinates at most; a piece of it is there twice.
-    made.result = (point + 16) * (points + min(points, CHUNK_POINTS)) + ROOM_BYTES + 36 * faces
-    made.memory_needed = _worker_bytes(job)
-    if alone:
-        swarm = job.planning.particles * job.planning.waypoints if job.planning else 0
-        other = PROCESS_BYTES + PARTICLE_BYTES * swarm
-        piece = 6 * (point + 24) * min(points, CHUNK_POINTS)  # merged, written and read back
-        driver = 2 * SCENE_BYTES * faces + SCAN_BYTES * survey.scan_count + piece
-        made.memory_needed *= made.slots[GPU][1]
-        made.memory_needed += other * made.slots.get(OTHER, (0, 0))[1] + driver
-        made.memory_needed += 2 * PROCESS_BYTES  # of LIDAR and the driver
-    if made.free < made.parts + made.result:
-        made.reasons.append(
-            f"The disk of {made.out} has {format_bytes(made.free)} free and the run needs about "
-            f"{format_bytes(made.parts + made.result)}: make room, name another folder with "
-            "--out, or take a larger keep_every."
-        )
-    if made.memory and made.memory < made.memory_needed:
-        made.reasons.append(
-            f"There are {format_bytes(made.memory)} of memory and the run needs about "
-            f"{format_bytes(made.memory_needed)}: take a smaller scene, fewer workers (pool.gpu), "
-            "rays_per_revolution or planning.particles, or a machine with more."
-        )
+    cloud = (point + 16) * (points + min(points, CHUNK_POINTS))
+    return run, cloud + ROOM_BYTES + 36 * faces
+
+
+def _point_bytes(job: Job) -> int:
+    return sum(np.dtype(column.dtype).itemsize for column in job.survey.stored_columns)

@@ -10,11 +10,9 @@ import click
 
 from ..base.errors import LidarpoolError
 from ..scenario.schema import SCHEMA_FILE, schema_text
-from ..scenario.template import scenario_template
+from ..scenario.template import SCENARIO_FILE, scenario_template
 from ..scene.meshfile import SUFFIXES
 from ..scene.transform import UNITS_M, UP_AXES
-
-SCENARIO_FILE = "scenario.yaml"
 
 
 @click.command()
@@ -53,12 +51,11 @@ def init(folder: Path, meshes: tuple[Path, ...], unit: str | None, up_axis: str 
     if not meshes and (unit or up_axis):
         raise click.UsageError("--unit and --up-axis say how to read a mesh: name it with --mesh.")
     target = folder / SCENARIO_FILE
-    commands = tuple(f"lidarpool {verb} {SCENARIO_FILE}" for verb in ("check", "run"))
     entries = [_entry(path, folder, unit, up_axis) for path in meshes]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with target.open("x", encoding="utf-8", newline="\n") as file:
-            file.write(scenario_template(commands, SCHEMA_FILE, entries))
+            file.write(scenario_template(entries))
         (folder / SCHEMA_FILE).write_text(schema_text(), encoding="utf-8", newline="\n")
     except FileExistsError as error:
         raise LidarpoolError(

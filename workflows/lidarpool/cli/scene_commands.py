@@ -4,26 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import click
 
 from poolpart.wording import counted
 
 from ..scene.scene import Scene
-
-_out = click.argument("out", type=click.Path(path_type=Path), metavar="OUT.ply|.glb|.obj")
-
-
-def _triangles(default: int) -> Callable[[Any], Any]:
-    return click.option(
-        "--triangles", type=int, default=default, show_default=True, help="About how many."
-    )
-
-
-_seed = click.option(
-    "--seed", type=int, default=0, show_default=True, help="The same seed gives the same scene."
-)
+from .options import Command
 
 
 @click.group(name="scene")
@@ -31,10 +18,23 @@ def scene() -> None:
     """Make scenes to survey, as mesh files."""
 
 
-@scene.command()
-@_out
-@_triangles(100_000)
-@_seed
+def _made(triangles: int) -> Callable[[Command], Command]:
+    """Add a file to write, about how many triangles, and a seed."""
+
+    def add(command: Command) -> Command:
+        for option in (
+            click.option("--seed", default=0, help="The same seed gives the same scene."),
+            click.option("--triangles", default=triangles, help="About how many."),
+            click.argument("out", type=click.Path(path_type=Path), metavar="OUT.ply|.glb|.obj"),
+        ):
+            command = option(command)
+        return command
+
+    return add
+
+
+@scene.command(context_settings={"show_default": True})
+@_made(triangles=100_000)
 def city(out: Path, triangles: int, seed: int) -> None:
     """Make a city: streets, houses, towers, trees, cars; more triangles make it larger.
 
@@ -48,13 +48,9 @@ def city(out: Path, triangles: int, seed: int) -> None:
     _write(out, lambda: make(triangles, seed))
 
 
-@scene.command()
-@_out
-@_triangles(2_000_000)
-@_seed
-@click.option(
-    "--side", type=float, default=1000.0, show_default=True, help="Length of a side in metres."
-)
+@scene.command(context_settings={"show_default": True})
+@_made(triangles=2_000_000)
+@click.option("--side", default=1000.0, help="Length of a side in metres.")
 def terrain(out: Path, triangles: int, seed: int, side: float) -> None:
     """Make a square of hills and mountains; more triangles make it finer.
 
@@ -74,10 +70,8 @@ def _write(out: Path, make: Callable[[], Scene]) -> None:
     check_target(out)
     made = make()
     write_scene(out, made)
-    objects = len(made.names)
     low, high = made.bounds
-    size = " x ".join(f"{length:.0f}" for length in high - low)
     click.echo(
-        f"{len(made.faces):,} triangles, {counted(objects, 'object')}, {size} m: "
-        f"{click.format_filename(out)}"
+        f"{len(made.faces):,} triangles, {counted(len(made.names), 'object')}, "
+        f"{' x '.join(f'{length:.0f}' for length in high - low)} m: {click.format_filename(out)}"
     )

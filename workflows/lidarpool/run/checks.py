@@ -34,13 +34,6 @@ def slots_needed(collectors: int, planning: bool) -> dict[str, int]:
     return {GPU: 1, LIDAR: 2 + collectors} | ({OTHER: 1} if planning else {})
 
 
-def check_counts(**counts: int | None) -> None:
-    """Check that numbers of tasks or workers are at least 1, or None; LidarpoolError if not."""
-    for name, count in counts.items():
-        if count is not None and count < 1:
-            raise LidarpoolError(f"{name} is {count}; it must be at least 1.")
-
-
 def check_precision(scene: Scene, survey: Survey) -> None:
     """Check that the scene spans few enough cells of the cloud's precision to be numbered."""
     reach = float(np.abs(scene.vertices).max(initial=0.0))

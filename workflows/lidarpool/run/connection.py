@@ -90,7 +90,12 @@ def connected(scheduler: str, files: TlsFiles | None = None) -> Iterator[Client]
         If no scheduler answers at this address, or the certificates do not do.
     """
     try:
-        security = _security(files) if files and any(files) else Security()
+        security = Security()
+        if files and any(files):
+            ca, cert, key = (path and str(path) for path in files)
+            security = Security(
+                require_encryption=True, tls_ca_file=ca, tls_client_cert=cert, tls_client_key=key
+            )
         asyncio.run(asyncio.wait_for(_knock(scheduler, security), CONNECT_TIMEOUT_S))
         client = Client(
             scheduler, security=security, timeout=CONNECT_TIMEOUT_S, set_as_default=False
@@ -108,13 +113,6 @@ def connected(scheduler: str, files: TlsFiles | None = None) -> Iterator[Client]
         ) from error
     with client:
         yield client
-
-
-def _security(files: TlsFiles) -> Security:
-    ca, cert, key = (None if path is None else str(path) for path in files)
-    return Security(
-        require_encryption=True, tls_ca_file=ca, tls_client_cert=cert, tls_client_key=key
-    )
 
 
 async def _knock(address: str, security: Security) -> None:

@@ -121,11 +121,6 @@ class RunDatabase:
         table = np.array(found, np.int64).reshape(-1, 2, 3)
         return np.stack([table[:, 0].min(axis=0), table[:, 1].max(axis=0)])
 
-    @property
-    def parts_done(self) -> int:
-        """Parts that are committed."""
-        return len(self.parts)
-
     def unframed(self) -> list[Receipt]:
         """Parts that hold scans which were not handed out as frames, in order."""
         at = max(0, bisect.bisect_right(self._firsts, self.frames) - 1)

@@ -11,7 +11,7 @@ from ..scan.watch import PATIENCE_S, WAIT_S
 from ..scenario.scenario import Scenario
 from ..scene.scene import Scene
 from ..sensor import Survey
-from .checks import check_counts, check_precision
+from .checks import check_precision
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,10 +50,12 @@ class Job:
 
     def __post_init__(self) -> None:
         check_precision(self.scene, self.survey)
-        check_counts(queue_capacity=self.queue_capacity, collectors=self.collectors)
-        for name in ("wait_s", "patience_s"):
-            if not getattr(self, name) >= 0:
-                raise LidarpoolError(f"{name} is {getattr(self, name)}; it must be 0 or more.")
+        limits = {"queue_capacity": 1, "collectors": 1, "wait_s": 0, "patience_s": 0}
+        for name, least in limits.items():
+            if not getattr(self, name) >= least:  # nor NaN
+                raise LidarpoolError(
+                    f"{name} is {getattr(self, name)}; it must be at least {least}."
+                )
 
     @property
     def trials(self) -> int:

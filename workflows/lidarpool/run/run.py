@@ -81,7 +81,7 @@ class Run:
         job = store.job
         self.client, self.job, self.store = client, job, store
         self._wants_pause, self._tell = wants_pause, tell
-        self._paused_s, self._paused_at = 0.0, 0.0  # seconds in all; since when, 0 for not
+        self._stood = False  # whether it stood still, paused, at the last look
         # For when it is lost; a client that was never connected is refused in a moment.
         self.address: str = getattr(client.scheduler, "address", "")
         try:
@@ -152,8 +152,6 @@ class Run:
             raise
         self.store.db.save_frames()
         self.store.tidy()
-        if self._paused_s >= 1:
-            self.notes.append(f"the run was paused for {self._paused_s:.0f} s, in its times too")
         return make_result(
             self.store,
             [survey.book, *([trials.book] if trials else [])],
@@ -246,12 +244,10 @@ class Run:
         wanted = self._wants_pause()
         for pump in pumps:
             pump.paused = wanted
-        still, now = wanted and all(pump.idle for pump in pumps), time.monotonic()
-        if still and not self._paused_at:
-            self._paused_at = now
+        still = wanted and all(pump.idle for pump in pumps)
+        if still and not self._stood:
             self.store.db.save_frames()
-        elif not still and self._paused_at:
-            self._paused_s, self._paused_at = self._paused_s + now - self._paused_at, 0.0
+        self._stood = still
         return still
 
     def _progress(

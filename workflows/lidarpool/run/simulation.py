@@ -13,7 +13,7 @@ from ..scan import Frame
 from ..scan.watch import PATIENCE_S, WAIT_S
 from ..scene.scene import Scene
 from ..sensor import Survey
-from .checks import check_backend_here, check_counts
+from .checks import check_backend_here
 from .connection import local_client
 from .job import Job
 from .progress import Progress
@@ -116,7 +116,6 @@ def simulate(
         wait_s,
         patience_s,
     )
-    check_counts(gpu_workers=gpu_workers, other_workers=other_workers)
     if client is None:
         check_backend_here(backend)
     store = RunStore(job, None if folder is None else Path(folder), parts, resume=resume)

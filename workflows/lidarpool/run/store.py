@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.choice import one_of_each_part
 from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud
 from ..columns.parts import SUFFIX, StoredCloud, read_part, read_tally
@@ -32,7 +31,6 @@ from .progress import Progress
 PARTS = "parts"  # the folder of the parts, in the run's folder
 RUN_FOLDER = "run"  # the run's folder in that of the output, until the result is whole
 SAMPLE_RAYS = 400  # of the pictures
-TALLIED_PARTS = 2000  # read for the hits of each triangle; of more, an even choice
 
 # On the command line, and in Python.
 _RESUME = "--resume (in Python resume=True)"
@@ -239,16 +237,11 @@ class RunStore:
         return self.points().cloud_of(columns, rows)
 
     def hit_counts(self) -> NDArray[np.int64]:
-        """Hits of each triangle, (f,): of all parts, or scaled up from an even choice of many."""
+        """Hits of each triangle, (f,)."""
         counts = np.zeros(len(self.job.scene.faces), np.int64)
-        parts = self.db.ordered
-        chosen = [parts[i] for i in one_of_each_part(len(parts), TALLIED_PARTS)]
-        for part in chosen:
+        for part in self.db.ordered:
             triangles, hits = read_tally(self.storage, part.name)
             counts[triangles] += hits
-        seen = sum(part.hits for part in chosen)
-        if seen and len(chosen) < len(parts):
-            counts = np.rint(counts * (self.db.hits / seen)).astype(np.int64)
         return counts
 
     def sample_rays(self) -> NDArray[np.float32]:

@@ -13,7 +13,7 @@ from poolpart import Partition, fetch_available, look_for_tasks, recorded
 
 from ..base.errors import LidarpoolError
 from ..base.task_book import TaskBook
-from ..plan import Plan, Planning, Trial, best, run_trial
+from ..plan import Planning, Trial, run_trial
 from ..scan.failures import was_killed
 
 TRIAL = "trial"
@@ -135,8 +135,3 @@ class TrialPump:
     def finish(self) -> None:
         """Let go of everything on the scheduler."""
         self._running.clear()
-
-    def plan(self) -> Plan:
-        """Best plan of all trials, whatever order they ended in."""
-        self.trials.sort(key=lambda trial: trial.trial)
-        return best(self.trials, self.planning)

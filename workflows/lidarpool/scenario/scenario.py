@@ -36,7 +36,6 @@ from .sections import (
 from .validation_errors import validation_error
 from .yamlfile import read_yaml
 
-SCAN_LIMIT = 10_000_000
 # Of the objects, those lower than this are floors and markings, which a path may cross.
 FLAT_M = 0.2
 
@@ -95,10 +94,7 @@ class Scenario(Section):
     _notes: list[str] = PrivateAttr(default_factory=list)  # of what was left out of the scene
 
     @model_validator(mode="after")
-    def _bounded(self) -> Scenario:
-        scans = len(self.poses or _HEIGHTS_M) * self.steps
-        if scans > SCAN_LIMIT:
-            raise ValueError(f"poses times steps makes {scans:,} scans; at most {SCAN_LIMIT:,}.")
+    def _both_ends(self) -> Scenario:
         missing = [self.planning.start, self.planning.target].count(None)
         if self.planning.enabled and not self.scene.has_seed and missing:
             raise ValueError("planning is enabled: give planning.start and planning.target.")

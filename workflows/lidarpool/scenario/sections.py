@@ -13,9 +13,6 @@ from ..scene.transform import Transform
 from ..sensor import Sensor
 from ..sensor.models import load_sensor
 
-# Their directions take 2.4 GB; real lidars have five million.
-RAY_LIMIT = 100_000_000
-
 BACKENDS = ("auto", "cuda", "embree", "numpy")
 COLUMN_NAMES = tuple(column.in_files for column in OPTIONAL)
 
@@ -219,13 +216,7 @@ class SensorSection(Section):
     ] = None
 
     @model_validator(mode="after")
-    def _bounded(self) -> SensorSection:
-        rays = self.rays_per_revolution * self.layers
-        if rays > RAY_LIMIT:
-            raise ValueError(
-                f"rays_per_revolution times layers is {rays:,}; at most {RAY_LIMIT:,} rays make "
-                "a revolution."
-            )
+    def _one_source(self) -> SensorSection:
         own = [name for name in ("model", "calibration") if getattr(self, name) is not None]
         # Defaults that `lidarpool init` has written out are in nobody's way.
         grid = [name for name in _GRID if getattr(self, name) != _GRID[name]]

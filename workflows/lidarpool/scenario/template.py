@@ -11,38 +11,33 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from .scenario import Scenario
+from .schema import SCHEMA_FILE
+
+SCENARIO_FILE = "scenario.yaml"
 
 _WIDTH = 100
 _COMMENT_AT = 30  # column of the comments that stand beside a field
 
-_HEAD = """\
+_HEAD = f"""\
+# yaml-language-server: $schema={SCHEMA_FILE}
 # A lidar survey for lidarpool, and a path planned beside it. All of it written out: every line
 # may be left out, and this is what it is then. Lines that begin with "# " and a name show what
 # may be given instead of what lidarpool chooses. Lengths are in metres, angles in degrees, Z is up.
+#
+#     lidarpool check {SCENARIO_FILE}
+#     lidarpool run {SCENARIO_FILE}
 """
 
 
-def scenario_template(
-    commands: tuple[str, ...] = (),
-    schema: str | None = None,
-    files: Sequence[str | dict[str, str]] = (),
-) -> str:
+def scenario_template(files: Sequence[dict[str, str]] = ()) -> str:
     """Return a commented scenario in YAML that holds all defaults.
 
     Parameters
     ----------
-    commands
-        What to do with it, for its head.
-    schema
-        Name of the JSON Schema beside it, which editors then use; None for none.
     files
         Mesh files to begin with, as in `scene.files`.
     """
-    # Only a comment's first line is looked at by editors.
-    lines = [f"# yaml-language-server: $schema={schema}\n"] if schema else []
-    lines.append(_HEAD)
-    if commands:
-        lines += ["#\n", *(f"#     {command}\n" for command in commands)]
+    lines = [_HEAD]
     for name, field in Scenario.model_fields.items():
         given = {"files": list(files)} if name == "scene" and files else {}
         lines += ["\n", *(f"{line}\n" for line in _top(name, field, given))]
