@@ -60,7 +60,7 @@ def plain(client: Client, work: Job) -> float:
 
 def watched(client: Client, work: Job) -> tuple[float, int]:
     """Seconds of a survey with a page that somebody looks at, and bytes that were sent."""
-    with live_run(work, port=0, browser=False) as live, _looking(live) as taken:
+    with live_run(work, port=0, browser=False) as live, looking(live.page.url) as taken:
         store = RunStore(work)
         live.follow(store)
         run = Run(client, store)
@@ -71,11 +71,11 @@ def watched(client: Client, work: Job) -> tuple[float, int]:
 
 
 @contextmanager
-def _looking(live: Any) -> Iterator[list[int]]:
-    """Take what the page sends, as a browser would; gives the sizes of the messages."""
+def looking(url: str) -> Iterator[list[int]]:
+    """Take what a page sends, as a browser would; gives the sizes of the messages."""
     taken: list[int] = []
     version = Subprotocol(f"viser-v{viser.__version__}")
-    address = live.page.url.replace("http", "ws")
+    address = url.replace("http", "ws", 1)
     with connect(address, subprotocols=[version], max_size=None, compression=None) as socket:
         socket.send(msgspec.msgpack.encode(CAMERA))  # or nobody looks yet
 

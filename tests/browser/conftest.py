@@ -35,8 +35,6 @@ OPTIONS = (
     "--remote-debugging-port=0",
 )
 
-_ATTACH = {"autoAttach": True, "waitForDebuggerOnStart": True, "flatten": True}
-
 
 @dataclass(frozen=True)
 class Browser:
@@ -56,8 +54,6 @@ class Tab:
         self.errors: list[str] = []  # of the console, and exceptions
         for domain in ("Page", "Network", "Runtime", "Log"):
             self.call(f"{domain}.enable")
-        # Workers have requests of their own; they wait until these are listened to as well.
-        self.call("Target.setAutoAttach", **_ATTACH)
 
     def call(self, method: str, **params):
         """Ask the browser something; its events that come meanwhile are noted."""
@@ -71,24 +67,9 @@ class Tab:
             if "method" in message:
                 self._note(message["method"], message["params"])
 
-    def _listen(self, session: str) -> None:
-        """Hear what a worker does, and let it begin."""
-        for method, params in (
-            ("Network.enable", {}),
-            ("Runtime.enable", {}),
-            ("Target.setAutoAttach", _ATTACH),
-            ("Runtime.runIfWaitingForDebugger", {}),
-        ):
-            message = {"id": next(self._numbers), "method": method, "params": params}
-            self._socket.send(json.dumps(message | {"sessionId": session}))
-
     def _note(self, method: str, params: dict) -> None:
-        if method == "Target.attachedToTarget":
-            self._listen(params["sessionId"])
-        elif method == "Network.requestWillBeSent":
+        if method == "Network.requestWillBeSent":
             self.requests.append(params["request"]["url"])
-        elif method == "Network.webSocketCreated":
-            self.requests.append(params["url"])
         elif method == "Runtime.exceptionThrown":
             self.errors.append(json.dumps(params["exceptionDetails"]))
         elif method == "Runtime.consoleAPICalled" and params["type"] == "error":

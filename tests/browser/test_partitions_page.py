@@ -117,17 +117,10 @@ def page(new_tab, tmp_path):
     return show
 
 
-def test_each_task_has_a_lane_to_itself_and_keeps_it(page):
+@pytest.mark.parametrize("begin", [0.0, 29.0])  # whoever comes late is told all at once
+def test_each_task_has_a_lane_to_itself_and_keeps_it(page, begin):
     workers = {"one": ("A", 1), "four": ("B", 4), "sixteen": ("C", 16)}
-    tab = page(Cluster(workers, 30, 3.0), 30)
-    faults = tab.value(FAULTS)
-    assert faults.pop("tasks") > 300
-    assert faults == {"overlaps": 0, "beyond": 0}
-
-
-def test_whoever_comes_late_sees_lanes_as_well(page):
-    """All that has been is told at once."""
-    tab = page(Cluster({"four": ("B", 4), "sixteen": ("C", 16)}, 30, 3.0), 30, begin=29.0)
+    tab = page(Cluster(workers, 30, 3.0), 30, begin)
     faults = tab.value(FAULTS)
     assert faults.pop("tasks") > 300
     assert faults == {"overlaps": 0, "beyond": 0}

@@ -11,6 +11,7 @@ from importlib.metadata import version
 import msgspec
 import pytest
 import zstandard
+from benchmarks.live import CAMERA
 from websockets.exceptions import ConnectionClosed
 from websockets.frames import OP_BINARY, Frame
 from websockets.sync.client import connect
@@ -30,19 +31,6 @@ STRANGERS = [
     "",
 ]
 OWN = ["http://127.0.0.1:8080", "http://localhost:18080", "https://LOCALHOST", "http://[::1]:80"]
-# The first word of a browser to viser: where its camera is.
-CAMERA = {
-    "type": "ViewerCameraMessage",
-    "wxyz": [1.0, 0.0, 0.0, 0.0],
-    "position": [40.0, -40.0, 30.0],
-    "fov": 0.8,
-    "near": 0.1,
-    "far": 1000.0,
-    "image_height": 800,
-    "image_width": 1280,
-    "look_at": [0.0, 0.0, 0.0],
-    "up_direction": [0.0, 0.0, 1.0],
-}
 PROTOCOL = f"viser-v{version('viser')}"
 
 

@@ -3,19 +3,13 @@
 import re
 import subprocess
 import sys
-import threading
 import time
-from contextlib import contextmanager, suppress
 from dataclasses import replace
-from importlib.metadata import version
 
-import msgspec
 import numpy as np
 import pytest
 import trimesh
-from tests.lidarpool.test_live_page import CAMERA
-from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import connect
+from benchmarks.live import looking
 
 from lidarpool import Column, LidarpoolError, Planning, Scene, Sensor, Survey
 from lidarpool.columns.parts import PartColumns, pack
@@ -71,24 +65,6 @@ def commit(store: RunStore, first: int, count: int, triangle=7, **more) -> None:
     new = store.db.commit([receipt])
     if store.on_parts:
         store.on_parts(new)
-
-
-@contextmanager
-def looked_at(live: LiveRun):
-    """Have somebody look at a page: whatever is drawn is drawn for them."""
-    url, protocol = live.page.url.replace("http", "ws", 1), f"viser-v{version('viser')}"
-    with connect(url, subprotocols=[protocol], max_size=None, compression=None) as socket:
-        socket.send(msgspec.msgpack.encode(CAMERA))
-
-        def take():
-            with suppress(ConnectionClosed):
-                for _ in socket:
-                    pass
-
-        thread = threading.Thread(target=take)
-        thread.start()
-        yield
-    thread.join(LONG_S)
 
 
 def panel(live: LiveRun) -> str:
@@ -192,7 +168,7 @@ def test_what_comes_while_somebody_looks_is_drawn_and_the_last_picture_is_whole(
         commit(store, 0, 10)
         time.sleep(0.1)
         assert displayed(live) == 0  # for whom?
-        with looked_at(live):
+        with looking(live.page.url):
             wait_for(lambda: displayed(live) == 10)
             for scan in range(1, 200):
                 commit(store, scan, 10)
@@ -215,7 +191,7 @@ def test_a_resumed_run_shows_what_the_earlier_one_has_left(tmp_path):
         commit(first, scan, 10)
     first.db.close()
     store = RunStore(job, tmp_path / "run", resume=True)
-    with live_run(job, port=0, browser=False) as live, looked_at(live):
+    with live_run(job, port=0, browser=False) as live, looking(live.page.url):
         live.follow(store)
         # Before there is a cluster, what is left of the first is there to see.
         wait_for(lambda: "600 points" in panel(live) and "60 / 100" in panel(live))
@@ -253,7 +229,7 @@ def test_a_run_is_watched_from_its_first_part_to_its_path():
     with (
         local_client(gpu_workers=1, collectors=2, other_workers=1) as client,
         live_run(job, port=0, browser=False) as live,
-        looked_at(live),
+        looking(live.page.url),
     ):
         store = RunStore(job)
         live.follow(store)

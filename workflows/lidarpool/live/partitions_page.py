@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
@@ -12,8 +11,6 @@ from distributed import Client
 from poolpart import has_partitions_page, partitions_page, remove_partitions_page, tell_page
 
 from ..run.progress import Progress, Show
-
-TELL_EVERY_S = 0.5
 
 
 @contextmanager
@@ -28,15 +25,10 @@ def shown_on_page(client: Client, wanted: bool, show: Show) -> Iterator[Show]:
         return
     found = has_partitions_page(client)
     click.echo(f"page of partitions: {partitions_page(client)}", err=True)
-    told = float("-inf")
 
     def tell(progress: Progress) -> None:
-        """Show the progress, and tell the page of it now and then."""
-        nonlocal told
-        if time.monotonic() - told >= TELL_EVERY_S:
-            told = time.monotonic()
-            with suppress(OSError, RuntimeError):  # a lost cluster is for the run to tell of
-                tell_page(client, **totals(progress))
+        with suppress(OSError, RuntimeError):  # a lost cluster is for the run to tell of
+            tell_page(client, **totals(progress))
         show(progress)
 
     try:
