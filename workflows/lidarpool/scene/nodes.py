@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -65,6 +66,7 @@ def instances(roots: Iterable[K], node_of: Callable[[K], Node[K]], stem: str) ->
         If nodes contain each other without end, or some hundred thousand times.
     """
     content = Content([])
+    node_of = cache(node_of)
     places = []
     stack = [(key, np.eye(4), "") for key in reversed(list(roots))]
     while stack:

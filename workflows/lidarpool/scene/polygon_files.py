@@ -12,6 +12,7 @@ import re
 import struct
 from array import array
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -181,7 +182,7 @@ def read_stl(data: bytes, path: Path) -> Content:
         if b"endsolid" not in solid.lower():
             raise MeshFileError("is cut short: it does not end with 'endsolid'")
         words = re.findall(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", body, re.IGNORECASE)
-        vertices = np.array([list(map(float, row)) for row in words]).reshape(-1, 3)
+        vertices = np.array(list(map(float, chain.from_iterable(words)))).reshape(-1, 3)
         if len(vertices) != 3 * len(re.findall(rb"\bendfacet", body, re.IGNORECASE)):
             raise ValueError("a facet is no triangle")
         meshes += _stl_mesh(_text(head.strip()) or path.stem, vertices)

@@ -130,9 +130,9 @@ class _Model:
     def _begin(self, tag: str, attributes: dict[str, str]) -> None:
         tag = tag.rpartition(":")[2]
         if tag == "vertex":
-            self._object.vertices.extend(float(attributes[axis]) for axis in "xyz")
+            self._object.vertices.extend([float(attributes[axis]) for axis in "xyz"])
         elif tag == "triangle":
-            self._object.faces.extend(int(attributes[corner]) for corner in ("v1", "v2", "v3"))
+            self._object.faces.extend([int(attributes[corner]) for corner in ("v1", "v2", "v3")])
         elif tag == "object":
             self._object = _Object(attributes.get("name", ""))
             self.objects[attributes["id"]] = self._object
