@@ -28,12 +28,9 @@ def undisturbed(cluster_client):
     return simulate(Scene.seed(), SURVEY, client=cluster_client).cloud
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("point", "stage"),
-    [
-        ("intersect.cast", "intersect"),
-        pytest.param("collect.part", "collect", marks=pytest.mark.slow),
-    ],
+    ("point", "stage"), [("intersect.cast", "intersect"), ("collect.part", "collect")]
 )
 def test_a_scan_that_kills_its_worker_is_named_and_all_others_are_kept(
     client, sabotage, undisturbed, same_cloud, tmp_path, left_over, point, stage
@@ -88,11 +85,11 @@ def _deadly() -> Callable[[str, bytes], None]:
     return prepare
 
 
-def test_a_worker_that_was_ended_for_its_memory_is_known(client: Client):
-    client.log_event("worker-restart-memory", {"worker": "tcp://127.0.0.1:1", "rss": 1})
-    assert words_on_memory(client, ["tcp://127.0.0.1:2"]) == ""
+def test_a_worker_that_was_ended_for_its_memory_is_known(cluster_client: Client):
+    cluster_client.log_event("worker-restart-memory", {"worker": "tcp://127.0.0.1:1", "rss": 1})
+    assert words_on_memory(cluster_client, ["tcp://127.0.0.1:2"]) == ""
     until = time.monotonic() + 120
-    while not (words := words_on_memory(client, ["tcp://127.0.0.1:1"])):
+    while not (words := words_on_memory(cluster_client, ["tcp://127.0.0.1:1"])):
         assert time.monotonic() < until
     assert "memory" in words
 

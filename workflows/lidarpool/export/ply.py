@@ -159,6 +159,9 @@ def _write(temporary: Path, path: Path, cloud: CloudLike, real: np.dtype[np.floa
     with temporary.open("xb") as file:
         try:
             for chunk in cloud.chunks():
+                # Open3D would print a line for each buffer that it cannot write. There is need for
+                # the piece, and for its copy in the file.
+                _check_room(path, 2 * len(chunk) * row_type(real, cloud.table).itemsize)
                 _write_open3d(piece, _as_held(chunk, real))
                 start = _start_of_rows(piece, path, len(chunk))
                 with piece.open("rb") as written:
@@ -174,6 +177,15 @@ def _write(temporary: Path, path: Path, cloud: CloudLike, real: np.dtype[np.floa
         file.flush()
         os.fsync(file.fileno())
         return file.tell()
+
+
+def _check_room(path: Path, needed: int) -> None:
+    free = shutil.disk_usage(path.parent).free
+    if free < needed:
+        raise LidarpoolError(
+            f"{path} could not be written whole, which takes {needed:,} bytes; the disk has "
+            f"{free:,} bytes free. Make room, or write to another folder."
+        )
 
 
 class _Held(NamedTuple):
