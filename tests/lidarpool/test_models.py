@@ -252,6 +252,7 @@ def test_a_list_of_rays_of_livox(tmp_path):
         5_000_000,
     ]
     assert sensor.firings(35)[1] == 10_000, "a frame of 0.1 s, which begins the list again"
+    assert isinstance(load_sensor("livox/mid40", calibration=tmp_path / "mid40.csv"), ListedSensor)
     numbered = write(tmp_path, "mid360.csv", LIVOX + "1,268.99,37.838\n2,269.99,38\n3,270,39\n")
     sensor = load_sensor("livox/mid360", calibration=numbered)
     assert sensor.times_ns(np.arange(4))[:, 0].tolist() == [0, 5000, 10_000, 15_000]
@@ -289,21 +290,22 @@ VELODYNE = "num_lasers: 2\nlasers: [{laser_id: 0, vert_correction: 0.1, rot_corr
 BAD = {
     "field.yaml": (GOOD + "firing_us: 5\nrage_m: [0, 1]", "rage_m: Extra inputs"),
     "both.yaml": (GOOD + "firing_us: 5\nfirings_per_turn: 5", "either firing_us or"),
-    "kind.yaml": (GOOD + "firing_us: 5\nkind: prisms", "a section prisms goes with"),
+    "mirror.yaml": (GOOD + "firing_us: 5\nmirror: {motion: x, width_deg: 9}", "mirror.motion: Inp"),
     "zero.yaml": (GOOD + "firing_us: 0\nbeams: {elevation_deg: [0]}", "firing_us: Input should be"),
     "list.yaml": (GOOD + "firing_us: 5\nbeams: {elevation_deg: [0, .nan]}", "finite number"),
     "short.yaml": (GOOD + "firing_us: 5\nbeams: {elevation_deg: [0, 1], time_us: [0]}", "Beams"),
-    "yaml.yaml": ("name: [", "is not YAML"),
-    "empty.csv": ("\n", "is empty"),
+    "even.yaml": (GOOD + "firing_us: 5\nbeams: {elevation_deg: {first: 1}}", "'last' is missing"),
+    "yaml.yaml": ("name: [", "no model that can be used: while parsing"),
+    "empty.csv": ("\n", "it is empty"),
     "prose.csv": ("dear reader\n1,2", "'dear reader', is of no known format"),
     "prose.json": ("{", "Expecting property name"),
     "other.json": ('{"format": 3}', "no beam_altitude_angles"),
     "half.json": ('{"beam_altitude_angles": [1, 2]}', "'beam_azimuth_angles' is missing"),
     "rows.json": ('{"beam_altitude_angles": [1], "beam_azimuth_angles": [1, 2]}', "1 altitude and"),
-    "zeros.json": ('{"beam_altitude_angles": [0], "beam_azimuth_angles": [0]}', "all angles are 0"),
+    "zeros.json": ('{"beam_altitude_angles": [0], "beam_azimuth_angles": [0]}', "beams, not 0"),
     "nan.json": ('{"beam_altitude_angles": [NaN], "beam_azimuth_angles": [0]}', "finite numbers"),
-    "missing.yml": (VELODYNE + "]", "1 lasers of 2: laser 1 is missing"),
-    "twice.yml": (VELODYNE.replace("2", "1", 1) + ", {laser_id: 0}]", "one is there twice"),
+    "missing.yml": (VELODYNE + "]", "lasers 0 to 1 must be there, each once"),
+    "twice.yml": (VELODYNE.replace("2", "1", 1) + ", {laser_id: 0}]", "must be there, each"),
     "key.yml": ("lasers: [{laser_id: 0, vert_correction: 1}]", "'rot_correction' is missing"),
     "lasers.yml": ("scene: seed", "no list of lasers"),
     "text.yml": ("lasers: [{laser_id: 0, vert_correction: x, rot_correction: 1}]", "float: 'x'"),
@@ -313,11 +315,11 @@ BAD = {
     "ragged.csv": ("Channel,Elevation,Azimuth\n1,2,3\n2,4\n", "number of columns changed"),
     "nan.csv": ("Channel,Elevation,Azimuth\n1,2,3\n2,nan,3", "line 3 has numbers that are not"),
     "column.csv": ("elevation_deg,azimut_deg\n1,2", "column 'azimut_deg' is none of"),
-    "plain.csv": ("elevation_deg\n1", "give columns: .* or model:"),
+    "plain.csv": ("elevation_deg\n1", "give model:, or columns: .* as well"),
     "back.csv": (LIVOX + "0,1,2\n2e-5,1,2\n1e-5,1,2\n", "times go back in line 4"),
-    "count.csv": (LIVOX + "1,1,2\n2,1,2\n", "the times of these rays; give model"),
-    "few.csv": (hesai(count=7), "no hesai model has 7 beams like these; give model:"),
-    "binary.csv": (b"\xff\xfe\x00", "is not text"),
+    "count.csv": (LIVOX + "1,1,2\n2,1,2\n", "say when rays are fired: give model: as well"),
+    "few.csv": (hesai(count=7), "is of no known model.* give model: as well"),
+    "binary.csv": (b"\xff\xfe\x00", "codec can't decode"),
 }  # fmt: skip
 
 
@@ -341,12 +343,15 @@ def test_bad_files_are_refused_in_one_line(tmp_path, file, text, message):
         ({"model": "velodyne/vlp16", "rate_hz": 0}, "rate_hz"),
         ({"model": "velodyne/vlp16", "calibration": "xt.csv"}, "32 beams, and Velodyne .* has 16"),
         ({"model": "livox/mid360", "calibration": "xt.csv"}, "does not fit Livox Mid-360"),
-        ({"calibration": "none.csv"}, "none.csv cannot be read: No such file"),
-        ({"model": "none.yaml"}, "none.yaml cannot be read: No such file"),
+        ({"model": "livox/mid40", "calibration": "xt.csv"}, "does not fit Livox Mid-40"),
+        ({"model": "hesai/xt32", "calibration": "rays.csv"}, "does not fit Hesai PandarXT-32"),
+        ({"calibration": "none.csv"}, "none.csv is no calibration .* No such file"),
+        ({"model": "none.yaml"}, "none.yaml is no model .* No such file"),
     ],
 )
 def test_what_does_not_fit_together(tmp_path, options, message):
     write(tmp_path, "xt.csv", hesai())
+    write(tmp_path, "rays.csv", LIVOX + "0,1,2\n1e-5,1,2\n")
     if "calibration" in options:
         options = options | {"calibration": tmp_path / options["calibration"]}
     with pytest.raises(LidarpoolError, match=message):

@@ -164,7 +164,6 @@ class SensorSection(Section):
     model: Annotated[
         str | None,
         Field(
-            min_length=1,
             description="as its maker specifies it, see `lidarpool sensors`; or a .yaml of one's "
             "own, from the scenario's folder",
             examples=["velodyne/vlp16"],
@@ -173,7 +172,6 @@ class SensorSection(Section):
     calibration: Annotated[
         str | None,
         Field(
-            min_length=1,
             description="file of the unit itself: Velodyne, Ouster, Hesai, RoboSense, Livox, or a "
             "table of beams",
             examples=["unit.json"],

@@ -229,17 +229,6 @@ class Mirror(Spin):
     width_deg: float = 60.0
     duty: float = 1.0
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks = (
-            ("motion", self.motion in ("sine", "triangle", "sawtooth"), "sine, triangle, sawtooth"),
-            ("width_deg", 0 < self.width_deg <= 360, "above 0, at most 360"),
-            ("duty", 0 < self.duty <= 1, "above 0, at most 1"),
-        )
-        for name, good, allowed in checks:
-            if not good:
-                raise LidarpoolError(f"{name} is {getattr(self, name)}; it must be {allowed}.")
-
     def times_ns(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
         """See `Head.times_ns`."""
         pause = self._within(firings) * (1 - self.duty)

@@ -63,44 +63,41 @@ def read_calibration(path: Path) -> Calibration:
     """
     try:
         text = path.read_text("utf-8-sig")
-    except OSError as error:
-        raise LidarpoolError(f"{path} cannot be read: {error.strerror}.") from error
-    except UnicodeDecodeError as error:
-        raise LidarpoolError(f"{path} is not text, and so no calibration.") from error
-    if not text.strip():
-        raise LidarpoolError(f"{path} is empty.")
-    try:
+        if not text.strip():
+            raise ValueError("it is empty")
         if path.suffix.lower() in (".yaml", ".yml"):
             return _velodyne(path.name, yaml.safe_load(text))
         if path.suffix.lower() == ".json":
             return _ouster(path.name, json.loads(text))
         return _table(path.name, text)
-    except (yaml.YAMLError, json.JSONDecodeError, ValueError, TypeError, KeyError) as error:
-        words = f"{error} is missing" if isinstance(error, KeyError) else str(error)
-        raise LidarpoolError(f"{path}: {' '.join(words.split())}.") from error
-    except LidarpoolError as error:
-        raise LidarpoolError(f"{path}: {error}") from error
+    except (OSError, ValueError, TypeError, KeyError, yaml.YAMLError, LidarpoolError) as error:
+        raise LidarpoolError(f"{path} is no calibration that can be used: {said(error)}") from error
+
+
+def said(error: Exception) -> str:
+    """Return what an error of a file says, in one line."""
+    words = f"{error} is missing" if isinstance(error, KeyError) else str(error)
+    words = (error.strerror if isinstance(error, OSError) else None) or words
+    return " ".join(words.split()).rstrip(".") + "."
 
 
 def _velodyne(name: str, data: Any) -> Calibration:
     """Beams of Velodyne's YAML; geometry as in ros-drivers/velodyne, rawdata.cc."""
     if not isinstance(data, dict) or not isinstance(data.get("lasers"), list):
         raise ValueError("it has no list of lasers, as Velodyne's calibrations have")
-    lasers = {laser["laser_id"]: laser for laser in data["lasers"]}
-    count = data.get("num_lasers", len(data["lasers"]))
-    missing = sorted(set(range(count)) - set(lasers))
-    if missing or len(data["lasers"]) != count:
-        which = f"laser {missing[0]} is missing" if missing else "one is there twice"
-        raise ValueError(f"it has {len(data['lasers'])} lasers of {count}: {which}")
+    lasers = sorted(data["lasers"], key=lambda laser: laser["laser_id"])
+    count = data.get("num_lasers", len(lasers))
+    if [laser["laser_id"] for laser in lasers] != list(range(count)):
+        raise ValueError(f"lasers 0 to {count - 1} must be there, each once")
     elevation, azimuth, up, left = np.array(
         [
             [
-                float(lasers[number]["vert_correction"]),
-                float(lasers[number]["rot_correction"]),
-                float(lasers[number].get("vert_offset_correction", 0)),
-                float(lasers[number].get("horiz_offset_correction", 0)),
+                float(laser["vert_correction"]),
+                float(laser["rot_correction"]),
+                float(laser.get("vert_offset_correction", 0)),
+                float(laser.get("horiz_offset_correction", 0)),
             ]
-            for number in range(count)
+            for laser in lasers
         ]
     ).T
     # Offsets at right angles to the beam, upwards and to the left of it.
@@ -130,8 +127,6 @@ def _ouster(name: str, data: Any) -> Calibration:
             f"it has {elevation.size} altitude and {azimuth.size} azimuth angles of {rows} beams"
         )
     there = (elevation != 0) | (azimuth != 0)  # older firmware writes zeros for beams it lacks
-    if not there.any():
-        raise ValueError("all angles are 0")
     beam_at = np.reshape(beam.get("beam_to_lidar_transform", np.eye(4)), (4, 4))[:3, 3].copy()
     if "lidar_origin_to_beam_origin_mm" in beam:
         beam_at[0] = beam["lidar_origin_to_beam_origin_mm"]
@@ -156,7 +151,7 @@ def _ouster(name: str, data: Any) -> Calibration:
         head={
             "clockwise": True,
             "zero_deg": 180.0,
-            "firings_per_turn": (columns,),
+            "firings_per_turn": columns,
             "rate_hz": float(rate),
         },
     )
@@ -209,7 +204,7 @@ def _livox(name: str, rows: NDArray[np.float64]) -> Calibration:
         return Calibration(name, "livox", rays=rays)
     shot_ns = (times - times[0]) * 1e9
     every_us = Fraction(float(shot_ns[-1]) / (len(times) - 1) / 1000).limit_denominator(1000)
-    head = {"kind": "list", "firing_us": every_us}
+    head = {"listed": True, "firing_us": every_us}
     return Calibration(name, "livox", rays=rays, shot_ns=shot_ns, head=head)
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from fractions import Fraction
 from functools import cache
-from importlib.resources import as_file, files
+from importlib.resources import files
+from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -16,7 +17,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from ..base.errors import LidarpoolError
 from ..base.words import did_you_mean
 from .beams import Beams, Mirror, Spin
-from .calibrations import Calibration, read_calibration
+from .calibrations import Calibration, read_calibration, said
 from .rays import ListedSensor, PrismSensor
 from .sensor import LineSensor, Sensor
 
@@ -27,18 +28,10 @@ class _Part(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class _Even(_Part):
-    """Numbers evenly spaced, both ends included."""
-
-    first: float
-    last: float
-    count: Annotated[int, Field(ge=1, le=65_535)]
-
-
 def _numbers(value: Any) -> Any:
+    """Take {first, last, count} for numbers evenly spaced, both ends included."""
     if isinstance(value, dict):
-        even = _Even.model_validate(value)
-        return np.linspace(even.first, even.last, even.count).tolist()
+        return np.linspace(value["first"], value["last"], value["count"]).tolist()
     return value
 
 
@@ -79,8 +72,8 @@ class MirrorPart(_Part):
     """See `Mirror`."""
 
     motion: Literal["sine", "triangle", "sawtooth"]
-    width_deg: float
-    duty: float = 1.0
+    width_deg: Annotated[float, Field(gt=0, le=360)]
+    duty: Annotated[float, Field(gt=0, le=1)] = 1.0
 
 
 class PrismPart(_Part):
@@ -98,52 +91,45 @@ class SensorModel(_Part):
 
     name: str
     sources: dict[str, str]
-    kind: Literal["spin", "mirror", "prisms", "list"] = "spin"
     axis: Literal["z", "x"] = "z"
     clockwise: bool = False
     zero_deg: float = 0.0
     firing_us: Annotated[Exact, Field(gt=0)] | None = None
-    firings_per_turn: Annotated[
-        tuple[Annotated[int, Field(gt=0)], ...],
-        BeforeValidator(lambda value: [value] if isinstance(value, int) else value),
-    ] = ()
+    firings_per_turn: Annotated[int, Field(gt=0)] | None = None
     rate_hz: Positive = 10.0
     rates_hz: tuple[Positive, Positive] | None = None
     range_m: tuple[float, float] | None = None
+    beams: BeamTable = BeamTable()
     mirror: MirrorPart | None = None
     prisms: PrismPart | None = None
-    beams: BeamTable = BeamTable()
+    listed: bool = False
 
     @model_validator(mode="after")
     def _whole(self) -> SensorModel:
-        if (self.firing_us is None) != bool(self.firings_per_turn):
+        if (self.firing_us is None) == (self.firings_per_turn is None):
             raise ValueError("give either firing_us or firings_per_turn")
-        for kind in ("mirror", "prisms"):
-            if (self.kind == kind) != (getattr(self, kind) is not None):
-                raise ValueError(f"a section {kind} goes with kind: {kind}")
-        if self.kind == "mirror" and not self.beams.elevation_deg:
-            raise ValueError("a mirror needs beams")
-        self.beams.beams()
+        self.beams.beams()  # LidarpoolError if it cannot be made
         return self
 
     @property
     def needs_calibration(self) -> bool:
         """Whether its rays are known only from the file of a unit."""
-        return self.kind == "list" or (self.kind == "spin" and not self.beams.elevation_deg)
+        return not (self.beams.elevation_deg or self.mirror or self.prisms)
 
     def turn(self, rate_hz: float | None, columns: int | None) -> tuple[float, float]:
         """Return the firings in a turn, and turns a second."""
         rate = self.rate_hz if rate_hz is None else rate_hz
         if not rate > 0:
             raise LidarpoolError(f"rate_hz is {rate}; it must be above 0.")
-        if self.firing_us is None:
-            return columns or self.firings_per_turn[0], rate
-        if columns is not None:
-            raise LidarpoolError(
-                f"{self.name} fires every {float(self.firing_us):g} µs, so its firings a turn "
-                "follow from rate_hz: leave columns out."
-            )
-        return float(1_000_000 / (self.firing_us * Fraction(str(rate)))), rate
+        if self.firing_us is not None:
+            if columns is not None:
+                raise LidarpoolError(
+                    f"{self.name} fires every {float(self.firing_us):g} µs, so its firings a turn "
+                    "follow from rate_hz: leave columns out."
+                )
+            return float(1_000_000 / (self.firing_us * Fraction(str(rate)))), rate
+        assert self.firings_per_turn is not None
+        return columns or self.firings_per_turn, rate
 
 
 def model_names() -> tuple[str, ...]:
@@ -175,23 +161,18 @@ def read_model(name: str | Path) -> SensorModel:
 
 @cache
 def _built_in(name: str) -> SensorModel:
-    with as_file(_BUILT_IN / f"{name}.yaml") as path:
-        return _read(path)
+    return _read(_BUILT_IN / f"{name}.yaml")
 
 
-def _read(path: Path) -> SensorModel:
+def _read(path: Path | Traversable) -> SensorModel:
     try:
         return SensorModel.model_validate(yaml.safe_load(path.read_text("utf-8")))
-    except OSError as error:
-        raise LidarpoolError(f"{path} cannot be read: {error.strerror}.") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise LidarpoolError(f"{path} is not YAML: {' '.join(str(error).split())}.") from error
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"])) or "as a whole"
         raise LidarpoolError(f"{path}, {place}: {first['msg']}.") from error
-    except LidarpoolError as error:
-        raise LidarpoolError(f"{path}: {error}") from error
+    except (OSError, ValueError, TypeError, KeyError, yaml.YAMLError, LidarpoolError) as error:
+        raise LidarpoolError(f"{path} is no model that can be used: {said(error)}") from error
 
 
 def load_sensor(
@@ -258,21 +239,17 @@ def load_sensor(
         "name": described.name if unit is None else f"{described.name}, {unit.file}",
     }
     head = Spin(firings, step_deg, rate, described.clockwise, described.zero_deg)
+    if unit is not None and (unit.rays is not None or described.listed or described.prisms):
+        return _listed(described, unit, head, common)
     if described.prisms is not None:
         return PrismSensor(head=head, **described.prisms.model_dump(), **common)
-    if unit is not None and unit.rays is not None:
-        each_ns = 1e9 / (firings * rate)
-        times = unit.shot_ns
-        if times is None:
-            times = each_ns * np.arange(len(unit.rays), dtype=np.float64)
-        cycle_ns = float(times[-1]) + each_ns
-        return ListedSensor(head=head, rays=unit.rays, shot_ns=times, cycle_ns=cycle_ns, **common)
     beams = described.beams.beams() if unit is None else _calibrated(described, unit)
-    assert beams is not None  # those that need a calibration have one
     if described.mirror is not None:
         mirror = described.mirror.model_dump()
         head = Mirror(firings, step_deg, rate, zero_deg=described.zero_deg, **mirror)
+        beams = beams or Beams(np.zeros(1))
     else:
+        assert beams is not None  # of the model, else of the unit
         beams = beams.turning(head.radians_per_ns)
     kind = LineSensor if described.axis == "x" else Sensor
     return kind(beams.lowest_first(), head, **common)
@@ -280,38 +257,46 @@ def load_sensor(
 
 def _model_of(unit: Calibration, columns: int | None) -> SensorModel:
     """Find the model whose beams are nearest, else take what the file itself says."""
-    best, least = None, 5.0  # degrees: units of one model differ by far less
+    off = {}  # {model: how far its elevations are from those of the unit, degrees}
     for name in model_names():
-        candidate = read_model(name).beams.elevation_deg
-        if name.startswith(f"{unit.maker}/") and unit.beams and len(candidate) == len(unit.beams):
+        ours = read_model(name).beams.elevation_deg
+        if name.startswith(f"{unit.maker}/") and unit.beams and len(ours) == len(unit.beams):
             theirs = np.degrees(unit.beams.elevation)
-            off = float(np.abs(np.sort(theirs) - np.sort(candidate)).max())
-            if off < least:
-                best, least = name, off
-    if best is not None:
-        return read_model(best)
-    head = {"firings_per_turn": (columns,)} if columns and unit.maker is None else {}
-    try:
-        return SensorModel(name=(unit.maker or "beams").title(), sources={}, **(unit.head | head))
-    except ValidationError as error:
-        rays = f"{len(unit.beams)} beams like these" if unit.beams else "the times of these rays"
+            off[name] = float(np.abs(np.sort(theirs) - np.sort(ours)).max())
+    if off and min(off.values()) < 5:  # units of one model differ by far less
+        return read_model(min(off, key=off.__getitem__))
+    head = {"firings_per_turn": columns} if columns and unit.maker is None else unit.head
+    if not head:
         raise LidarpoolError(
-            f"{unit.file}: no {unit.maker} model has {rays}; give model: as well."
-            if unit.maker
-            else f"{unit.file}: give columns: (firings in a turn) as well, or model:."
-        ) from error
+            f"{unit.file} is of no known model, and does not say when rays are fired: give model:"
+            f"{'' if unit.maker else ', or columns: (firings in a turn),'} as well."
+        )
+    return SensorModel(name=(unit.maker or "beams").title(), sources={}, **head)
+
+
+def _listed(
+    described: SensorModel, unit: Calibration, head: Spin, common: dict[str, Any]
+) -> ListedSensor:
+    """Rays of a unit's list, at the model's rate where the list has no times."""
+    if unit.rays is None or described.beams.elevation_deg:
+        raise LidarpoolError(f"{unit.file} does not fit {described.name}: it lists other things.")
+    each_ns = 1e9 / (head.firings_per_turn * head.rate_hz)
+    times = unit.shot_ns
+    if times is None:
+        times = each_ns * np.arange(len(unit.rays), dtype=np.float64)
+    cycle_ns = float(times[-1]) + each_ns
+    return ListedSensor(head=head, rays=unit.rays, shot_ns=times, cycle_ns=cycle_ns, **common)
 
 
 def _calibrated(described: SensorModel, unit: Calibration) -> Beams:
     """Beams of a unit, fired at the times of its model."""
     beams, table = unit.beams, described.beams
-    if beams is None or described.kind == "list":
-        raise LidarpoolError(f"{unit.file} does not fit {described.name}: it lists other things.")
-    times = beams.time_ns if beams.time_ns.any() else np.multiply(table.time_us, 1000.0)
+    assert beams is not None  # a file has beams or rays
     expected = len(table.elevation_deg) or len(table.time_us)
     if expected not in (0, len(beams)):
         raise LidarpoolError(
             f"{unit.file} has {len(beams)} beams, and {described.name} has {expected}."
         )
+    times = beams.time_ns if beams.time_ns.any() else np.multiply(table.time_us, 1000.0)
     origin = beams.origin if beams.origin.any() else table.origins(len(beams))
     return Beams(beams.elevation, beams.azimuth, times, origin)

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.errors import LidarpoolError
 from .beams import Beams
 from .sensor import Sensor
 
@@ -92,7 +91,7 @@ class ListedSensor(Sensor):
     rays
         float64 (n, 3): unit directions in the order of firing.
     shot_ns
-        float64 (n,): when each is fired, from 0 on.
+        float64 (n,): when each is fired, from 0 on, in order.
     cycle_ns
         How long the list takes.
     """
@@ -101,11 +100,6 @@ class ListedSensor(Sensor):
     rays: NDArray[np.float64] = field(default_factory=lambda: np.array([[1.0, 0, 0]]))
     shot_ns: NDArray[np.float64] = field(default_factory=lambda: np.zeros(1))
     cycle_ns: float = 1e8
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not (np.diff(self.shot_ns) >= 0).all() or not self.shot_ns[-1] <= self.cycle_ns:
-            raise LidarpoolError("The times of listed rays must not go back.")
 
     @property
     def period(self) -> int | None:
