@@ -54,6 +54,7 @@ def plot(result: Path, only: tuple[str, ...], size: tuple[int, int], out: Path |
 
     \b
     Examples:
+      lidarpool plot lidarpool-out
       lidarpool plot lidarpool-out --only cloud --size 2400x1500 --out figures
     """  # noqa: D301 - click wants the character, not its name
     # Matplotlib is a second that --help can do without.
