@@ -61,17 +61,6 @@ def test_verbose_keeps_more_at_once_and_the_traceback_of_an_error(tmp_path, libr
     assert "Traceback" in path.read_text() and "as it happens" in path.read_text()
 
 
-def test_an_error_leaves_the_warnings_before_it(tmp_path, library):
-    def fail() -> None:
-        with logged_to(tmp_path / "log"):
-            library.warning("the disk is slow")
-            raise ValueError
-
-    with pytest.raises(ValueError):
-        fail()
-    assert "the disk is slow" in (tmp_path / "log").read_text()
-
-
 def test_an_interrupt_leaves_the_folder_as_it_was(tmp_path, library):
     def interrupt() -> None:
         with logged_to(tmp_path / "log"):
@@ -93,13 +82,6 @@ def test_it_is_heard_also_where_logs_were_silenced_and_they_are_again_after(tmp_
     finally:
         logging.disable(logging.NOTSET)
     assert (tmp_path / "log").read_text().endswith(": heard\n")
-
-
-def test_handlers_and_levels_are_those_of_before(tmp_path, library):
-    before = list(logging.root.handlers), logging.root.level
-    with logged_to(tmp_path / "log", verbose=True):
-        assert logging.root.level == logging.INFO
-    assert (list(logging.root.handlers), logging.root.level) == before
 
 
 def test_a_file_that_cannot_be_written_stops_nothing(tmp_path, library, capfd):

@@ -18,11 +18,6 @@ def test_every_machine_gets_workers_and_no_more_than_cores_and_gpus(cores, gpus)
     assert sum(workers.values()) <= max(cores + 1, gpus + 1)
 
 
-def test_without_a_gpu_three_quarters_of_the_cores_cast():
-    assert default_workers(cores=2, gpus=0)["GPU"] == 2
-    assert default_workers(cores=16, gpus=0)["GPU"] == 12
-
-
 @pytest.mark.parametrize(
     ("given", "partitions"),
     [

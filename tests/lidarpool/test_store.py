@@ -152,9 +152,6 @@ def test_another_backend_cannot_go_on(unfinished):
 
 OTHERS = {
     "survey": replace(JOB, survey=replace(SURVEY, keep_every=1)),
-    "sensor": replace(JOB, survey=replace(SURVEY, sensor=Sensor.grid(layers=3))),
-    "columns": replace(JOB, survey=replace(SURVEY, columns=["range"])),
-    "poses": replace(JOB, survey=replace(SURVEY, poses=[(0, 0, 2)], trajectory=None)),
     "scene": replace(JOB, scene=Scene.from_meshes(seed_objects(rings=4, segments=7))),
     "planning": replace(JOB, planning=PLANNING),
 }
@@ -162,9 +159,8 @@ OTHERS = {
 
 @pytest.mark.parametrize("other", OTHERS)
 def test_another_run_cannot_go_on(other, unfinished):
-    what = other if other in ("scene", "planning") else "survey"
     for resume in (True, False):
-        with pytest.raises(LidarpoolError, match=f"cannot be continued, it is of another {what}"):
+        with pytest.raises(LidarpoolError, match=f"cannot be continued, it is of another {other}"):
             RunStore(OTHERS[other], unfinished, resume=resume)
     remove_run(unfinished)
     RunStore(OTHERS[other], unfinished).db.close()
@@ -200,13 +196,11 @@ def test_trials_are_gone_on_with_too(folder):
     assert [trial.trial for trial in again.db.trials] == [1] and not again.complete
 
 
-@pytest.mark.parametrize("damage", ["missing", "cut", "longer", "all"])
+@pytest.mark.parametrize("damage", ["missing", "cut", "all"])
 def test_parts_that_are_not_whole_are_made_again(damage, unfinished):
     part = unfinished / "parts" / "3-0.npz"
     if damage == "cut":
         part.write_bytes(part.read_bytes()[:-1])
-    elif damage == "longer":
-        part.write_bytes(part.read_bytes() + b"\0")
     else:
         part.unlink()
     if damage == "all":

@@ -5,7 +5,6 @@ import re
 import pytest
 import yaml
 
-from lidarpool import LidarpoolError
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scenario.sections import CloudSection, PlanningSection, PoolSection, SceneSection
 from lidarpool.scenario.sections import SensorSection as Sensor
@@ -35,13 +34,6 @@ def test_every_field_is_in_it_with_a_comment_of_its_own():
     assert max(map(len, TEXT.splitlines())) <= 100
 
 
-def test_every_default_is_written_out():
-    data = yaml.safe_load(TEXT)
-    assert data["sensor"]["layers"] == 40 and data["sensor"]["step_deg"] == 10
-    assert data["planning"]["trials"] == 100 and data["pool"]["backend"] == "auto"
-    assert data["steps"] == 36
-
-
 @pytest.mark.parametrize(
     "line", [line for line in TEXT.splitlines() if OFF.match(line) and "$schema" not in line]
 )
@@ -57,8 +49,3 @@ def test_the_lines_that_are_commented_out_are_found():
     found = [OFF.match(line) for line in TEXT.splitlines()]
     names = {match[2].partition(":")[0] for match in found if match}
     assert names >= {"preset", "files", "ground", "poses", "start", "obstacles", "gpu", "enabled"}
-
-
-def test_a_mistake_in_it_is_found():
-    with pytest.raises(LidarpoolError, match="Did you mean 'layers'"):
-        Scenario.from_data(yaml.safe_load(TEXT.replace("layers:", "layer:")))

@@ -6,7 +6,6 @@ import json
 import shutil
 from collections import namedtuple
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -162,14 +161,6 @@ def test_a_cluster_that_lacks_a_partition(check, cluster):
     assert said["reasons"][0] in outcome.err
 
 
-def test_a_folder_that_is_not_there_yet(lidarpool, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    Path("s.yaml").write_text(json.dumps(SHORT))
-    outcome = lidarpool("check", "s.yaml", "--out", "made/here", "--json")
-    assert outcome.code == 0
-    assert json.loads(outcome.out)["disk"]["folder"] == "made/here"
-
-
 def test_a_folder_that_cannot_take_a_result(check, tmp_path):
     (tmp_path / "out" / "cloud.ply").mkdir(parents=True)
     outcome = check("--no-plan")
@@ -189,10 +180,3 @@ def test_sizes_that_speak_of_another_unit(size, unit, check, tmp_path, lidarpool
     assert unit is None or f"give the file's unit ({unit}?) in scene.files" in outcome.out
     given = check(text="scene: {files: [{file: my box.stl, unit: m}]}")
     assert given.code == 0 and "states no unit" not in given.out
-
-
-def test_the_memory_of_swarms_is_counted(check):
-    outcome = check(text="planning: {particles: 10000000, waypoints: 100}")
-    assert outcome.code == 2
-    assert "of memory and the run needs about" in outcome.err
-    assert "particles" in outcome.err

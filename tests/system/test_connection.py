@@ -17,23 +17,17 @@ from lidarpool.base.interrupts import deferred_interrupts, interrupt_on_signals
 SCRIPT = """
 from lidarpool import Scene, Survey, simulate
 
-def tell(progress):
-    if progress.generated and not told:
-        told.append(print("surveying", flush=True))
-
-told = []
 if __name__ == "__main__":
     survey = Survey(poses=[(0, 0, 1)], steps=1_000_000)
     print("starting", flush=True)
     try:
-        simulate(Scene.seed(), survey, gpu_workers=1, other_workers=1, on_progress=tell)
+        simulate(Scene.seed(), survey, gpu_workers=1, other_workers=1)
     except KeyboardInterrupt:
         print("interrupted", flush=True)
 """
 
 
-@pytest.mark.parametrize(("word", "pauses"), [("starting", [0.5, 0.5]), ("surveying", [0, 0.2])])
-def test_simulate_leaves_nothing_when_it_is_interrupted_twice(word, pauses, tmp_path):
+def test_simulate_leaves_nothing_when_it_is_interrupted_twice(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
     with subprocess.Popen(
@@ -45,10 +39,9 @@ def test_simulate_leaves_nothing_when_it_is_interrupted_twice(word, pauses, tmp_
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
     ) as run:
         assert run.stdout
-        while word not in run.stdout.readline():
-            assert run.poll() is None
-        for pause in pauses:
-            time.sleep(pause)
+        assert "starting" in run.stdout.readline()
+        for _ in range(2):
+            time.sleep(0.5)
             started = psutil.Process(run.pid).children(recursive=True)
             os.killpg(run.pid, signal.SIGINT)
         out, err = run.communicate(timeout=120)

@@ -77,13 +77,6 @@ def test_init_with_what_is_no_mesh_writes_nothing(options, says, tmp_path, lidar
     assert not (tmp_path / "new").exists()
 
 
-def test_init_where_there_can_be_no_folder(tmp_path, lidarpool):
-    (tmp_path / "file").write_text("")
-    outcome = lidarpool("init", tmp_path / "file" / "folder")
-    assert outcome.code == 2
-    assert "Not a directory" in outcome.err and "Traceback" not in outcome.err
-
-
 def test_schema_prints_what_init_writes(tmp_path, lidarpool):
     lidarpool("init", tmp_path)
     assert lidarpool("schema").out == (tmp_path / "scenario.schema.json").read_text()
