@@ -23,7 +23,7 @@ from lidarpool.plan.trial import run_trial
 from lidarpool.report.cloud_numbers import CountedCloud
 from lidarpool.report.page import Recipe, make_recipe, write_page
 from lidarpool.report.page.charts import OBJECTS_MOST
-from lidarpool.report.page.timeline import LANES_MOST
+from lidarpool.report.page.timeline import ROWS_MOST
 from lidarpool.report.report import make_report
 from lidarpool.run.trials import TRIAL
 from lidarpool.scan import COLLECT, GENERATE, INTERSECT, SORT
@@ -37,7 +37,7 @@ EVIL = (
     "\"'><script>alert(1)</script><img src=//evil.test/x onerror=y>&amp;{{ 7*7 }}\u202e\x00\udc80"
 )
 PICTURES = ["scene.png", "intensity.png", "cloud.png", "path.png"]
-RECIPE = Recipe("hall.yaml", "lidarpool run hall.yaml", "steps: 36\n", "hall.yaml")
+RECIPE = Recipe("hall.yaml", "lidarpool run hall.yaml", "steps: 36\n")
 EPOCH = 1.7e9
 
 
@@ -203,7 +203,7 @@ def test_the_page_refers_to_nothing_outside(write):
         for name, value in attributes.items()
         if name in ("src", "href", "srcset", "action", "xlink:href", "poster", "data")
     ]
-    assert len(references) == len(PICTURES) + 1  # the last is the scenario
+    assert len(references) == len(PICTURES)
     assert all(reference.startswith(("data:", "#")) for reference in references)
     assert not {"script", "link", "iframe", "object", "embed", "base"} & {
         t for t, _ in page.elements
@@ -349,9 +349,9 @@ def test_rows_of_the_timeline(write):
     assert len(said["Stages"]) == 5 and said["Stages"][1].startswith("intersect: 20 tasks")
     assert said["GPU"] == ["GPU-0: intersect, 20 tasks, 2 s"]
     assert said["OTHER"] == ["OTHER-0: plan path, 20 tasks, 9 s"]
-    assert said["LIDAR"] == [  # each in a lane of its own, as they began
+    assert said["LIDAR"] == [
         "LIDAR-0: generate, 1 task, 4 s", "LIDAR-0: sort frames, 1 task, 4.5 s",
-        "LIDAR-0: collect points, 1 task, 4.5 s", "LIDAR-0: collect points, 1 task, 4.5 s",
+        "LIDAR-0: collect points, 2 tasks, 9 s",
     ]  # fmt: skip
 
 
@@ -375,16 +375,15 @@ def test_hundreds_of_workers_and_tens_of_thousands_of_tasks(write):
     page = Page(text)
     assert len(text) < 2_000_000 and len(page.elements) < 3000
     said = lanes(page)
-    assert sum(map(len, said.values())) <= LANES_MOST + 5 + 3
-    assert len(said["LIDAR"]) == 4
-    for name in ("GPU", "OTHER"):
-        folded = re.fullmatch(r"and (\d+) more lanes: the share that was busy", said[name][-1])
-        assert int(folded[1]) + len(said[name]) - 1 >= 200
+    assert {name: len(rows) for name, rows in said.items()} == {
+        "Stages": 5, "GPU": ROWS_MOST, "LIDAR": 3, "OTHER": ROWS_MOST,
+    }  # fmt: skip
     headings = page.texts("div", "group")
     assert headings[0] == "Stages while at least one task ran"
     assert headings[1].startswith("GPU 200 workers, 10,000 tasks, of which 2,5")
+    assert headings[1].endswith("; the busiest 24 of 200 rows")
     assert headings[2] == "LIDAR 1 worker, 4 tasks"
-    assert f"{20_004:,} tasks in" in text and "are drawn by worker" in text
+    assert f"{20_004:,} tasks in" in text
 
 
 # -- what there may not be -----------------------------------------------------------------------
@@ -421,7 +420,7 @@ def test_no_way_to_the_target(write):
     page = Page(write(plan=closed)[0])
     assert page.pairs()["shortest possible"] == "none, the obstacles leave no way"
     assert page.pairs()["collisions"] == "enters an obstacle"
-    assert any("in metres" in text for text in page.texts("p", "aside"))
+    assert any("above the lowest that was found" in text for text in page.texts("p", "aside"))
 
 
 def test_the_straight_line_is_the_shortest(write):
@@ -477,8 +476,6 @@ def test_the_scenario_on_the_page_is_the_scenario(write):
         page = Page(write(recipe=recipe)[0])
         (shown,) = [page.text[n] for n in page.all("code") if "sensor:" in page.text[n]]
         assert Scenario.from_data(yaml.safe_load(shown)).model_dump() == scenario.model_dump()
-        (saved,) = page.attributes("a", "href")
-        assert base64.b64decode(saved.split(",")[1]).decode() == shown
 
 
 def test_a_million_poses_are_cut_short():

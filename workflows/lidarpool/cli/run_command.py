@@ -16,7 +16,7 @@ from distributed import Client
 from poolpart.wording import counted
 
 from ..live import shown_on_page
-from ..report.summary import summary
+from ..report.report import summary
 from ..run.checks import check_backend_here
 from ..run.connection import TlsFiles, connected, local_client
 from ..run.job import Job, make_job

@@ -7,55 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..scene.scene import Scene
-from .surface import Surface
+from .surface import Surface, dot
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
 
+MOST_SENSORS = 8  # that are asked what they see
 MAX_LAYERS = 12  # walls have two faces, roofs have beams; more than this is no wall
 ENCLOSED = 0.7  # of the level rays from the sensors end in the scene: they stand indoors
 HIDDEN = 0.65  # less than this of what the sensors see is seen by the camera
-
-
-@dataclass(frozen=True, eq=False)
-class Shell:
-    """Walls and roofs: the outer shells of the objects that surround the sensors.
-
-    Parameters
-    ----------
-    scene
-        The triangles.
-    surrounds
-        bool (objects,): whether the sensors are within it, seen from above.
-    core
-        (objects, 2, 3) box inside each object's shell.
-    """
-
-    scene: Scene
-    surrounds: NDArray[np.bool_]
-    core: Floats
-
-    @classmethod
-    def around(cls, scene: Scene, sensors: Floats) -> Shell:
-        """Return the shell around sensors at (p, 3)."""
-        box = scene.object_bounds
-        flat = sensors[:, None, :2]
-        inside = ((flat > box[None, :, 0, :2]) & (flat < box[None, :, 1, :2])).all(axis=2)
-        core = box.copy()
-        width = np.where(np.isfinite(box).all(axis=1), box[:, 1] - box[:, 0], 0.0)
-        core[:, 0, :2] += 0.06 * width[:, :2]
-        core[:, 1, :2] -= 0.06 * width[:, :2]
-        # The roof and what hangs from it: all above the middle between sensors and top.
-        core[:, 1, 2] = (core[:, 1, 2] + sensors[:, 2].max()) / 2
-        return cls(scene, inside.mean(axis=0) >= 0.5, core)
-
-    def holds(self, points: Floats, triangle: Ints) -> NDArray[np.bool_]:
-        """Whether points (n, 3) on triangles (n,) are of it."""
-        owner = self.scene.face_object[triangle]
-        low, high = self.core[owner, 0], self.core[owner, 1]
-        beside = (points[:, :2] < low[:, :2]) | (points[:, :2] > high[:, :2])
-        return self.surrounds[owner] & (beside.any(axis=1) | (points[:, 2] > high[:, 2]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,21 +36,40 @@ class Cutaway:
         (p, 3) metres.
     eye
         (3,) the camera.
-    shell
-        What may be taken away.
+    surrounds
+        bool (objects,): whether the sensors are within an object, seen from above.
+    core
+        (objects, 2, 3) box inside each object's shell.
     """
 
     surface: Surface
     sensors: Floats
     eye: Floats
-    shell: Shell
+    surrounds: Bools
+    core: Floats
 
-    def removes(self, points: Floats, triangle: Ints) -> NDArray[np.bool_]:
+    @classmethod
+    def around(cls, surface: Surface, sensors: Floats, eye: Floats) -> Cutaway:
+        """Return what hides sensors at (p, 3) from a camera at `eye`."""
+        core = surface.scene.object_bounds.copy()
+        flat = sensors[:, None, :2]
+        inside = ((flat > core[None, :, 0, :2]) & (flat < core[None, :, 1, :2])).all(axis=2)
+        width = np.where(np.isfinite(core).all(axis=1), core[:, 1] - core[:, 0], 0.0)
+        core[:, 0, :2] += 0.06 * width[:, :2]
+        core[:, 1, :2] -= 0.06 * width[:, :2]
+        # The roof and what hangs from it: all above the middle between sensors and top.
+        core[:, 1, 2] = (core[:, 1, 2] + sensors[:, 2].max()) / 2
+        return cls(surface, sensors, eye, inside.mean(axis=0) >= 0.5, core)
+
+    def removes(self, points: Floats, triangle: Ints) -> Bools:
         """Whether the hits at points (n, 3) on triangles (n,) are taken away."""
-        out = self.shell.holds(points, triangle)
+        owner = self.surface.scene.face_object[triangle]
+        low, high = self.core[owner, 0], self.core[owner, 1]
+        beside = (points[:, :2] < low[:, :2]) | (points[:, :2] > high[:, :2])
+        out: Bools = self.surrounds[owner] & (beside.any(axis=1) | (points[:, 2] > high[:, 2]))
         which = np.flatnonzero(out)
         normal = self.surface.face_normals[triangle[which]]
-        height = (normal * points[which]).sum(axis=1)
+        height = dot(normal, points[which])
         eye_above = normal @ self.eye > height
         sensor_above = normal @ self.sensors.T > height[:, None]
         out[which] = (sensor_above != eye_above[:, None]).mean(axis=1) >= 0.5
@@ -103,30 +83,30 @@ def plan_cutaway(surface: Surface, poses: Floats, eye: Floats) -> Cutaway | None
     """
     if not len(poses):
         return None
-    sensors = some_of(poses)
-    if not enclosed(surface, sensors):
+    sensors = poses[np.linspace(0, len(poses) - 1, min(len(poses), MOST_SENSORS)).astype(int)]
+    level = surface.caster.cast(*_probes(sensors, 128, 0.0, 15.0)).distance
+    if np.isfinite(level).mean() < ENCLOSED:
         return None
-    origins, directions = probes(sensors, 512, -60.0, 30.0)
+    origins, directions = _probes(sensors, 512, -60.0, 30.0)
     seen = surface.caster.cast(origins, directions).distance
     hit = np.isfinite(seen)
-    points = origins[hit] + seen[hit, None] * directions[hit]
-    offset = points - eye
+    offset = origins[hit] + seen[hit, None] * directions[hit] - eye
     distance = np.linalg.norm(offset, axis=1)
     nearest = surface.caster.cast(eye, offset / distance[:, None]).distance
     if (nearest >= distance * (1 - 1e-3)).mean() >= HIDDEN:
         return None
-    return Cutaway(surface, sensors, eye, Shell.around(surface.scene, sensors))
+    return Cutaway.around(surface, sensors, eye)
 
 
-def some_of(poses: Floats) -> Floats:
-    """Return a few of the poses (p, 3), p >= 1, from the first to the last."""
-    return poses[np.linspace(0, len(poses) - 1, min(len(poses), 8)).astype(int)]
-
-
-def enclosed(surface: Surface, sensors: Floats) -> bool:
-    """Whether most level rays from sensors at (p, 3) end in the scene."""
-    level = surface.caster.cast(*probes(sensors, 128, 0.0, 15.0))
-    return bool(np.isfinite(level.distance).mean() >= ENCLOSED)
+def _probes(sensors: Floats, count: int, low_deg: float, high_deg: float) -> tuple[Floats, Floats]:
+    """Origins and directions (p * count, 3) of `count` rays from each, between two elevations."""
+    n = np.arange(count)
+    azimuth = 2 * np.pi * 0.6180339887 * n
+    low, high = np.sin(np.radians([low_deg, high_deg]))
+    up = low + (high - low) * (n + 0.5) / count
+    level = np.sqrt(1 - up * up)
+    rays = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), up], axis=1)
+    return np.repeat(sensors, count, axis=0), np.tile(rays, (len(sensors), 1))
 
 
 def cast_through(
@@ -146,24 +126,22 @@ def cast_through(
     if cutaway is None:
         return distance, triangle, u, v
     live = np.flatnonzero(triangle >= 0)
-    for layer in range(MAX_LAYERS):
+    for _ in range(MAX_LAYERS):
         points = eye + distance[live, None] * directions[live]
         live = live[cutaway.removes(points, triangle[live])]
         if not len(live):
             break
         start = distance[live] * (1 + 1e-6)
         again = surface.caster.cast(eye + start[:, None] * directions[live], directions[live])
-        last = layer == MAX_LAYERS - 1
-        distance[live] = np.inf if last else start + again.distance
-        triangle[live] = -1 if last else again.triangle
-        u[live], v[live] = again.u, again.v
+        distance[live] = start + again.distance
+        triangle[live], u[live], v[live] = again.triangle, again.u, again.v
         live = live[triangle[live] >= 0]
     return distance, triangle, u, v
 
 
 def blocked(
     surface: Surface, cutaway: Cutaway | None, origins: Floats, directions: Floats, reach: float
-) -> NDArray[np.bool_]:
+) -> Bools:
     """Whether rays (n, 3) meet something within `reach` metres that is not taken away."""
     hits = surface.caster.cast(origins, directions, t_max=reach)
     met = np.asarray(hits.triangle >= 0)
@@ -172,17 +150,3 @@ def blocked(
         points = origins[which] + hits.distance[which, None] * directions[which]
         met[which] = ~cutaway.removes(points, np.asarray(hits.triangle[which], dtype=np.int64))
     return met
-
-
-def probes(sensors: Floats, count: int, low_deg: float, high_deg: float) -> tuple[Floats, Floats]:
-    """Origins and directions of `count` rays from each sensor, between two elevations.
-
-    Those of a sensor follow one another: (p * count, 3) both.
-    """
-    n = np.arange(count)
-    azimuth = 2 * np.pi * 0.6180339887 * n
-    low, high = np.sin(np.radians([low_deg, high_deg]))
-    up = low + (high - low) * (n + 0.5) / count
-    level = np.sqrt(1 - up * up)
-    rays = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), up], axis=1)
-    return np.repeat(sensors, count, axis=0), np.tile(rays, (len(sensors), 1))

@@ -55,10 +55,8 @@ class CountedCloud:
     ----------
     cloud
         The points, in world coordinates.
-    survey
-        Where each scan was made from.
-    origin
-        World position of the survey's coordinates, (3,), metres.
+    survey, origin
+        Where each scan was made from; `origin`, (3,) metres, is added to its coordinates.
     objects
         How many objects there are.
     """
@@ -73,23 +71,18 @@ class CountedCloud:
         self._counts = np.zeros(0, np.int64)  # by range, in fine bins
         self._nearest, self._farthest = np.inf, 0.0
         self._every = -(-max(len(cloud), 1) // RANGES_MOST)
+        self.bounds: NDArray[np.float64] = np.asarray(cloud.bounds, dtype=np.float64)
+        self.table: tuple[Column, ...] = cloud.table
         path = survey.path
         stations = np.array([path.pose(station).position for station in range(path.stations)])
         self._stations = stations + origin
-        self._fine = _fine_step(self._stations, self.bounds)
+        # A power of ten, metres, that divides whatever ranges there may be finely.
+        reach = np.abs(self._stations[:, None] - self.bounds).max(axis=1)
+        most = max(float(np.linalg.norm(reach, axis=1).max()), 1e-3)
+        self._fine = float(10.0 ** np.floor(np.log10(most / _FINE)))
 
     def __len__(self) -> int:
         return len(self._cloud)
-
-    @property
-    def bounds(self) -> NDArray[np.float64]:
-        """Lowest and highest coordinates, (2, 3), metres."""
-        return np.asarray(self._cloud.bounds, dtype=np.float64)
-
-    @property
-    def table(self) -> tuple[Column, ...]:
-        """The columns beside the positions."""
-        return self._cloud.table
 
     def chunks(self, points: int = CHUNK_POINTS) -> Iterator[Cloud]:
         """Give the points in order, and count them."""
@@ -121,40 +114,26 @@ class CountedCloud:
 
     def numbers(self) -> CloudNumbers:
         """Sum up all points that were read."""
-        empty = np.zeros(0)
-        by_range, edges, median = empty.astype(np.int64), empty, 0.0
-        if self._counts.any():
-            middle = self._counts.sum() / 2
-            median = self._fine * (np.searchsorted(np.cumsum(self._counts), middle) + 0.5)
-            by_range, edges = _coarse(self._counts, self._fine, self._nearest, self._farthest)
+        by_range, edges, median = np.zeros(0, np.int64), np.zeros(0), 0.0
+        filled = np.flatnonzero(self._counts)
+        if len(filled):
+            middle = np.searchsorted(np.cumsum(self._counts), self._counts.sum() / 2)
+            median = float(self._fine * (middle + 0.5))
+            span = max(self._farthest - self._nearest, self._fine)
+            wide = max(1, round(nice_step(span / BARS) / self._fine))
+            first, stop = filled[0] // wide, filled[-1] // wide + 1
+            if first <= (stop - first) // 3:
+                first = 0  # from the sensor on, where that wastes little
+            by_range = self._every * np.add.reduceat(self._counts, np.arange(first, stop) * wide)
+            edges = np.arange(first, stop + 1) * (wide * self._fine)
         return CloudNumbers(
             self._by_object,
             self._by_channel,
             self._limits,
-            by_range * self._every,
+            by_range,
             edges,
-            self._nearest if by_range.size else 0.0,
-            float(median),
+            self._nearest if len(filled) else 0.0,
+            median,
             self._farthest,
             self.bounds,
         )
-
-
-def _fine_step(stands: NDArray[np.float64], bounds: NDArray[np.float64]) -> float:
-    """Return a power of ten, metres, that divides whatever ranges there may be finely."""
-    reach = np.maximum(np.abs(stands - bounds[0]), np.abs(stands - bounds[1]))
-    most = float(np.linalg.norm(reach, axis=1).max())
-    return float(10.0 ** np.floor(np.log10(max(most, 1e-3) / _FINE)))
-
-
-def _coarse(
-    counts: NDArray[np.int64], fine: float, nearest: float, farthest: float
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Sum fine bins up to about `BARS` wide ones from nearest to farthest."""
-    wide = max(1, round(nice_step((farthest - nearest) / BARS) / fine)) if farthest > nearest else 1
-    filled = np.flatnonzero(counts)
-    first, stop = filled[0] // wide, filled[-1] // wide + 1
-    if first <= (stop - first) // 3:
-        first = 0  # from the sensor on, where that wastes little
-    starts = np.arange(first, stop) * wide
-    return np.add.reduceat(counts, starts), np.arange(first, stop + 1) * (wide * fine)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import json
 import os
 import secrets
 import shutil
-import sys
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -27,18 +27,12 @@ from .page import Recipe, write_page
 from .pictures import picture_makers
 from .report import make_report
 
-if sys.platform != "win32":
-    import fcntl
-
 ROOM_BYTES = 32 << 20  # what pictures and report may take; the cloud is checked when it is known
 
 CLOUD, PAGE, REPORT = "cloud.ply", "report.html", "report.json"
 _IMAGES = tuple(f"{name}.png" for name in PICTURES)
 FILES = (CLOUD, *_IMAGES, PICTURE_FILE, PAGE, REPORT)
-
-# Folders within the output folder: a result being made, and one that is whole and on its way
-# into place. A run that was killed leaves one behind; the next run removes or finishes it.
-_WRITING, _COMPLETE = ".writing-", ".complete-"
+_WRITING = ".writing-"  # folder of a result being made; one of a killed run goes at the next
 
 
 @contextmanager
@@ -53,33 +47,33 @@ def result_folder(folder: Path) -> Iterator[None]:
         If it is a file, cannot be made or written to, another run uses it, or its disk is
         nearly full.
     """
+    if folder.exists() and not folder.is_dir():
+        raise LidarpoolError(f"{folder} is a file: give a folder for the results with --out.")
+    if obstacle := folder_in_the_way(folder):
+        raise LidarpoolError(obstacle)
     made = [path for path in (folder, *folder.parents) if not path.exists()]  # innermost first
     try:
-        lock = _claim(folder)
-    except BaseException as error:
-        if not isinstance(error.__cause__, BlockingIOError):  # else another run has made them, too
-            _remove_empty(made)
-        raise
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            lock = _lock(folder)
+        for left in folder.glob(f"{_WRITING}*"):
+            shutil.rmtree(left)
+    except BlockingIOError as error:
+        raise LidarpoolError(
+            f"Another run is using the folder {folder}: wait for it, or give another with --out."
+        ) from error
+    except OSError as error:
+        raise LidarpoolError(
+            f"Cannot write to the folder {folder} ({error.strerror}): give another with --out."
+        ) from error
     try:
-        _clear_up(folder)
         _check_room(folder)
         yield
     finally:
-        if sys.platform == "win32":  # removes no folder with an open file
-            os.close(lock)
-            _remove_empty(made)
-        else:  # as long as no other run can have begun to use them
-            _remove_empty(made)
-            os.close(lock)
-
-
-def _remove_empty(folders: Iterable[Path]) -> None:
-    """Remove folders, innermost first, up to one that holds something."""
-    for path in folders:
-        if path.exists():
-            if any(path.iterdir()):
-                break
-            path.rmdir()
+        for path in made:
+            if path.exists() and not any(path.iterdir()):
+                path.rmdir()
+        os.close(lock)
 
 
 def write_result(
@@ -94,11 +88,11 @@ def write_result(
 ) -> dict[str, Any]:
     """Write cloud, pictures and report, and return the report.
 
-    They are made in a temporary folder within `folder` and moved into place together once
-    all are there and on the disk, so that an earlier result stays whole if one cannot be
-    written. A picture that an earlier run made and this one does not is removed. `then` is
-    called when all are in place, before an interrupt that came meanwhile is let through.
-    `only_cloud` leaves pictures and page out.
+    They are made in a temporary folder within `folder` and moved into place once all are there
+    and on the disk, so that an earlier result stays whole if one cannot be written. A picture
+    that an earlier run made and this one does not is removed. `then` is called when all are in
+    place, before an interrupt that came meanwhile is let through. `only_cloud` leaves pictures
+    and page out.
 
     Raises
     ------
@@ -107,38 +101,29 @@ def write_result(
     """
     staged = folder / f"{_WRITING}{secrets.token_hex(4)}"
     counted = CountedCloud(result.points, survey, scene.origin, len(scene.names))
-    pictures = {} if only_cloud else _pictures(staged, result, scene, survey, planning)
-    files = [CLOUD, *pictures, *([] if only_cloud else [PAGE]), REPORT]
-    report: dict[str, Any] = {}
-
-    def write_cloud(path: Path) -> None:
-        save_cloud(path, counted, precision_m=survey.precision_m)
-        numbers = counted.numbers()
-        report.update(make_report(result, scene, survey, planning, files, numbers))
-
-    def write_report(path: Path) -> None:
-        text = json.dumps(report, indent=1, allow_nan=False) + "\n"
-        path.write_text(text, encoding="utf-8")
-
-    makers: dict[str, Callable[[Path], object]] = {CLOUD: write_cloud, **pictures}
+    makers: dict[str, Callable[[Path], object]] = {}
     if not only_cloud:
-        makers[PAGE] = lambda path: write_page(
-            path, report, result, counted.numbers(), planning, recipe
-        )
-    makers[REPORT] = write_report
+        shown = Pictured.of(result, scene, survey, planning)
+        # The cloud is drawn from its file, as by `lidarpool plot`, so that both draw the same.
+        drawn = picture_makers(shown, staged / CLOUD)
+        makers = {f"{name}.png": draw for name, draw in drawn.items()} | {PICTURE_FILE: shown.save}
+    files = [CLOUD, *makers, *([] if only_cloud else [PAGE]), REPORT]
     try:
-        try:
-            staged.mkdir()
-            for name, make in makers.items():
-                make(staged / name)
-                _flush(staged / name)
-            _flush(staged)
-            with deferred_interrupts():
-                whole = staged.rename(folder / f"{_COMPLETE}{secrets.token_hex(4)}")
-                _publish(whole, folder)
-                then()
-        finally:
-            shutil.rmtree(staged, ignore_errors=True)  # it is gone already if all went well
+        staged.mkdir()
+        save_cloud(staged / CLOUD, counted, precision_m=survey.precision_m)
+        numbers = counted.numbers()
+        report = make_report(result, scene, survey, planning, files, numbers)
+        for name, make in makers.items():
+            make(staged / name)
+        if not only_cloud:
+            write_page(staged / PAGE, report, result, numbers, planning, recipe)
+        text = json.dumps(report, indent=1, allow_nan=False) + "\n"
+        (staged / REPORT).write_text(text, encoding="utf-8")
+        for name in files:
+            _flush(staged / name)
+        with deferred_interrupts():
+            _publish(staged, folder, files)
+            then()
     except LidarpoolError as error:  # names the file; its temporary folder is nobody's business
         raise LidarpoolError(str(error).replace(str(staged), str(folder))) from error
     except OSError as error:
@@ -146,69 +131,33 @@ def write_result(
             f"The result cannot be written to {folder} ({error.strerror or error}): make room or "
             "give another folder with --out."
         ) from error
+    finally:
+        shutil.rmtree(staged, ignore_errors=True)
     return report
 
 
-def _pictures(
-    folder: Path, result: Result, scene: Scene, survey: Survey, planning: Planning | None
-) -> dict[str, Callable[[Path], object]]:
-    """Functions that write each picture, and what they are drawn from, into a folder."""
-    shown = Pictured.of(result, scene, survey, planning)
-    # The cloud is drawn from its file, as by `lidarpool plot`, so that both draw the same.
-    makers = picture_makers(shown, folder / CLOUD)
-    return {
-        **{f"{name}.png": draw for name, draw in makers.items()},
-        PICTURE_FILE: shown.save,
-    }
+def _publish(staged: Path, folder: Path, files: Collection[str]) -> None:
+    """Move a whole result into place.
 
-
-def _publish(whole: Path, folder: Path) -> None:
-    """Move a whole result into place; called again after a crash, it does the rest.
-
-    A folder with a report is a result: the earlier one's goes first, and the new one comes
-    last. As long as that is in `whole`, it says what belongs to the result.
+    A folder with a report is a result: the earlier one's goes first, and the new one comes last.
+    Whoever is killed in between has the run's folder, and goes on with --resume.
     """
-    files = json.loads((whole / REPORT).read_text(encoding="utf-8"))["files"]
     for name in (REPORT, PAGE):
-        if (whole / name).exists():
-            (folder / name).unlink(missing_ok=True)
+        (folder / name).unlink(missing_ok=True)
     _flush(folder)
     for name in FILES:
-        if name not in files:  # a path of an earlier run would pass for this one's, too
+        if name in files:
+            (staged / name).replace(folder / name)
+        else:  # a path of an earlier run would pass for this one's
             (folder / name).unlink(missing_ok=True)
-        elif (whole / name).exists():
-            (whole / name).replace(folder / name)
-    whole.rmdir()
     _flush(folder)
 
 
-def _claim(folder: Path) -> int:
-    """Make a folder if need be and lock it; returns the handle that holds the lock."""
-    if folder.exists() and not folder.is_dir():
-        raise LidarpoolError(f"{folder} is a file: give a folder for the results with --out.")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder) as file:
-            return _lock(folder, file.fileno())
-    except BlockingIOError as error:
-        raise LidarpoolError(
-            f"Another run is using the folder {folder}: wait for it, or give another with --out."
-        ) from error
-    except OSError as error:
-        raise LidarpoolError(
-            f"Cannot write to the folder {folder} ({error.strerror}): give another with --out."
-        ) from error
-
-
-def _lock(folder: Path, spare: int) -> int:
+def _lock(folder: Path) -> int:
     """Lock a folder until the handle that is returned is closed, or this process ends."""
-    if sys.platform == "win32":  # has no locks on folders
-        return os.dup(spare)
     handle = os.open(folder, os.O_RDONLY)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if not (folder.exists() and os.path.samestat(os.fstat(handle), folder.stat())):
-            raise BlockingIOError(errno.EAGAIN, "removed by the run that had made it")
     except OSError as error:
         if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP):  # a network disk without locks
             os.close(handle)
@@ -227,25 +176,6 @@ def folder_in_the_way(folder: Path) -> str:
     )
 
 
-def _clear_up(folder: Path) -> None:
-    """Finish or remove what a killed run left, and refuse folders where files are to go."""
-    if obstacle := folder_in_the_way(folder):
-        raise LidarpoolError(obstacle)
-    try:
-        for whole in folder.glob(f"{_COMPLETE}*"):
-            if (whole / REPORT).exists():
-                _publish(whole, folder)
-            else:
-                whole.rmdir()
-        for staged in folder.glob(f"{_WRITING}*"):
-            shutil.rmtree(staged)
-    except OSError as error:
-        raise LidarpoolError(
-            f"{folder} holds what a killed run left, and it cannot be cleared up ({error}): "
-            f"remove its {_WRITING}* and {_COMPLETE}*, or give another folder with --out."
-        ) from error
-
-
 def _check_room(folder: Path) -> None:
     free = shutil.disk_usage(folder).free
     if free < ROOM_BYTES:
@@ -257,9 +187,7 @@ def _check_room(folder: Path) -> None:
 
 def _flush(path: Path) -> None:
     """Wait until the file or folder is on the disk."""
-    if sys.platform == "win32" and path.is_dir():
-        return  # Windows has no handle of a folder to flush
-    handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
+    handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
     finally:

@@ -7,6 +7,7 @@ import platform
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,16 +25,15 @@ from .cloud_numbers import CloudNumbers
 _ORDER = (GENERATE, INTERSECT, SORT, COLLECT, TRIAL)  # in which stages are listed
 
 _PACKAGES = (
-    "numpy",
-    "dask",
-    "distributed",
-    "trimesh",
-    "open3d-cpu",
-    "open3d",
-    "matplotlib",
-    "cupy-cuda12x",
-    "cupy-cuda13x",
-)
+    "numpy", "dask", "distributed", "trimesh", "open3d-cpu", "open3d", "matplotlib",
+    "cupy-cuda12x", "cupy-cuda13x",
+)  # fmt: skip
+# What `--json` prints of a report.
+_FIGURES = (
+    "backend", "notes", "scans", "rays", "hits", "points", "points_by_object", "seconds",
+    "placement_violations", "replayed", "duplicates_dropped", "resumed_scans",
+)  # fmt: skip
+_PLANNING = ("trials", "best_length", "shortest_possible", "collision_free")
 
 
 def versions() -> dict[str, str]:
@@ -82,9 +82,7 @@ def make_report(
         "stages": _stages(result.stages),
         "tasks": _tasks(result.stages),
         "placement_violations": sum(stage.violations for stage in result.stages),
-        "misplaced_tasks": [
-            asdict(record) for stage in result.stages for record in stage.misplaced
-        ][:20],
+        "misplaced_tasks": [asdict(record) for s in result.stages for record in s.misplaced][:20],
         "replayed": result.replayed,
         "duplicates_dropped": result.duplicates_dropped,
         "resumed_scans": result.resumed,
@@ -93,16 +91,33 @@ def make_report(
     }
 
 
+def summary(folder: Path, report: dict[str, Any], log: Path | None) -> dict[str, Any]:
+    """Return what `--json` prints: main figures of a report, and where the files are.
+
+    Parameters
+    ----------
+    folder, log
+        Where the files are, and the messages of libraries; None for none.
+    report
+        See `make_report`.
+    """
+    planning = report["planning"]
+    return {
+        "folder": str(folder),
+        "files": {name: str(folder / name) for name in report["files"]},
+        "log": str(log) if log else None,
+        **{name: report[name] for name in _FIGURES},
+        "planning": planning and {name: planning[name] for name in _PLANNING},
+    }
+
+
 def _parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
-    path = survey.path
-    first = [path.pose(station) for station in range(min(path.stations, 10))]
     return {
         "objects": len(scene.names),
         "triangles": len(scene.faces),
         "origin": scene.origin.tolist(),
         "sensor": _sensor(survey.sensor),
-        "poses": path.stations,
-        "first_poses": [asdict(pose) for pose in first],
+        "poses": survey.path.stations,
         "steps": survey.steps,
         "keep_every": survey.keep_every,
         "precision_m": survey.precision_m,

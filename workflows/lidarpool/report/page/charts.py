@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +18,7 @@ from .words import share
 
 HIGH, WIDE = 100, 1000  # units of a drawing, whatever its size on the page
 OBJECTS_MOST = 25
-RINGS_MOST = 128
+CHANNELS_MOST = 128
 TICKS = 6
 _POINTS_MOST = 400  # of a curve
 _LEAST_EXCESS = 1e-6  # a float32 history knows no less
@@ -53,7 +53,6 @@ class Histogram:
     path: str
     ticks: tuple[Tick, ...]
     tallest: int
-    columns: int
 
 
 @dataclass(frozen=True)
@@ -94,17 +93,17 @@ def range_histogram(counts: NDArray[np.int64], edges: Floats) -> Histogram:
     step = nice_step((high - low) / TICKS)
     at = np.arange(math.ceil(low / step - 1e-9), high / step + 1e-9) * step
     ticks = [(100 * (x - low) / (high - low), f"{x:.6g} m") for x in at.tolist()]
-    return Histogram(_columns(counts), tuple(ticks), int(counts.max()), len(counts))
+    return Histogram(_columns(counts), tuple(ticks), int(counts.max()))
 
 
-def ring_histogram(counts: NDArray[np.int64]) -> Histogram:
-    """Columns of points by layer, (layers,); neighbours together where there are many."""
-    each = -(-len(counts) // RINGS_MOST)
+def channel_histogram(counts: NDArray[np.int64]) -> Histogram:
+    """Columns of points by channel, (channels,); neighbours together where there are many."""
+    each = -(-len(counts) // CHANNELS_MOST)
     columns = np.add.reduceat(counts, np.arange(0, len(counts), each))
     step = max(1, round(nice_step(len(counts) / TICKS)))
     wide = len(columns) * each
-    ticks = [(100 * (ring + 0.5) / wide, str(ring)) for ring in range(0, len(counts), step)]
-    return Histogram(_columns(columns), tuple(ticks), int(columns.max()), len(columns))
+    ticks = [(100 * (k + 0.5) / wide, str(k)) for k in range(0, len(counts), step)]
+    return Histogram(_columns(columns), tuple(ticks), int(columns.max()))
 
 
 def _columns(counts: NDArray[np.int64]) -> str:
@@ -122,74 +121,41 @@ def _columns(counts: NDArray[np.int64]) -> str:
 
 
 def convergence(trials: Sequence[Trial], plan: Plan) -> Convergence | None:
-    """Curves of how the trials came down to the shortest path; None where there is nothing."""
+    """Curves of how the trials came down to the shortest path; None where there is nothing.
+
+    Up is the logarithm of the excess over the shortest possible path, or over the least cost
+    that was found where none is possible.
+    """
     costs = np.array([trial.history for trial in trials], np.float64)  # (trials, iterations)
     if not costs.size:
         return None
+    possible = 0 < plan.shortest_possible < math.inf
+    base = plan.shortest_possible if possible else max(float(costs.min()), 1e-9)
+    excess = np.log10(np.maximum(costs / base - 1, _LEAST_EXCESS))
+    low = math.floor(excess.min())
+    high = min(max(math.ceil(excess.max()), low + 1), max(1, low + 1))
     chosen = np.unique(np.linspace(0, costs.shape[1] - 1, _POINTS_MOST).astype(int))
-    best = next((k for k, trial in enumerate(trials) if trial.trial == plan.trial), 0)
-    scale = _scale(costs, plan.shortest_possible)
-    low, middle, high = np.quantile(costs[:, chosen], (0.1, 0.5, 0.9), axis=0, method="nearest")
-    x = (chosen + 1) / costs.shape[1] * WIDE
-    up, down = scale.line(x, high), scale.line(x[::-1], low[::-1])
-    step = max(1, round(nice_step(costs.shape[1] / TICKS)))
-    return Convergence(
-        band=f"M{up}L{down}Z",
-        median=f"M{scale.line(x, middle)}",
-        best=f"M{scale.line(x, costs[best, chosen])}",
-        across=tuple(
-            (100 * k / costs.shape[1], f"{k:,}") for k in range(0, costs.shape[1] + 1, step)
-        ),
-        up=tuple(scale.ticks()),
-        title=scale.title,
-    )
+    x = ((chosen + 1) / costs.shape[1] * WIDE).tolist()
 
-
-@dataclass(frozen=True)
-class _Scale:
-    """Costs to heights: logarithms of the excess over `shortest`, or metres where it is None."""
-
-    shortest: float | None
-    low: float
-    high: float
-
-    @property
-    def title(self) -> str:
-        if self.shortest is None:
-            return "lowest cost so far, in metres"
-        return "lowest cost so far, above the shortest possible path"
-
-    def line(self, x: Floats, costs: Floats) -> str:
+    def line(values: Floats, step: int = 1) -> str:
         """Points of a curve; what is above the drawing runs along its edge."""
-        values = _values(costs, self.shortest)
-        y = HIGH * (1 - (values.clip(self.low, self.high) - self.low) / (self.high - self.low))
-        return "L".join(f"{a:.1f} {b:.2f}" for a, b in zip(x.tolist(), y.tolist(), strict=True))
+        y = HIGH * (1 - (values.clip(low, high) - low) / (high - low))
+        points = list(zip(x, y.tolist(), strict=True))
+        return "L".join(f"{a:.1f} {b:.2f}" for a, b in points[::step])
 
-    def ticks(self) -> Iterable[Tick]:
-        """Whole powers of ten, or round lengths."""
-        if self.shortest is None:
-            step = nice_step((self.high - self.low) / 4)
-            at = np.arange(math.ceil(self.low / step), self.high / step + 1e-9) * step
-            labels = [f"{value:,.6g} m" for value in at.tolist()]
-        else:
-            at = np.arange(self.low, self.high + 0.5)
-            labels = [f"{10.0 ** (power + 2):.4g}%" for power in at.tolist()]
-        for value, label in zip(at.tolist(), labels, strict=True):
-            yield 100 * (value - self.low) / (self.high - self.low), label
-
-
-def _scale(costs: Floats, shortest: float) -> _Scale:
-    base = shortest if 0 < shortest < math.inf else None
-    values = _values(costs, base)
-    least = float(values.min())
-    if base is None:
-        return _Scale(None, least, max(float(np.quantile(values, 0.9)), least + 1e-3))
-    low = math.floor(max(least, math.log10(_LEAST_EXCESS)))
-    return _Scale(base, low, min(max(math.ceil(values.max()), low + 1), max(1, low + 1)))
-
-
-def _values(costs: Floats, shortest: float | None) -> Floats:
-    finite = np.nan_to_num(costs, nan=1e30, posinf=1e30)
-    if shortest is None:
-        return finite
-    return np.asarray(np.log10(np.maximum(finite / shortest - 1, _LEAST_EXCESS)))
+    best = next((k for k, trial in enumerate(trials) if trial.trial == plan.trial), 0)
+    tenth, middle, ninth = np.quantile(excess[:, chosen], (0.1, 0.5, 0.9), axis=0, method="nearest")
+    step = max(1, round(nice_step(costs.shape[1] / TICKS)))
+    iterations = range(0, costs.shape[1] + 1, step)
+    return Convergence(
+        band=f"M{line(ninth)}L{line(tenth, -1)}Z",
+        median=f"M{line(middle)}",
+        best=f"M{line(excess[best, chosen])}",
+        across=tuple((100 * k / costs.shape[1], f"{k:,}") for k in iterations),
+        up=tuple(
+            (100 * (power - low) / (high - low), f"{10.0 ** (power + 2):.4g}%")
+            for power in range(low, high + 1)
+        ),
+        title="lowest cost so far, above the "
+        + ("shortest possible path" if possible else "lowest that was found"),
+    )

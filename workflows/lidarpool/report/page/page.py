@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -21,10 +21,12 @@ from ...run.trials import TRIAL
 from ...scan import COLLECT, GENERATE, INTERSECT, SORT
 from ..cloud_numbers import CloudNumbers
 from . import words
-from .charts import convergence, object_bars, range_histogram, ring_histogram
+from .charts import channel_histogram, convergence, object_bars, range_histogram
 from .recipe import Recipe
-from .sentences import facts, pictures, summary
 from .timeline import make_timeline
+from .words import duration, excess, large, metres
+
+Report = Mapping[str, Any]
 
 # {stage: what it is called on the page}, in the order of the pipeline
 STAGES = {
@@ -37,18 +39,26 @@ STAGES = {
 
 
 @dataclass(frozen=True)
-class Picture:
-    """A picture within the page."""
+class Fact:
+    """A number at the head of the page; `bad` where it should be another."""
 
-    name: str
+    value: str
+    what: str
+    bad: bool = False
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture within the page, its words for those who do not see it, and its caption."""
+
+    uri: str
     alt: str
     caption: str
-    uri: str
 
 
 def write_page(
     path: Path,
-    report: Mapping[str, Any],
+    report: Report,
     result: Result,
     numbers: CloudNumbers,
     planning: Planning | None,
@@ -73,34 +83,26 @@ def write_page(
         If it cannot be written.
     """
     ordered = sorted(result.stages, key=lambda stage: list(STAGES).index(stage.stage))
-    page = (
-        _environment()
-        .get_template("page.html")
-        .stream(
-            report=report,
-            title="Lidar survey" + (f": {recipe.name}" if recipe else ""),
-            begun=_day(min((stage.start for stage in ordered), default=math.inf)),
-            summary=summary(report),
-            facts=facts(report),
-            pictures=[
-                _picture(path.parent / name, *said) for name, said in pictures(report).items()
-            ],
-            stages=ordered,
-            names=STAGES,
-            timeline=make_timeline(ordered, result.records, STAGES),
-            objects=object_bars(report["points_by_object"]),
-            cloud=numbers,
-            ranges=range_histogram(numbers.by_range, numbers.edges) if len(numbers.edges) else None,
-            rings=ring_histogram(numbers.by_channel) if len(result.points) else None,
-            curves=convergence(result.trials, result.plan) if planning and result.plan else None,
-            files=[(name, _size(path.parent / name, path)) for name in report["files"]],
-            recipe=recipe,
-            recipe_uri=_data_uri("text/yaml", recipe.scenario.encode(errors="backslashreplace"))
-            if recipe
-            else "",
-        )
+    begun = min((stage.start for stage in ordered), default=math.inf)
+    page = _environment().get_template("page.html")
+    text = page.render(
+        report=report,
+        title="Lidar survey" + (f": {recipe.name}" if recipe else ""),
+        begun=f"{datetime.fromtimestamp(begun, UTC):%Y-%m-%d %H:%M UTC}" if ordered else "",
+        summary=_summary(report),
+        facts=list(_facts(report)),
+        pictures=list(_pictures(report, path.parent)),
+        stages=ordered,
+        names=STAGES,
+        timeline=make_timeline(ordered, result.records, STAGES),
+        objects=object_bars(report["points_by_object"]),
+        cloud=numbers,
+        ranges=range_histogram(numbers.by_range, numbers.edges) if len(numbers.edges) else None,
+        channels=channel_histogram(numbers.by_channel) if len(result.points) else None,
+        curves=convergence(result.trials, result.plan) if planning and result.plan else None,
+        recipe=recipe,
     )
-    page.dump(str(path), encoding="utf-8")
+    path.write_text(text, encoding="utf-8")
 
 
 def _environment() -> Environment:
@@ -115,7 +117,7 @@ def _environment() -> Environment:
     )
     for filter_ in (
         words.duration, words.rate, words.large, words.share, words.excess, words.metres,
-        words.numbers, words.shortened, counted,
+        words.numbers, words.shortened, words.grouped, counted,
     ):  # fmt: skip
         environment.filters[filter_.__name__] = filter_
     return environment
@@ -128,22 +130,70 @@ def _presentable(value: object) -> object:
     return value
 
 
-def _day(seconds: float) -> str:
-    if not math.isfinite(seconds):
-        return ""
-    return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d %H:%M UTC")
+def _summary(report: Report) -> str:
+    """Say in a sentence what was done and what came out."""
+    parameters, planning = report["parameters"], report["planning"]
+    text = (
+        f"{counted(report['scans'], 'scan')} from {counted(parameters['poses'], 'position')} sent "
+        f"{counted(report['rays'], 'ray')} at {counted(parameters['objects'], 'object')}; "
+        f"{report['hits']:,} hit, and {counted(report['points'], 'point')} of them "
+        f"{'is' if report['points'] == 1 else 'are'} in the cloud"
+    )
+    if planning is None:
+        return f"{text}."
+    text += f"; {counted(planning['trials'], 'particle swarm')} searched for a path meanwhile"
+    if not planning["collision_free"]:
+        return f"{text}, and found none that is free of collisions."
+    text += f": the best is {metres(planning['best_length'])} long"
+    if planning["excess"] is None:
+        return f"{text}."
+    return f"{text}, {excess(planning['excess']).removeprefix('+')} above the shortest possible."
 
 
-def _picture(path: Path, alt: str, caption: str) -> Picture:
-    return Picture(path.name, alt, caption, _data_uri("image/png", path.read_bytes()))
+def _facts(report: Report) -> Iterator[Fact]:
+    """Give the numbers for the head of the page."""
+    seconds, wrong = report["seconds"], report["placement_violations"]
+    yield Fact(large(report["points"]), "points in the cloud")
+    yield Fact(large(report["rays"]), f"rays, cast by {report['backend']}")
+    if report["stages"]:
+        yield Fact(duration(seconds["survey"]), "for the survey")
+        if report["planning"] is not None:
+            yield Fact(duration(seconds["planning"]), "for the planning")
+            beside = seconds["survey_and_planning_overlap"]
+            yield Fact(duration(beside), "both at work at the same time")
+    yield Fact(f"{wrong:,}", "tasks outside their partition", bad=wrong > 0)
 
 
-def _data_uri(kind: str, data: bytes) -> str:
-    return f"data:{kind};base64,{base64.b64encode(data).decode()}"
-
-
-def _size(file: Path, page: Path) -> str:
-    """Size of a file, if it is there already: the report comes last."""
-    if file == page:
-        return "this page"
-    return words.size(file.stat().st_size) if file.exists() else ""
+def _pictures(report: Report, folder: Path) -> Iterator[Picture]:
+    """Give the pictures that there are."""
+    parameters = report["parameters"]
+    objects = counted(parameters["objects"], "object")
+    poses = counted(parameters["poses"], "sensor position")
+    every = parameters["keep_every"]
+    kept = "one for each hit" if every == 1 else f"one for every {every:,} hits of a scan"
+    for name, alt, caption in (
+        (
+            "scene.png",
+            f"Rendered scene of {objects}, with {poses} marked by red dots",
+            f"The scene: {objects} of {counted(parameters['triangles'], 'triangle')}, {poses}.",
+        ),
+        (
+            "intensity.png",
+            "The same scene coloured by hits per square metre, with sample rays in red",
+            f"Where the {counted(report['hits'], 'hit')} fell, per square metre, and some rays.",
+        ),
+        (
+            "cloud.png",
+            "Point cloud of the scene, coloured by height, from the same viewpoint",
+            f"The cloud: {counted(report['points'], 'point')}, {kept}, rounded to "
+            f"{parameters['precision_m']:g} m.",
+        ),
+        (
+            "path.png",
+            "Plan of the obstacles as discs, with the paths of all trials and the best one",
+            "The planned path, seen from above, among those of the trials.",
+        ),
+    ):
+        if name in report["files"]:
+            data = base64.b64encode((folder / name).read_bytes()).decode()
+            yield Picture(f"data:image/png;base64,{data}", alt, caption)

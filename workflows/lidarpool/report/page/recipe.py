@@ -28,8 +28,6 @@ class Recipe:
         The command, for a shell; empty where it was not one.
     scenario
         The scenario as YAML, with what was left to defaults.
-    file
-        Name for a file of it.
     remark
         What else is needed, such as where mesh files are looked for.
     """
@@ -37,30 +35,24 @@ class Recipe:
     name: str
     command: str
     scenario: str
-    file: str
     remark: str = ""
 
 
 def make_recipe(scenario: Scenario, context: click.Context | None) -> Recipe:
-    """Write a recipe.
-
-    Parameters
-    ----------
-    scenario
-        What was run.
-    context
-        The command as it was called; None where it was not.
-    """
+    """Write a recipe of a scenario, and of the command as it was called, if it was one."""
     source = context.params.get("scenario") if context else None
-    text, remark = _as_yaml(scenario)
-    remarks = [remark] if remark else []
+    remarks = []
     if scenario.scene.files:
-        remarks.insert(0, "File names start from the folder that the scenario is in.")
+        remarks.append("File names start from the folder that the scenario is in.")
+    if scenario.poses is not None and len(scenario.poses) > POSES_MOST:
+        remarks.append(
+            f"Only the first {POSES_MOST:,} of its {len(scenario.poses):,} poses are written here."
+        )
+        scenario = scenario.model_copy(update={"poses": scenario.poses[:POSES_MOST]})
     return Recipe(
         name="the default survey" if source is None else Path(source).name,
         command=shlex.join(_words(context)) if context else "",
-        scenario=text,
-        file="scenario.yaml" if source is None else f"{Path(source).stem}.yaml",
+        scenario=_as_yaml(scenario),
         remark=" ".join(remarks),
     )
 
@@ -80,18 +72,13 @@ def _words(context: click.Context) -> list[str]:
     return words + named
 
 
-def _as_yaml(scenario: Scenario) -> tuple[str, str]:
-    """Return a scenario as YAML that can be loaded, and what is to be said about it."""
-    poses, remark = scenario.poses, ""
-    if poses is not None and len(poses) > POSES_MOST:
-        remark = f"Only the first {POSES_MOST:,} of its {len(poses):,} poses are written here."
-        scenario = scenario.model_copy(update={"poses": poses[:POSES_MOST]})
+def _as_yaml(scenario: Scenario) -> str:
+    """Return a scenario as YAML that can be loaded."""
     data = scenario.model_dump(mode="json", exclude_none=True)
     for entry in data["scene"]["files"]:
         if "matrix" in entry:  # says where a mesh stands; the other three would contradict it
             for name in ("translation", "rotation_deg", "scale"):
                 entry.pop(name, None)
-    text = yaml.safe_dump(
+    return yaml.safe_dump(
         data, sort_keys=False, allow_unicode=True, default_flow_style=None, width=96
     )
-    return text, remark

@@ -20,8 +20,7 @@ from .words import duration
 
 WIDTH = 1000  # units of the drawing, whatever its width on the page
 ROW = 18  # height of a row
-LANES_MOST = 48  # of all partitions; what is beyond is drawn together
-SLICES = 250  # of the time, in what is drawn together
+ROWS_MOST = 24  # of a partition; the busiest are drawn
 _THIN = 1.2  # units that a bar is wide at least
 _GAP = 0.6  # units between bars that are drawn as one
 
@@ -30,26 +29,22 @@ Span = tuple[float, float]
 
 @dataclass(frozen=True)
 class Row:
-    """One row: bars of one stage on one worker, or a curve of what was folded.
+    """The bars of one stage, on one worker or on all.
 
     Parameters
     ----------
     label, detail
         What stands before it, and what is said on a closer look.
     stage
-        Whose colour it has; empty for what is of several.
+        Whose colour it has.
     bars
-        A path for SVG: lines along the middle of the row to be drawn thick, or a filled area
-        where `folded`.
-    folded
-        Whether several workers are in it.
+        A path for SVG: lines along the middle of the row, to be drawn thick.
     """
 
     label: str
     detail: str
     stage: str
     bars: str
-    folded: bool = False
 
 
 @dataclass(frozen=True)
@@ -75,8 +70,8 @@ class Timeline:
         The stages, then each partition's workers.
     both
         Where stage 2 and planning ran at the same time: (from, to) in units.
-    drawn, tasks
-        Tasks with a record of their own, and all.
+    tasks
+        How many there were.
     row
         Height of a row.
     """
@@ -85,7 +80,6 @@ class Timeline:
     ticks: tuple[tuple[float, str], ...]
     groups: tuple[Group, ...]
     both: tuple[Span, ...]
-    drawn: int
     tasks: int
     row: int = ROW
 
@@ -106,6 +100,9 @@ class _Axis:
             wide.append((low, max((stop - self.begin) * scale, low + _THIN)))
         return union(wide, _GAP)
 
+    def bars(self, times: Iterable[Span]) -> str:
+        return "".join(f"M{low:.1f} {ROW / 2:g}H{high:.1f}" for low, high in self.spans(times))
+
 
 def make_timeline(
     stages: Sequence[StageTotals], records: Sequence[TaskRecord], names: dict[str, str]
@@ -117,7 +114,7 @@ def make_timeline(
     stages
         All tasks of each stage, in the order in which they are listed.
     records
-        Tasks by themselves.
+        Tasks by themselves; of thousands, some.
     names
         {stage: what it is called on the page}.
     """
@@ -125,52 +122,38 @@ def make_timeline(
         return None
     axis = _Axis(stages)
     step = nice_step(axis.seconds / 6)
-    ticks = [(100 * t / axis.seconds, f"{t:.6g} s") for t in np.arange(0, axis.seconds, step)]
-    groups = [_overview(axis, stages, names)]
-    lanes = {name: _lanes(members) for name, members in sorted(_by_partition(records).items())}
-    ran = sum((stage.resources for stage in stages), Counter())  # {partition: tasks}
-    room = _shared(LANES_MOST, [len(found) for found in lanes.values()])
-    for (partition, found), most in zip(lanes.items(), room, strict=True):
-        drawn = sum(len(tasks) for _, _, tasks in found)
-        tasks = max(ran[partition], drawn)
-        rows = _workers(axis, found, most, names, tasks / drawn)
-        workers = {worker for worker, _, _ in found}  # of the tasks that have a record
-        workers = workers.union(*(s.workers for s in stages if s.partition == partition))
-        detail = f"{counted(len(workers), 'worker')}, {counted(tasks, 'task')}"
-        if tasks > drawn:  # else the gaps would pass for idleness
-            detail += f", of which {drawn:,} are drawn: the gaps are not all idle time"
-        groups.append(Group(partition, detail, rows))
-    return Timeline(
-        seconds=axis.seconds,
-        ticks=tuple(ticks),
-        groups=tuple(groups),
-        both=tuple(_together(axis, stages)),
-        drawn=len(records),
-        tasks=sum(stage.tasks for stage in stages),
-    )
-
-
-def _overview(axis: _Axis, stages: Sequence[StageTotals], names: dict[str, str]) -> Group:
-    rows = []
-    for stage in stages:
-        detail = (
+    overview = [
+        Row(
+            names[stage.stage],
             f"{names[stage.stage]}: {counted(stage.tasks, 'task')}, {duration(stage.seconds)} of "
-            f"work within {duration(stage.stop - stage.start)}"
+            f"work within {duration(stage.stop - stage.start)}",
+            stage.stage,
+            axis.bars(stage.busy),
         )
-        bars = _lines(axis.spans(stage.busy))
-        rows.append(Row(names[stage.stage], detail, stage.stage, bars))
-    return Group("Stages", "while at least one task ran", tuple(rows))
-
-
-def _together(axis: _Axis, stages: Sequence[StageTotals]) -> list[Span]:
-    """Where stage 2 and planning were both under way, in units."""
+        for stage in stages
+    ]
+    groups = [Group("Stages", "while at least one task ran", tuple(overview))]
+    ran = sum((stage.resources for stage in stages), Counter())  # {partition: tasks}
+    for partition, tasks in sorted(_by_partition(records).items()):
+        workers = {task.worker for task in tasks}  # that have a record
+        workers = workers.union(*(s.workers for s in stages if s.partition == partition))
+        groups.append(_group(axis, partition, len(workers), ran[partition], tasks, names))
     spans = {stage.stage: axis.spans(stage.busy) for stage in stages}
-    return [
+    both = [
         (max(a[0], b[0]), min(a[1], b[1]))
         for a in spans.get(INTERSECT, [])
         for b in spans.get(TRIAL, [])
         if min(a[1], b[1]) > max(a[0], b[0])
     ]
+    return Timeline(
+        seconds=axis.seconds,
+        ticks=tuple(
+            (100 * t / axis.seconds, f"{t:.6g} s") for t in np.arange(0, axis.seconds, step)
+        ),
+        groups=tuple(groups),
+        both=tuple(both),
+        tasks=sum(stage.tasks for stage in stages),
+    )
 
 
 def _by_partition(records: Iterable[TaskRecord]) -> dict[str, list[TaskRecord]]:
@@ -182,75 +165,38 @@ def _by_partition(records: Iterable[TaskRecord]) -> dict[str, list[TaskRecord]]:
     return found
 
 
-Lane = tuple[str, str, list[TaskRecord]]  # worker, stage, tasks one after the other
-
-
-def _lanes(records: Iterable[TaskRecord]) -> list[Lane]:
-    """Divide tasks so that those of a lane are of one worker and stage and do not overlap."""
-    by_place: dict[tuple[str, str], list[list[TaskRecord]]] = defaultdict(list)
-    for record in sorted(records, key=lambda record: (record.start, record.stop)):
-        lanes = by_place[record.worker, record.stage]
-        for lane in lanes:
-            if lane[-1].stop <= record.start:
-                lane.append(record)
-                break
-        else:
-            lanes.append([record])
-    return [(*place, lane) for place, lanes in by_place.items() for lane in lanes]
-
-
-def _workers(
-    axis: _Axis, lanes: list[Lane], most: int, names: dict[str, str], each: float
-) -> tuple[Row, ...]:
-    """Rows of a partition: the busiest lanes by themselves, the others together.
-
-    `each` is the number of tasks that one with a record stands for.
-    """
-    lanes = sorted(lanes, key=lambda lane: -sum(task.seconds for task in lane[2]))
-    shown, rest = lanes[:most], lanes[most:]
-    rows = []
-    for worker, stage, tasks in sorted(shown, key=lambda lane: _natural(lane[0], lane[2])):
-        busy = duration(sum(task.seconds for task in tasks))
-        detail = f"{worker}: {names[stage]}, {counted(len(tasks), 'task')}, {busy}"
-        spans = axis.spans((task.start, task.stop) for task in tasks)
-        rows.append(Row(worker, detail, stage, _lines(spans)))
-    if rest:
-        rows.append(_folded(axis, rest, each))
-    return tuple(rows)
-
-
-def _folded(axis: _Axis, lanes: list[Lane], each: float) -> Row:
-    """Draw many lanes as one area: how large a share of them was busy when."""
-    busy = np.zeros(SLICES)  # lanes that were busy in each slice
-    for _, _, tasks in lanes:
-        at_work = np.zeros(SLICES, bool)
-        for start, stop in axis.spans((task.start, task.stop) for task in tasks):
-            at_work[int(start * SLICES / WIDTH) : int(np.ceil(stop * SLICES / WIDTH))] = True
-        busy += at_work
-    high = (ROW - 4) * np.minimum(each * busy / len(lanes), 1.0)
-    width = WIDTH / SLICES
-    steps = "".join(f"V{ROW - 2 - level:.1f}H{(k + 1) * width:.0f}" for k, level in enumerate(high))
-    label = f"and {counted(len(lanes), 'more lane')}"
-    return Row(
-        label, f"{label}: the share that was busy", "", f"M0 {ROW - 2}{steps}V{ROW - 2}Z", True
+def _group(
+    axis: _Axis,
+    partition: str,
+    workers: int,
+    ran: int,
+    tasks: Sequence[TaskRecord],
+    names: dict[str, str],
+) -> Group:
+    """Rows of a partition: one for each worker and stage, the busiest of them."""
+    rows: dict[tuple[str, str], list[TaskRecord]] = defaultdict(list)
+    for task in tasks:
+        rows[task.worker, task.stage].append(task)
+    busiest = sorted(rows.items(), key=lambda row: -sum(task.seconds for task in row[1]))
+    detail = f"{counted(workers, 'worker')}, {counted(max(ran, len(tasks)), 'task')}"
+    if ran > len(tasks):  # else the gaps would pass for idleness
+        detail += f", of which {len(tasks):,} are known: the gaps are not all idle time"
+    if len(rows) > ROWS_MOST:
+        detail += f"; the busiest {ROWS_MOST} of {len(rows):,} rows"
+    drawn = []
+    order = list(names)
+    shown = sorted(
+        busiest[:ROWS_MOST], key=lambda row: (_natural(row[0][0]), order.index(row[0][1]))
     )
+    for (worker, stage), those in shown:
+        busy = duration(sum(task.seconds for task in those))
+        said = f"{worker}: {names[stage]}, {counted(len(those), 'task')}, {busy}"
+        bars = axis.bars((task.start, task.stop) for task in those)
+        drawn.append(Row(worker, said, stage, bars))
+    return Group(partition, detail, tuple(drawn))
 
 
-def _lines(spans: Iterable[Span]) -> str:
-    return "".join(f"M{low:.1f} {ROW / 2:g}H{high:.1f}" for low, high in spans)
-
-
-def _natural(worker: str, tasks: Sequence[TaskRecord]) -> tuple[list[tuple[int, str]], float]:
-    """Sort key: GPU-2 before GPU-10, lanes of a worker as they began."""
+def _natural(worker: str) -> list[tuple[int, str]]:
+    """Sort key: GPU-2 before GPU-10."""
     pieces = re.split(r"(\d+)", worker)
-    return [(int(p), "") if p.isdecimal() else (-1, p) for p in pieces], tasks[0].start
-
-
-def _shared(room: int, wanted: Sequence[int]) -> list[int]:
-    """Divide `room` so that nobody gets more than wanted and the small ones all they want."""
-    given = [0] * len(wanted)
-    left = room
-    for position, k in enumerate(sorted(range(len(wanted)), key=lambda k: wanted[k])):
-        given[k] = min(wanted[k], max(1, left // (len(wanted) - position)))
-        left -= given[k]
-    return given
+    return [(int(p), "") if p.isdecimal() else (-1, p) for p in pieces]

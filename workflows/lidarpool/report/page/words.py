@@ -25,6 +25,11 @@ def shortened(name: str) -> str:
     return f"{name[: LETTERS_MOST - tail - 1]}…{name[-tail:]}"
 
 
+def grouped(count: int) -> str:
+    """Return a whole number with its thousands apart."""
+    return f"{count:,}"
+
+
 def duration(seconds: float) -> str:
     """Return a time in the unit that suits it."""
     if seconds < 0.001:
@@ -41,9 +46,7 @@ def duration(seconds: float) -> str:
 
 def rate(number: float, seconds: float) -> str:
     """Return how many there were in a second; a dash where that cannot be said."""
-    if seconds <= 0:
-        return "–"
-    return f"{large(number / seconds)}/s"
+    return f"{large(number / seconds)}/s" if seconds > 0 else "–"
 
 
 def large(number: float) -> str:
@@ -55,29 +58,16 @@ def large(number: float) -> str:
     return f"{number:,.0f}" if number >= 100 else f"{number:.3g}"
 
 
-def size(count: int) -> str:
-    """Bytes in the unit that suits them."""
-    for unit, letters in ((1e9, "GB"), (1e6, "MB"), (1e3, "kB")):
-        if count >= unit:
-            return f"{count / unit:.3g} {letters}"
-    return f"{count} bytes"
-
-
 def share(part: float, whole: float) -> str:
     """Return a part in per cent."""
-    if not whole:
-        return "–"
-    percent = 100 * part / whole
-    return "< 0.1%" if 0 < percent < 0.1 else f"{percent:.1f}%"
+    return f"{100 * part / whole:.1f}%" if whole else "–"
 
 
 def excess(fraction: float) -> str:
     """Return by how much something is longer, in per cent: «+0.12%»."""
-    percent = 100 * fraction
-    text = f"{percent:+.2f}%" if abs(percent) >= 0.01 or percent == 0 else f"{percent:+.1g}%"
-    if "e" in text:
-        text = "< 0.01%"
-    return text.replace("-", MINUS)
+    if 0 < fraction < 1e-4:
+        return "< 0.01%"
+    return f"{fraction:+.2%}".replace("-", MINUS)
 
 
 def metres(value: float | None) -> str:
