@@ -144,11 +144,6 @@ def test_cuda_without_a_gpu(refused):
 # -- where the result goes ----------------------------------------------------------------------
 
 
-def test_out_has_a_folder_where_a_file_is_to_go(place, refused):
-    (place / "lidarpool-out" / "scene.png").mkdir()
-    refused(["run", "good.yaml"], "scene.png is a folder")
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="no locks on folders")
 def test_out_is_in_use_by_another_run(place, refused):
     import fcntl

@@ -162,10 +162,10 @@ def test_a_cluster_that_lacks_a_partition(check, cluster):
 
 
 def test_a_folder_that_cannot_take_a_result(check, tmp_path):
-    (tmp_path / "out" / "cloud.ply").mkdir(parents=True)
+    (tmp_path / "out").write_text("")
     outcome = check("--no-plan")
     assert outcome.code == 2
-    assert "cloud.ply is a folder, and a result has a file of that name" in outcome.err
+    assert "out is a file: give a folder for the results with --out" in outcome.err
 
 
 @pytest.mark.parametrize(

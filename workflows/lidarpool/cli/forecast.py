@@ -21,7 +21,7 @@ from raybeam import available_backends
 from ..base.choice import one_of_each_part
 from ..base.errors import LidarpoolError
 from ..columns.cloud import CHUNK_POINTS
-from ..report.output import ROOM_BYTES, folder_in_the_way
+from ..report.output import ROOM_BYTES
 from ..run.checks import check_backend_here, find_workers, slots_needed
 from ..run.database import FILE
 from ..run.job import Job
@@ -189,8 +189,6 @@ def _look_at_folder(out: Path) -> tuple[list[str], list[str]]:
         reasons.append(f"{there} is a file: give a folder for the results with --out.")
     elif not os.access(there, os.W_OK | os.X_OK):
         reasons.append(f"Cannot write to the folder {there}: give another with --out.")
-    elif obstacle := folder_in_the_way(out):
-        reasons.append(obstacle)
     if not (out / RUN_FOLDER / FILE).exists():
         return reasons, []
     note = f"{out} holds an unfinished run: --resume goes on with it, --fresh drops it"

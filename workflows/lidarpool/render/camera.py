@@ -17,26 +17,13 @@ class Camera:
 
     Pixel coordinates are continuous: x to the right, y down, the centre of the first pixel at
     (0.5, 0.5).
-
-    Parameters
-    ----------
-    eye
-        (3,) metres.
-    axes
-        (3, 3), rows: unit vectors to the right, up and forward.
-    focal
-        Focal length in pixels.
-    centre
-        (2,) pixel that looks straight ahead; it may lie outside the image.
-    size
-        Width and height in pixels.
     """
 
-    eye: Floats
-    axes: Floats
-    focal: float
-    centre: Floats
-    size: tuple[int, int]
+    eye: Floats  # (3,) metres
+    axes: Floats  # (3, 3), rows: unit vectors to the right, up and forward
+    focal: float  # length in pixels
+    centre: Floats  # (2,) pixel that looks straight ahead; it may lie outside the image
+    size: tuple[int, int]  # width and height in pixels
 
     def rays(self, pixels: ArrayLike) -> Floats:
         """Return unit directions (n, 3) through pixel coordinates (n, 2)."""

@@ -28,25 +28,13 @@ class Cutaway:
     other. So near walls and the roof go, both of their faces, while far walls, the floor and
     what stands inside stay, however the triangles are wound and grouped.
 
-    Parameters
-    ----------
-    surface
-        The triangles.
-    sensors
-        (p, 3) metres.
-    eye
-        (3,) the camera.
-    surrounds
-        bool (objects,): whether the sensors are within an object, seen from above.
-    core
-        (objects, 2, 3) box inside each object's shell.
     """
 
     surface: Surface
-    sensors: Floats
-    eye: Floats
-    surrounds: Bools
-    core: Floats
+    sensors: Floats  # (p, 3) metres
+    eye: Floats  # (3,) the camera
+    surrounds: Bools  # (objects,) whether the sensors are within it, seen from above
+    core: Floats  # (objects, 2, 3) box inside each object's shell
 
     @classmethod
     def around(cls, surface: Surface, sensors: Floats, eye: Floats) -> Cutaway:

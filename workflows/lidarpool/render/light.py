@@ -26,30 +26,16 @@ AMBIENT, SKY, SUN = 0.24, 0.54, 0.36  # brightness of a surface that faces them
 
 @dataclass(frozen=True, eq=False)
 class LightMap:
-    """How much light reaches a grid of pixels, and on which surface each of them lies.
+    """How much light reaches a grid of pixels, and on which surface each of them lies."""
 
-    Parameters
-    ----------
-    sun
-        (3,) unit vector towards the sun.
-    openness
-        (rows, columns) in 0 to 1: the share of the light that nothing keeps off.
-    position, normal
-        (rows, columns, 3); NaN where there is no surface.
-    """
-
-    sun: Floats
-    openness: Reals
-    position: Reals
-    normal: Reals
+    camera: Camera
+    sun: Floats  # (3,) unit vector towards it
+    openness: Reals  # (rows, columns) in 0 to 1: the share of the light that nothing keeps off
+    position: Reals  # (rows, columns, 3) metres; NaN where there is no surface
+    normal: Reals  # (rows, columns, 3)
 
     def brightness(
-        self,
-        pixels: Floats,
-        position: Reals,
-        normal: Reals,
-        tolerance: Reals,
-        ground: NDArray[np.bool_],
+        self, pixels: Floats, position: Reals, normal: Reals, ground: NDArray[np.bool_]
     ) -> Reals:
         """Brightness (n,) of points: Lambert's law for the sun, and the open part of the sky.
 
@@ -59,21 +45,18 @@ class LightMap:
             (n, 2) where the points are in the picture.
         position, normal
             (n, 3).
-        tolerance
-            (n,) metres, see `alike`.
         ground
             bool (n,): whether they are of the ground, whose colour in the open is as it is.
         """
-        openness = self._openness_at(pixels, position, normal, tolerance)
+        openness = self._openness_at(pixels, position, normal)
         facing = np.clip(normal @ self.sun.astype(np.float32), 0, None)
         lit = AMBIENT + openness * (SKY * (0.6 + 0.4 * normal[:, 2]) + SUN * facing)
         return np.asarray(np.where(ground, 0.6 + 0.4 * openness, lit))
 
-    def _openness_at(
-        self, pixels: Floats, position: Reals, normal: Reals, tolerance: Reals
-    ) -> Reals:
+    def _openness_at(self, pixels: Floats, position: Reals, normal: Reals) -> Reals:
         """Interpolate openness (n,) between the nine grid points around that are on the surface."""
         rows, columns = self.openness.shape
+        tolerance = plane_tolerance(self.camera, position, STRIDE)
         start = ((pixels - 0.5) / STRIDE - 0.5).astype(np.float32) - (STRIDE // 2) / STRIDE
         cell = np.floor(start).astype(np.int64)
         part = start - cell
@@ -103,7 +86,13 @@ def alike(position: Reals, normal: Reals, spot: Reals, facing: Reals, tolerance:
         return np.where(near, np.clip(dot(facing, normal) - 0.6, 0, None), 0)
 
 
-def sun_direction(camera: Camera) -> Floats:
+def plane_tolerance(camera: Camera, position: Reals, stride: int) -> Reals:
+    """How far in metres points of one surface, `stride` pixels apart, may be from its plane."""
+    distance = np.linalg.norm(position - camera.eye.astype(np.float32), axis=-1)
+    return (3 * stride * camera.footprint(distance)).astype(np.float32)
+
+
+def _sun_direction(camera: Camera) -> Floats:
     """Towards the sun, (3,): over the camera's left shoulder, so that shadows fall right."""
     back = -camera.axes[2] * np.array([1.0, 1.0, 0.0])
     sun = 0.4 * back / np.linalg.norm(back) - 0.55 * camera.axes[0] + np.array([0.0, 0.0, 0.95])
@@ -132,7 +121,7 @@ def make_light_map(
     reach
         Surfaces farther than this, in metres, cast no shadow.
     """
-    sun = sun_direction(camera)
+    sun = _sun_direction(camera)
     there = np.isfinite(position[..., 0])
     at, facing = position[there].astype(np.float64), normal[there].astype(np.float64)
     # Rays start half a pixel off the surface, so that it does not shade itself.
@@ -151,7 +140,7 @@ def make_light_map(
         open_[free] += falls[free]
     openness = np.ones(there.shape, np.float32)
     openness[there] = open_ / full
-    return LightMap(sun, openness, position, normal)
+    return LightMap(camera, sun, openness, position, normal)
 
 
 def _lights(sun: Floats) -> tuple[Floats, Floats, Floats]:

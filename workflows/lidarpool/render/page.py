@@ -15,7 +15,6 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import ListedColormap, LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from ..base.errors import LidarpoolError
@@ -145,7 +144,7 @@ class Page:
         self.key(
             [
                 Line2D([], [], ls="", marker=marker, color=colour, ms=0.85 * size * self.unit,
-                       mec="none", label=_shortened(name))
+                       mec="none", label=shortened(name))
                 for marker, name, colour in rows
             ],
             size,
@@ -177,14 +176,6 @@ class Page:
         if isinstance(norm, LogNorm):
             axes.yaxis.set_major_formatter(lambda value, _: f"{value:,.12g}")
             axes.yaxis.set_minor_formatter(lambda value, _: "")
-
-    def note(self, axes: Axes, text: str) -> None:
-        """Write a remark into the middle of the picture."""
-        halo = [withStroke(linewidth=3 * self.unit, foreground=theme.PAGE)]
-        axes.text(
-            0.43, 0.5, text, transform=axes.transAxes, ha="center", va="center",
-            fontsize=9 * self.unit, color=theme.MUTED, path_effects=halo, family=FONT,
-        )  # fmt: skip
 
     def save(self, path: Path) -> None:
         """Write the page as a PNG.
@@ -231,13 +222,11 @@ def _axis_edges(shot: Shot) -> list[tuple[Floats, Floats, Floats]]:
     return [*out, (foot, top, np.array([-1.0, 0.0]))]
 
 
-def _shortened(name: str) -> str:
-    """Cut a long name in its middle, so that it fits the legend; control characters show."""
+def shortened(name: str, most: int = LEGEND_LETTERS) -> str:
+    """Cut a name in its middle where it has more letters than `most`; control characters show."""
     name = "".join(letter if letter.isprintable() else "\ufffd" for letter in name)
-    if len(name) <= LEGEND_LETTERS:
-        return name
-    keep = LEGEND_LETTERS - 1
-    return f"{name[: keep - keep // 2]}…{name[-(keep // 2) :]}"
+    tail = (most - 1) // 2
+    return name if len(name) <= most else f"{name[: most - 1 - tail]}…{name[-tail:]}"
 
 
 def without_common_prefix(names: Sequence[str]) -> list[str]:

@@ -63,10 +63,7 @@ def draw_intensity(
     axes = page.show(shot, shot.paint(colours, 0.5))
     some = np.linspace(0, len(sample_rays) - 1, min(len(sample_rays), MOST_RAYS)).astype(int)
     page.lines(axes, shot, sample_rays[some].astype(np.float64), 0.45, 0.5)
-    if density.any():
-        page.colour_bar(TURBO, LogNorm(low, high), "hits per square metre")
-    else:
-        page.note(axes, "no ray hit the scene")
+    page.colour_bar(TURBO, LogNorm(low, high), "hits per square metre")
     hits = counted(int(hit_counts.sum()), "hit")
     page.title("Ray intensity", f"{hits} · {_positions(shot)} · grey: hit by no ray")
     page.save(path)
@@ -92,9 +89,7 @@ def draw_cloud(path: Path, shot: Shot, positions: Floats, count: int) -> None:
             image, shot, positions - shot.scene.origin, TURBO[(share * 255).astype(np.int64)]
         )
         page.colour_bar(TURBO, Normalize(low, high), "height z (m)")
-    axes = page.show(shot, image)
-    if not len(positions):
-        page.note(axes, "no points")
+    page.show(shot, image)
     page.title("Point cloud", f"{counted(count, 'point')} · {_positions(shot)}")
     page.save(path)
 

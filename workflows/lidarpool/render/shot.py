@@ -12,7 +12,7 @@ from ..scene.scene import Scene
 from . import theme
 from .camera import Camera, fit_camera
 from .cutaway import cast_through, plan_cutaway
-from .light import STRIDE, LightMap, alike, make_light_map
+from .light import STRIDE, alike, make_light_map, plane_tolerance
 from .stage import Stage
 from .surface import Surface
 
@@ -29,25 +29,13 @@ STEPS = 700  # places along a line where it is tested for being seen
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """What rays of the camera met; every array has one row a ray.
+    """What rays of the camera met; every array has one row a ray."""
 
-    Parameters
-    ----------
-    triangle
-        int64 (n,) or SKY, GROUND.
-    distance
-        float32 (n,) metres, infinite for the sky.
-    position, normal
-        float32 (n, 3), NaN for the sky.
-    light
-        float32 (n,) brightness: 1 on open ground.
-    """
-
-    triangle: NDArray[np.int64]
-    distance: Reals
-    position: Reals
-    normal: Reals
-    light: Reals
+    triangle: NDArray[np.int64]  # (n,) or SKY, GROUND
+    distance: Reals  # (n,) metres, infinite for the sky
+    position: Reals  # (n, 3) metres, NaN for the sky
+    normal: Reals  # (n, 3) unit length, NaN for the sky
+    light: Reals  # (n,) brightness: 1 on open ground
 
     def paint(self, face_colours: Floats, contrast: float) -> Reals:
         """Colours (n, 3) of the samples; see `Shot.paint`."""
@@ -60,31 +48,15 @@ class Samples:
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A scene on its ground with sensors in it, seen by a camera.
-
-    Parameters
-    ----------
-    scene
-        What is seen.
-    sensors
-        (p, 3) metres, local coordinates.
-    stage
-        Ground and axes.
-    camera
-        Its pixels are those of the picture.
-    whole
-        What is seen through the middle of each pixel.
-    edges, finer
-        int64 (e,) pixels that show the edge of something, and several samples of each in turn.
-    """
+    """A scene on its ground with sensors in it, seen by a camera."""
 
     scene: Scene
-    sensors: Floats
+    sensors: Floats  # (p, 3) metres, local coordinates
     stage: Stage
     camera: Camera
-    whole: Samples
-    edges: NDArray[np.int64]
-    finer: Samples
+    whole: Samples  # through the middle of each pixel
+    edges: NDArray[np.int64]  # (e,) pixels that show the edge of something
+    finer: Samples  # several of each of these in turn
 
     @property
     def depth(self) -> Reals:
@@ -181,7 +153,7 @@ def take_shot(
         cutaway = replace(cutaway, eye=camera.eye)
 
     def see(pixels: Floats) -> Samples:
-        """Look through places (n, 2) of the picture, in pixels; all is lit."""
+        """Look through places (n, 2) of the picture, in pixels; light is still to come."""
         directions = camera.rays(pixels)
         distance, triangle, u, v = cast_through(surface, cutaway, camera.eye, directions)
         normal = np.full((len(pixels), 3), np.nan, np.float32)
@@ -193,8 +165,8 @@ def take_shot(
         with np.errstate(invalid="ignore"):
             position = (camera.eye + distance[:, None] * directions).astype(np.float32)
         position[triangle == SKY] = np.nan
-        lit = np.ones(len(pixels), np.float32)
-        return Samples(triangle, distance.astype(np.float32), position, normal, lit)
+        light = np.ones(len(pixels), np.float32)
+        return Samples(triangle, distance.astype(np.float32), position, normal, light)
 
     width, height = size
     grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
@@ -208,8 +180,13 @@ def take_shot(
     edges = np.flatnonzero(_edges(whole, scene, camera))
     corners = np.array([[-0.125, -0.375], [0.375, -0.125], [-0.375, 0.125], [0.125, 0.375]])
     places = (centres[edges, None] + corners).reshape(-1, 2)
-    whole = _lit(whole, light, centres, camera)
-    finer = _lit(see(places), light, places, camera)
+    finer = see(places)
+    for samples, pixels in ((whole, centres), (finer, places)):
+        there = np.flatnonzero(samples.triangle != SKY)
+        samples.light[there] = light.brightness(
+            pixels[there], samples.position[there], samples.normal[there],
+            samples.triangle[there] == GROUND,
+        )  # fmt: skip
     return Shot(scene, sensors, stage, camera, whole, edges, finer)
 
 
@@ -248,36 +225,11 @@ def _edges(whole: Samples, scene: Scene, camera: Camera) -> Bools:
     kind = np.append(scene.face_object, [GROUND, SKY])[whole.triangle]
     number = np.arange(width * height).reshape(height, width)
     edge = np.zeros(width * height, np.bool_)
-    tolerance = _tolerance(whole.distance, camera, 1)
+    tolerance = plane_tolerance(camera, whole.position, 1)
     for here, beside in ((number[:, :-1], number[:, 1:]), (number[:-1], number[1:])):
         a, b = here.ravel(), beside.ravel()
-        with np.errstate(invalid="ignore"):
-            same = (
-                alike(
-                    whole.position[a],
-                    whole.normal[a],
-                    whole.position[b],
-                    whole.normal[b],
-                    tolerance[a],
-                )
-                > 0.3
-            )
+        spot = whole.position[b], whole.normal[b], tolerance[a]
+        same = alike(whole.position[a], whole.normal[a], *spot) > 0.3
         differs = (kind[a] != kind[b]) | ~same & (kind[a] != SKY)
         edge[a[differs]] = edge[b[differs]] = True
     return edge
-
-
-def _lit(samples: Samples, light: LightMap, pixels: Floats, camera: Camera) -> Samples:
-    """Return samples at pixels (n, 2) with their brightness."""
-    there = np.flatnonzero(samples.triangle != SKY)
-    out = samples.light.copy()
-    out[there] = light.brightness(
-        pixels[there], samples.position[there], samples.normal[there],
-        _tolerance(samples.distance[there], camera, STRIDE), samples.triangle[there] == GROUND,
-    )  # fmt: skip
-    return replace(samples, light=out)
-
-
-def _tolerance(distance: Reals, camera: Camera, stride: int) -> Reals:
-    """How far in metres points of one surface, `stride` pixels apart, may be from its plane."""
-    return (3 * stride * camera.footprint(distance)).astype(np.float32)

@@ -16,45 +16,21 @@ MOST_DIGITS = 5
 
 @dataclass(frozen=True, eq=False)
 class Axis:
-    """Ticks of one axis.
+    """Ticks of one axis."""
 
-    Parameters
-    ----------
-    title
-        Name of the axis, what its labels leave out, and unit.
-    step
-        Distance of ticks in metres.
-    ticks
-        (n,) local metres; round numbers in world coordinates.
-    labels
-        One a tick: the world coordinate, less what the title says.
-    """
-
-    title: str
-    step: float
-    ticks: Floats
-    labels: tuple[str, ...]
+    title: str  # its name, what the labels leave out, and unit
+    step: float  # from tick to tick, metres
+    ticks: Floats  # (n,) local metres; round numbers in world coordinates
+    labels: tuple[str, ...]  # the world coordinates, less what the title says
 
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """A box with round ticks on its axes, and the ground rectangle under it.
+    """A box with round ticks on its axes, and the ground rectangle under it; local metres."""
 
-    Parameters
-    ----------
-    bounds
-        (2, 3) lowest and highest corner of what is shown, local metres.
-    ground
-        (2, 2) lowest and highest corner of the ground rectangle, local metres.
-    level
-        Height of the ground, local metres, a little under the lowest point.
-    axes
-        x, y and z.
-    """
-
-    bounds: Floats
-    ground: Floats
-    level: float
+    bounds: Floats  # (2, 3) lowest and highest corner of what is shown
+    ground: Floats  # (2, 2) lowest and highest corner of the ground
+    level: float  # height of the ground, a little under the lowest point
     axes: tuple[Axis, Axis, Axis]
 
     @property

@@ -20,24 +20,12 @@ CREASE_COSINE = np.cos(np.radians(35))
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Triangles, what casts rays at them, and their normals.
-
-    Parameters
-    ----------
-    scene
-        The triangles.
-    caster
-        Finds closest hits.
-    face_normals
-        (f, 3) unit length; zero for degenerate triangles.
-    vertex_normals
-        (v, 3) unit length, weighted by area; zero where faces cancel out.
-    """
+    """Triangles, what casts rays at them, and their normals."""
 
     scene: Scene
     caster: RayCaster
-    face_normals: Floats
-    vertex_normals: Floats
+    face_normals: Floats  # (f, 3) unit length; zero for degenerate triangles
+    vertex_normals: Floats  # (v, 3) unit length, weighted by area; zero where faces cancel out
 
     @classmethod
     def of(cls, scene: Scene, backend: str = "auto") -> Surface:

@@ -20,32 +20,17 @@ _FINE = 2000  # bins that are counted in, at least; wide ones are sums of them
 
 @dataclass(frozen=True, eq=False)
 class CloudNumbers:
-    """Counts of a cloud.
+    """Counts of a cloud."""
 
-    Parameters
-    ----------
-    by_object, by_channel
-        int64 (objects,), (channels,): points of each object, and of each beam of the sensor.
-    limits
-        {column: lowest and highest value}; empty where there are no points.
-    by_range, edges
-        int64 (b,) points by distance from the sensor, and float64 (b + 1,) where the bins end,
-        in metres; both empty where there are no points. Of large clouds a part is looked at.
-    nearest, median, farthest
-        Distances in metres; the median to the nearest thousandth or so of the farthest.
-    bounds
-        float64 (2, 3): lowest and highest coordinates, metres, in the world.
-    """
-
-    by_object: NDArray[np.int64]
-    by_channel: NDArray[np.int64]
-    limits: Mapping[str, tuple[float, float]]
-    by_range: NDArray[np.int64]
-    edges: NDArray[np.float64]
-    nearest: float
-    median: float
+    by_object: NDArray[np.int64]  # (objects,) points of each
+    by_channel: NDArray[np.int64]  # (channels,) points of each beam of the sensor
+    limits: Mapping[str, tuple[float, float]]  # {column: lowest and highest}; {} without points
+    by_range: NDArray[np.int64]  # (b,) points by distance from the sensor; of large clouds a part
+    edges: NDArray[np.float64]  # (b + 1,) where these bins end, metres; empty without points
+    nearest: float  # metres
+    median: float  # to the nearest thousandth or so of the farthest
     farthest: float
-    bounds: NDArray[np.float64]
+    bounds: NDArray[np.float64]  # (2, 3) lowest and highest coordinates in the world
 
 
 class CountedCloud:

@@ -27,7 +27,7 @@ from .page import Recipe, write_page
 from .pictures import picture_makers
 from .report import make_report
 
-ROOM_BYTES = 32 << 20  # what pictures and report may take; the cloud is checked when it is known
+ROOM_BYTES = 32 << 20  # what pictures and report may take
 
 CLOUD, PAGE, REPORT = "cloud.ply", "report.html", "report.json"
 _IMAGES = tuple(f"{name}.png" for name in PICTURES)
@@ -44,13 +44,10 @@ def result_folder(folder: Path) -> Iterator[None]:
     Raises
     ------
     LidarpoolError
-        If it is a file, cannot be made or written to, another run uses it, or its disk is
-        nearly full.
+        If it is a file, cannot be made or written to, or another run uses it.
     """
     if folder.exists() and not folder.is_dir():
         raise LidarpoolError(f"{folder} is a file: give a folder for the results with --out.")
-    if obstacle := folder_in_the_way(folder):
-        raise LidarpoolError(obstacle)
     made = [path for path in (folder, *folder.parents) if not path.exists()]  # innermost first
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -67,7 +64,6 @@ def result_folder(folder: Path) -> Iterator[None]:
             f"Cannot write to the folder {folder} ({error.strerror}): give another with --out."
         ) from error
     try:
-        _check_room(folder)
         yield
     finally:
         for path in made:
@@ -163,26 +159,6 @@ def _lock(folder: Path) -> int:
             os.close(handle)
             raise
     return handle
-
-
-def folder_in_the_way(folder: Path) -> str:
-    """Say which folder has the name of a file of a result, and what to do; empty if none has."""
-    taken = next((folder / name for name in FILES if (folder / name).is_dir()), None)
-    if taken is None:
-        return ""
-    return (
-        f"{taken} is a folder, and a result has a file of that name: give another folder with "
-        "--out."
-    )
-
-
-def _check_room(folder: Path) -> None:
-    free = shutil.disk_usage(folder).free
-    if free < ROOM_BYTES:
-        raise LidarpoolError(
-            f"The disk of {folder} has {free / 1e6:.1f} MB free and a result needs at least "
-            f"{ROOM_BYTES / 1e6:.0f} MB: make room, or give another folder with --out."
-        )
 
 
 def _flush(path: Path) -> None:

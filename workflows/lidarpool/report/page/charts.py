@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,27 +27,24 @@ Floats = NDArray[np.float64]
 Tick = tuple[float, str]  # per cent of the axis, label
 
 
-@dataclass(frozen=True)
-class Bar:
+class Bar(NamedTuple):
     """A row of a bar chart: name in full and short, number, share of all, length in per cent."""
 
     name: str
     label: str
-    count: int
+    points: int
     share: str
     percent: float
 
 
-@dataclass(frozen=True)
-class ObjectBars:
+class ObjectBars(NamedTuple):
     """Points by object; `rest` tells of those that have no bar."""
 
     bars: tuple[Bar, ...]
     rest: str
 
 
-@dataclass(frozen=True)
-class Histogram:
+class Histogram(NamedTuple):
     """Columns: a path for SVG, ticks below, and the tallest column's count."""
 
     path: str
@@ -55,8 +52,7 @@ class Histogram:
     tallest: int
 
 
-@dataclass(frozen=True)
-class Convergence:
+class Convergence(NamedTuple):
     """Curves of the trials' best costs: paths for SVG and ticks on both axes."""
 
     band: str

@@ -5,10 +5,10 @@ from __future__ import annotations
 import base64
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
@@ -16,6 +16,7 @@ from markupsafe import Markup
 from poolpart.wording import counted
 
 from ...plan import Planning
+from ...render.page import shortened
 from ...run.result import Result
 from ...run.trials import TRIAL
 from ...scan import COLLECT, GENERATE, INTERSECT, SORT
@@ -38,8 +39,7 @@ STAGES = {
 }
 
 
-@dataclass(frozen=True)
-class Fact:
+class Fact(NamedTuple):
     """A number at the head of the page; `bad` where it should be another."""
 
     value: str
@@ -47,12 +47,10 @@ class Fact:
     bad: bool = False
 
 
-@dataclass(frozen=True)
-class Picture:
-    """A picture within the page, its words for those who do not see it, and its caption."""
+class Picture(NamedTuple):
+    """A picture within the page."""
 
     uri: str
-    alt: str
     caption: str
 
 
@@ -117,9 +115,10 @@ def _environment() -> Environment:
     )
     for filter_ in (
         words.duration, words.rate, words.large, words.share, words.excess, words.metres,
-        words.numbers, words.shortened, words.grouped, counted,
+        words.numbers, words.grouped, counted,
     ):  # fmt: skip
         environment.filters[filter_.__name__] = filter_
+    environment.filters["shortened"] = partial(shortened, most=60)
     return environment
 
 
@@ -171,29 +170,16 @@ def _pictures(report: Report, folder: Path) -> Iterator[Picture]:
     poses = counted(parameters["poses"], "sensor position")
     every = parameters["keep_every"]
     kept = "one for each hit" if every == 1 else f"one for every {every:,} hits of a scan"
-    for name, alt, caption in (
-        (
-            "scene.png",
-            f"Rendered scene of {objects}, with {poses} marked by red dots",
-            f"The scene: {objects} of {counted(parameters['triangles'], 'triangle')}, {poses}.",
-        ),
-        (
-            "intensity.png",
-            "The same scene coloured by hits per square metre, with sample rays in red",
-            f"Where the {counted(report['hits'], 'hit')} fell, per square metre, and some rays.",
-        ),
-        (
-            "cloud.png",
-            "Point cloud of the scene, coloured by height, from the same viewpoint",
-            f"The cloud: {counted(report['points'], 'point')}, {kept}, rounded to "
-            f"{parameters['precision_m']:g} m.",
-        ),
-        (
-            "path.png",
-            "Plan of the obstacles as discs, with the paths of all trials and the best one",
-            "The planned path, seen from above, among those of the trials.",
-        ),
-    ):
+    captions = {
+        "scene.png": f"The scene: {objects} of {counted(parameters['triangles'], 'triangle')}, "
+        f"{poses} in red.",
+        "intensity.png": f"Where the {counted(report['hits'], 'hit')} fell, per square metre, "
+        "and some rays.",
+        "cloud.png": f"The cloud: {counted(report['points'], 'point')}, {kept}, rounded to "
+        f"{parameters['precision_m']:g} m.",
+        "path.png": "The planned path, seen from above, among those of the trials.",
+    }
+    for name, caption in captions.items():
         if name in report["files"]:
             data = base64.b64encode((folder / name).read_bytes()).decode()
-            yield Picture(f"data:image/png;base64,{data}", alt, caption)
+            yield Picture(f"data:image/png;base64,{data}", caption)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,61 +27,32 @@ _GAP = 0.6  # units between bars that are drawn as one
 Span = tuple[float, float]
 
 
-@dataclass(frozen=True)
-class Row:
-    """The bars of one stage, on one worker or on all.
-
-    Parameters
-    ----------
-    label, detail
-        What stands before it, and what is said on a closer look.
-    stage
-        Whose colour it has.
-    bars
-        A path for SVG: lines along the middle of the row, to be drawn thick.
-    """
+class Row(NamedTuple):
+    """The bars of one stage, on one worker or on all: a path for SVG, lines to be drawn thick."""
 
     label: str
-    detail: str
-    stage: str
+    detail: str  # said on a closer look
+    stage: str  # whose colour it has
     bars: str
 
 
-@dataclass(frozen=True)
-class Group:
+class Group(NamedTuple):
     """Rows under one heading."""
 
     title: str
     detail: str
-    rows: tuple[Row, ...]
+    rows: Sequence[Row]
 
 
-@dataclass(frozen=True)
-class Timeline:
-    """All groups on one axis.
+class Timeline(NamedTuple):
+    """All groups on one axis: the stages, then each partition's workers."""
 
-    Parameters
-    ----------
-    seconds
-        From the first start to the last stop.
-    ticks
-        (per cent of the width, label).
-    groups
-        The stages, then each partition's workers.
-    both
-        Where stage 2 and planning ran at the same time: (from, to) in units.
-    tasks
-        How many there were.
-    row
-        Height of a row.
-    """
-
-    seconds: float
-    ticks: tuple[tuple[float, str], ...]
-    groups: tuple[Group, ...]
-    both: tuple[Span, ...]
+    seconds: float  # from the first start to the last stop
+    ticks: Sequence[tuple[float, str]]  # per cent of the width, label
+    groups: Sequence[Group]
+    both: Sequence[Span]  # where stage 2 and planning ran at the same time, in units
     tasks: int
-    row: int = ROW
+    row: int = ROW  # height of a row
 
 
 class _Axis:
@@ -109,14 +80,8 @@ def make_timeline(
 ) -> Timeline | None:
     """Lay the tasks of a run out; None where nothing ran.
 
-    Parameters
-    ----------
-    stages
-        All tasks of each stage, in the order in which they are listed.
-    records
-        Tasks by themselves; of thousands, some.
-    names
-        {stage: what it is called on the page}.
+    `stages` count all tasks, `records` are some of them, and `names` says {stage: what it is called
+    on the page}.
     """
     if not stages:
         return None
@@ -132,7 +97,7 @@ def make_timeline(
         )
         for stage in stages
     ]
-    groups = [Group("Stages", "while at least one task ran", tuple(overview))]
+    groups = [Group("Stages", "while at least one task ran", overview)]
     ran = sum((stage.resources for stage in stages), Counter())  # {partition: tasks}
     for partition, tasks in sorted(_by_partition(records).items()):
         workers = {task.worker for task in tasks}  # that have a record
@@ -145,15 +110,8 @@ def make_timeline(
         for b in spans.get(TRIAL, [])
         if min(a[1], b[1]) > max(a[0], b[0])
     ]
-    return Timeline(
-        seconds=axis.seconds,
-        ticks=tuple(
-            (100 * t / axis.seconds, f"{t:.6g} s") for t in np.arange(0, axis.seconds, step)
-        ),
-        groups=tuple(groups),
-        both=tuple(both),
-        tasks=sum(stage.tasks for stage in stages),
-    )
+    ticks = [(100 * t / axis.seconds, f"{t:.6g} s") for t in np.arange(0, axis.seconds, step)]
+    return Timeline(axis.seconds, ticks, groups, both, sum(stage.tasks for stage in stages))
 
 
 def _by_partition(records: Iterable[TaskRecord]) -> dict[str, list[TaskRecord]]:
@@ -193,7 +151,7 @@ def _group(
         said = f"{worker}: {names[stage]}, {counted(len(those), 'task')}, {busy}"
         bars = axis.bars((task.start, task.stop) for task in those)
         drawn.append(Row(worker, said, stage, bars))
-    return Group(partition, detail, tuple(drawn))
+    return Group(partition, detail, drawn)
 
 
 def _natural(worker: str) -> list[tuple[int, str]]:

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 
 MINUS, NARROW = "\N{MINUS SIGN}", "\N{NARROW NO-BREAK SPACE}"
-LETTERS_MOST = 60
 _SPACES = f"\n\t\N{NO-BREAK SPACE}{NARROW}"  # not printable to Python, and harmless
 
 
@@ -15,14 +14,6 @@ def printable(text: str) -> str:
     return "".join(
         c if c.isprintable() or c in _SPACES else "\N{REPLACEMENT CHARACTER}" for c in text
     )
-
-
-def shortened(name: str) -> str:
-    """Cut a long name in its middle."""
-    if len(name) <= LETTERS_MOST:
-        return name
-    tail = LETTERS_MOST // 3
-    return f"{name[: LETTERS_MOST - tail - 1]}…{name[-tail:]}"
 
 
 def grouped(count: int) -> str:
