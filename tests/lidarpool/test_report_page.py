@@ -492,7 +492,6 @@ def test_a_recipe_holds_the_command_as_it_was_given(monkeypatch):
         commands.append(make_recipe(scenario, click.get_current_context()).command)
 
     monkeypatch.setattr("lidarpool.cli.commands.run_scenario", note)
-    words = ["demo", "--live", "--no-stay", "--out", "my result"]
-    monkeypatch.setattr("sys.argv", ["/usr/bin/lidarpool", *words])
-    cli.main(words, standalone_mode=False)
-    assert commands == ["lidarpool demo --live --no-stay --out 'my result'"]
+    for words in (["demo"], ["demo", "--live", "--no-stay", "--out", "my result"]):
+        cli.main(words, prog_name="lidarpool", standalone_mode=False)
+    assert commands == ["lidarpool demo", "lidarpool demo --out 'my result' --live --no-stay"]

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import shlex
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 import click
 import yaml
+from click.core import ParameterSource
 
 from ...scenario.scenario import Scenario
 
 POSES_MOST = 500  # written out; a survey may have a million
+_ONCE = ("resume", "fresh", "quiet", "page")  # options that a repetition does not need
 
 
 @dataclass(frozen=True)
@@ -50,10 +51,25 @@ def make_recipe(scenario: Scenario, context: click.Context | None) -> Recipe:
         scenario = scenario.model_copy(update={"poses": scenario.poses[:POSES_MOST]})
     return Recipe(
         name="the default survey" if source is None else Path(source).name,
-        command=shlex.join(["lidarpool", *sys.argv[1:]]) if context else "",
+        command=shlex.join(_words(context)) if context else "",
         scenario=_as_yaml(scenario),
         remark=" ".join(remarks),
     )
+
+
+def _words(context: click.Context) -> list[str]:
+    """Return the command with what was given to it."""
+    words, named = context.command_path.split(), []
+    for parameter in context.command.params:
+        name, value = str(parameter.name), context.params.get(str(parameter.name))
+        if context.get_parameter_source(name) is not ParameterSource.COMMANDLINE or name in _ONCE:
+            continue
+        if isinstance(parameter, click.Argument):
+            words.append(str(value))
+        else:
+            flag = isinstance(parameter, click.Option) and parameter.is_flag
+            named += [max(parameter.opts, key=len)] + [str(value)] * (not flag)
+    return words + named
 
 
 def _as_yaml(scenario: Scenario) -> str:
