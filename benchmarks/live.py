@@ -112,7 +112,7 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
         "seconds_with": round(statistics.median(with_page), 2),
         "ratio": round(sum(with_page) / sum(without), 3),
         "ratios": [round(ratio, 3) for ratio in ratios],
-        "megabytes_sent": round(sent / 1e6, 2),
+        "megabytes_sent": round(sent / 1e6, 4),
     }
     print(
         f"{figures['scans']} scans: {figures['seconds_without']} s without the page, "
