@@ -107,6 +107,12 @@ def test_an_unusual_outline_is_filled(name):
         assert (parts @ whole >= 0).all()
 
 
+def test_a_warped_quadrangle_keeps_both_triangles():
+    # Seen from above its outline crosses itself.
+    vertices = np.array([[0, 0, 0], [2, 0, 0], [0.1, 1, 3], [2, 1, 0]], dtype=float)
+    assert len(cut(vertices)) == 2
+
+
 def test_corners_that_are_not_there():
     with pytest.raises(ValueError, match="vertices 0 to 3, counted from 0, of 3"):
         triangulated(np.zeros((3, 3)), np.array([0, 1, 3]), np.array([3]))

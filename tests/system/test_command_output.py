@@ -43,6 +43,14 @@ def test_json_is_one_document_and_all_of_stdout(run, tmp_path):
     assert said["planning"]["best_length"] == report["planning"]["best_length"]
 
 
+def test_a_run_that_hits_nothing_says_so(tmp_path, lidarpool, cluster, no_pictures):
+    (tmp_path / "s.yaml").write_text(f"{SHORT}steps: 1\nposes: [[0, 0, 1000]]\n")
+    place = ["--out", tmp_path / "out", "--scheduler", cluster, "--no-plan"]
+    outcome = lidarpool("run", tmp_path / "s.yaml", *place)
+    assert outcome.code == 0
+    assert "no ray that was cast hit anything: look at poses" in outcome.out
+
+
 def test_json_with_progress_for_people_beside_it(run):
     outcome = run("--json", "--no-plan")
     assert json.loads(outcome.out)["planning"] is None

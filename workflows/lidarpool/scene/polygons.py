@@ -18,8 +18,8 @@ def triangulated(
 ) -> NDArray[np.int64]:
     """Cut polygons into triangles with the same corners and the same outside.
 
-    Convex ones become fans, all of one size at once; of others ears are clipped off by
-    mapbox_earcut.
+    Convex ones and quadrangles become fans, all of one size at once; of others ears are clipped
+    off by mapbox_earcut.
 
     Parameters
     ----------
@@ -48,17 +48,29 @@ def triangulated(
     for size in np.unique(sizes[sizes > 2]).tolist():
         which = np.flatnonzero(sizes == size)
         rows = corners[first[which, None] + np.arange(size)]
+        if size == 4:
+            rows = _begun_well(vertices, rows)
         places = ends[which, None] - (size - 2) + np.arange(size - 2)
         out[places, 0] = rows[:, :1]
         out[places, 1] = rows[:, 1:-1]
         out[places, 2] = rows[:, 2:]
-        if size > 3:
+        if size > 4:
             for i in np.flatnonzero(_turns(vertices[rows]).any(axis=1)).tolist():
                 clipped = with_holes(vertices, [rows[i]])
                 if len(clipped):  # else it has no area, and the fan has none that matters
                     out[places[i]] = -1
                     out[places[i, : len(clipped)]] = clipped
     return out[out[:, 0] >= 0]
+
+
+def _begun_well(vertices: NDArray[np.float64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Quadrangles (p, 4) that begin at the corner that turns back, if one does: a fan fills them.
+
+    The clipper would leave out half of one that is so warped that its view crosses itself.
+    """
+    back = _turns(vertices[rows])
+    begin = np.where(back.sum(axis=1) == 1, back.argmax(axis=1), 0)
+    return np.take_along_axis(rows, (begin[:, None] + np.arange(4)) % 4, axis=1)
 
 
 def with_holes(vertices: NDArray[np.float64], rings: list[NDArray[np.int64]]) -> NDArray[np.int64]:
