@@ -38,7 +38,7 @@ class PrismSensor(Sensor):
     wedge_deg: float = 18.0
     index: float = 1.5
     rpm: tuple[float, float] = (7294.0, -4664.0)
-    phase_deg: tuple[float, float] = (0.0, 180.0)
+    phase_deg: tuple[float, float] = (0.0, 0.0)
     inclined_first: bool = False
 
     @property
