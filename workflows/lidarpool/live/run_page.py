@@ -34,7 +34,7 @@ from .page import PORT, LivePage, live_page, open_browser, redrawn
 from .view import View, bounds_of
 
 DRAW_EVERY_S = 0.5
-BUSY_SHARE, IDLE_SHARE = 0.1, 0.7  # of a core, while the run goes on and when it is over
+BUSY_SHARE, IDLE_SHARE = 0.06, 0.7  # of a core, while the run goes on and when it is over
 ASK_EVERY_S = 2.0  # how busy the partitions are
 FRAMES_SHOWN = 40  # whose rays are shown
 
