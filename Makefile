@@ -4,7 +4,7 @@ BIN := $(VENV)/bin
 OUT ?= lidarpool-out
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test slow chaos soak lint docs format bench clean
+.PHONY: help demo test slow compat chaos soak lint docs format bench clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /\1\t/' | expand -t 10
@@ -20,6 +20,9 @@ test:  ## run the test suite
 slow:  ## the tests that take minutes, which `test` leaves out
 	@VENV=$(VENV) sh .ci/setup dev
 	$(BIN)/python -m pytest -m slow
+
+compat:  ## poolpart's tests with the lowest and the newest Dask, and with Dask's main
+	@sh .ci/compat
 
 chaos:  ## 200 faults, every kind at every point of a survey; SEED=n plays them again
 	@VENV=$(VENV) sh .ci/setup dev

@@ -13,7 +13,7 @@ from .page import (
     tell_page,
 )
 from .partition import Partition
-from .pipe import Backoff, Pipe, await_news, forget_pipes, take_news
+from .pipe import Pipe, await_news, forget_pipes, take_news
 from .placement import Recorder, TaskRecord, placement_violations, recorded
 from .pool import Pool
 from .remote import ask_workers, worker_identities
@@ -25,7 +25,6 @@ from .tracing import trace, trace_to
 from .worker_info import WorkerInfo
 
 __all__ = [
-    "Backoff",
     "Partition",
     "PartitionStats",
     "Pipe",

@@ -11,7 +11,7 @@ from distributed import Client
 
 from .book import Seat, names_of
 from .errors import PoolError
-from .fence import enclose, fences_of, lower, settle_fences
+from .fence import enclose, fences_of, lower
 from .inherit import begin_inheritance, end_inheritance
 from .internals import asks_for, lift_restrictions
 from .page import close_page
@@ -116,7 +116,6 @@ async def _declare(
             steward.book.put(seat, name, rule.slots_of(seat.info))
     everyone = [seat for group in seats.values() for seat in group]
     late = await steward.reconciler.arrive(everyone, PATIENCE_S)
-    await settle_fences(steward.scheduler)
     if late or not all(seat.holds for seat in everyone):
         away = [seat for seat in everyone if seat in late or not seat.holds]
         raise PoolError(

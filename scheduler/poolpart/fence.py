@@ -6,7 +6,7 @@ tasks that take a slot of the partition run on its workers; un-annotated ones, d
 collections, tasks submitted from inside other tasks, recomputed and stolen ones, actors and
 the outputs of shuffles go to the remainder of the cluster, whoever submitted them and when.
 
-What a fence does not concern: tasks that run already when it is raised go on; `Client.run`
+What a fence does not concern: tasks that a worker was given before go on there; `Client.run`
 reaches all workers; data that is scattered, replicated or rebalanced may be put anywhere
 (give ``workers=`` to keep it out).
 
@@ -25,7 +25,6 @@ once, whose memory then holds all their results. With the rule it is 2, and 198 
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import pickle
 import time
@@ -35,7 +34,7 @@ from typing import Any
 from distributed import Client
 from distributed.diagnostics.plugin import SchedulerPlugin
 
-from .internals import FenceRules, open_to_all, recall, recalls_under_way
+from .internals import FenceRules, open_to_all
 from .remote import on_scheduler
 
 logger = logging.getLogger(__name__)
@@ -43,7 +42,6 @@ logger = logging.getLogger(__name__)
 NAME = "poolpart-fences"
 COMPLAIN_EVERY_S = 10.0
 _LOOK_AT_MOST = 1000
-_SETTLE_S = 5.0  # longest wait for workers to give up tasks that they have not started
 
 
 def enclose(scheduler: Any, name: str) -> None:
@@ -60,13 +58,6 @@ def enclose(scheduler: Any, name: str) -> None:
         fences.install()
     fences.names.add(name)
     fences.look_again()
-
-
-async def settle_fences(scheduler: Any) -> None:
-    """Turn out what has not started behind fences, if there are any."""
-    fences: Fences | None = scheduler.plugins.get(NAME)
-    if fences is not None:
-        await fences.settle()
 
 
 def lower(scheduler: Any, name: str) -> None:
@@ -107,7 +98,7 @@ class Fences(SchedulerPlugin):
         self.scheduler = scheduler
         self.names: set[str] = set()
         self.closed: set[Any] = set()  # states of the workers behind fences
-        self._rules = FenceRules(scheduler, self.closed, self.stop, self._changed)
+        self._rules = FenceRules(scheduler, self.closed, self.stop, self._look_at)
         self._complained_at = float("-inf")
 
     # -- coming and going --------------------------------------------------------------
@@ -150,30 +141,6 @@ class Fences(SchedulerPlugin):
         elif worker in self.closed:
             self.closed.discard(worker)
             open_to_all(self.scheduler, worker)
-
-    def _changed(self, worker: Any) -> None:
-        """Look at a worker that has declared something."""
-        self._look_at(worker)
-        if worker in self.closed:
-            self._turn_out(worker, set())
-
-    def _turn_out(self, worker: Any, asked: set[Any]) -> None:
-        """Ask a worker for tasks that it should not have, each once."""
-        mine = (task for task in worker.processing - asked if self.stop(task))
-        asked.update(recall(self.scheduler, worker, mine))
-
-    async def settle(self) -> None:
-        """Turn out what has not started behind fences, and wait a moment for the answers."""
-        asked: set[Any] = set()
-        deadline = time.monotonic() + _SETTLE_S
-        while time.monotonic() < deadline:
-            for worker in self.closed:
-                self._turn_out(worker, asked)
-            # Also what is just being stolen from somebody behind a fence, which is not asked for
-            # twice, or by somebody there; that is turned out then.
-            if not recalls_under_way(self.scheduler, self.closed, self.stop):
-                return
-            await asyncio.sleep(0.005)
 
     def remove_worker(self, scheduler: Any, worker: str, **kwargs: Any) -> None:
         """Forget a worker that has left."""
@@ -221,8 +188,8 @@ class Fences(SchedulerPlugin):
 def raise_fence(client: Client, name: str) -> None:
     """Keep tasks that do not ask for the resource `name` away from workers that declare it.
 
-    Tasks that were given to such workers and have not started go elsewhere. Raising a fence
-    that is there does nothing but that.
+    Tasks that such workers were given before end there. Raising a fence that is there does
+    nothing.
 
     Raises
     ------
@@ -237,19 +204,9 @@ def lower_fence(client: Client, name: str) -> None:
     on_scheduler(client, _lower, name=name)
 
 
-def raised_fences(client: Client) -> frozenset[str]:
-    """Names of the partitions that have a fence now."""
-    return frozenset(on_scheduler(client, _names))
-
-
 async def _raise(name: str, dask_scheduler: Any = None) -> None:
     enclose(dask_scheduler, name)
-    await settle_fences(dask_scheduler)
 
 
 async def _lower(name: str, dask_scheduler: Any = None) -> None:
     lower(dask_scheduler, name)
-
-
-async def _names(dask_scheduler: Any = None) -> list[str]:
-    return sorted(fences_of(dask_scheduler))

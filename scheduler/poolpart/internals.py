@@ -252,7 +252,6 @@ class FenceRules:
         self._rules.take_back()
         self.scheduler.handlers["set_resources"] = self.scheduler.add_resources
         self.scheduler.idle_task_count = set(self.scheduler.idle_task_count)
-        forget_recalls(self.scheduler)
 
     def could_take(self, task: Any) -> Any:
         """Workers that Dask itself would let take a task."""
@@ -379,11 +378,7 @@ def lift_restrictions(scheduler: Any, names: Collection[str]) -> None:
 
 # -- moving tasks that have not started, by the protocol of work stealing ----------------
 #
-# The worker is asked, and gives a task up unless the task runs. `hand_off` names another worker
-# that gets the task. `recall` asks in the name of a worker that has left, so that the scheduler
-# sends the task nowhere, but decides anew where it goes.
-
-_NOBODY = "poolpart-nobody"
+# The worker is asked, and gives a task up unless the task runs; then another worker gets it.
 
 
 def held_by(scheduler: Any, worker: Any, names: Collection[str]) -> list[str]:
@@ -421,64 +416,6 @@ def hand_off(scheduler: Any, worker: Any, names: Collection[str], asked: set[Any
             thief = min(others, key=lambda o: (len(o.processing) + given[o]) / o.nthreads)
             given[thief] += 1
             stealing.move_task_request(task, worker, thief)
-
-
-def recall(scheduler: Any, worker: Any, tasks: Iterable[Any]) -> list[Any]:
-    """Ask a worker for tasks that it has not started; returns those that it was asked for.
-
-    It is not asked for actors and long-running tasks, nor for tasks that are being stolen from it
-    already.
-    """
-    stealing = scheduler.extensions.get("stealing")
-    if stealing is None:
-        return []
-    asked = [
-        task
-        for task in tasks
-        if not (task.actor or task in worker.long_running or task in stealing.in_flight)
-    ]
-    for task in asked:
-        stealing.move_task_request(task, worker, _nobody(scheduler))
-    return asked
-
-
-def recalls_under_way(
-    scheduler: Any, workers: Collection[Any], concerns: Callable[[Any], bool]
-) -> bool:
-    """Whether workers have yet to answer to `recall`.
-
-    Or to a theft, from these workers or by them, of a task that `concerns` is true for.
-    """
-    stealing = scheduler.extensions.get("stealing")
-    moves = stealing.in_flight.items() if stealing else ()
-    return any(
-        move["thief"].server_id == _NOBODY
-        or (concerns(task) and not {move["thief"], move["victim"]}.isdisjoint(workers))
-        for task, move in moves
-    )
-
-
-def forget_recalls(scheduler: Any) -> None:
-    """Leave nothing of `recall` with work stealing."""
-    if stealing := scheduler.extensions.get("stealing"):
-        stealing.in_flight_tasks.pop(_nobody(scheduler), None)
-
-
-def _nobody(scheduler: Any) -> Any:
-    from distributed.scheduler import WorkerState
-
-    return WorkerState(
-        address="tcp://0.0.0.0:0",
-        status=Status.closed,
-        pid=0,
-        name=_NOBODY,
-        nthreads=1,
-        memory_limit=0,
-        local_directory="",
-        nanny=None,
-        server_id=_NOBODY,
-        scheduler=scheduler,
-    )
 
 
 # -- what a worker declares, and what its nanny starts it with ---------------------------

@@ -6,7 +6,6 @@ import logging
 import multiprocessing
 import os
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import dask
@@ -111,21 +110,10 @@ def local_cluster(
             )
     except RuntimeError as error:
         raise PoolError(
-            f"The workers did not start ({error.__cause__ or error}). {_advice()}"
+            f"The workers did not start ({error.__cause__ or error}). Each imports the script "
+            "that starts the cluster: do that under `if __name__ == '__main__':` in it. If it does "
+            "so, or there is none, one was killed while it started: look whether memory is short."
         ) from error
-
-
-def _advice() -> str:
-    """Say what to do where workers do not start, as far as that can be known."""
-    try:
-        Path.home()
-    except RuntimeError:  # a user without an entry in the list of users, as in containers
-        return "Dask's dashboard looks for a home folder: let HOME name one."
-    return (
-        "Each imports the script that starts the cluster: do that under "
-        "`if __name__ == '__main__':` in it. If it does so, or there is none, one was killed while "
-        "it started: look whether memory is short."
-    )
 
 
 def _security(wanted: Security | bool) -> Security:

@@ -38,11 +38,6 @@ def shrink(client: Client, name: str, workers: int, timeout_s: float) -> list[st
     return names
 
 
-def minimum(client: Client, name: str) -> int:
-    """Workers that a partition keeps whatever is moved."""
-    return int(ask(client, _minimum, name=name))
-
-
 def _check(workers: int) -> None:
     if not isinstance(workers, int) or workers < 1:
         raise PoolError(f"The number of workers to move is {workers!r}; give 1 or more.")
@@ -88,11 +83,6 @@ async def _shrink(steward: Steward, name: str, count: int, timeout_s: float) -> 
     target = book.remainder()
     chosen = _by_load(steward, members)[:count]
     return await _move(steward, chosen, None if target == name else target, timeout_s)
-
-
-async def _minimum(steward: Steward, name: str) -> int:
-    rule = steward.book.rules.get(name)
-    return rule.minimum if rule else 0
 
 
 async def _move(

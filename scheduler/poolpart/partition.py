@@ -369,11 +369,6 @@ class Partition:
 
     # -- workers that come and go ------------------------------------------------------
 
-    @property
-    def minimum(self) -> int:
-        """Workers that it keeps whatever is moved, as said when it was made."""
-        return moves.minimum(self.client, self.name)
-
     def grow(
         self, workers: int = 1, *, source: str | None = None, timeout_s: float = 60.0
     ) -> list[str]:

@@ -19,7 +19,7 @@ class TaskRecord:
     """One task as it ran: on which worker, with which resources, and when.
 
     `start` and `stop` are seconds since the epoch by the worker's clock; `items` is whatever
-    the task counts (scans, trials).
+    the task counts.
     """
 
     stage: str

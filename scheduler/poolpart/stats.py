@@ -281,16 +281,6 @@ def partition_stats(client: Client, name: str) -> PartitionStats:
     return PartitionStats(**told, **sums, stages=stages)
 
 
-def watch(client: Client) -> None:
-    """Count tasks from now on; does nothing where they are counted already."""
-    on_scheduler(client, _watch)
-
-
-def unwatch(client: Client) -> None:
-    """Count no more, and forget what was counted."""
-    on_scheduler(client, _unwatch)
-
-
 def statistics_of(scheduler: Any) -> Statistics:
     """Find the scheduler's statistics; count from now on if it has none."""
     statistics: Statistics | None = scheduler.plugins.get(NAME)
@@ -300,16 +290,8 @@ def statistics_of(scheduler: Any) -> Statistics:
     return statistics
 
 
-async def _watch(dask_scheduler: Any = None) -> None:
-    statistics_of(dask_scheduler)
-
-
-async def _unwatch(dask_scheduler: Any = None) -> None:
-    forget_statistics(dask_scheduler)
-
-
 def forget_statistics(scheduler: Any) -> None:
-    """Do what `unwatch` does, on the scheduler."""
+    """Count no more, and forget what was counted."""
     if NAME in scheduler.plugins:
         scheduler.remove_plugin(NAME)
 

@@ -7,7 +7,7 @@ from distributed import Reschedule
 from hypothesis import given
 from hypothesis import strategies as st
 
-from poolpart.mapping import GROWTH, MOST_BYTES, MOST_ITEMS, Chunk, ChunkSize, run_chunk
+from poolpart.mapping import GROWTH, MOST_BYTES, MOST_ITEMS, ChunkSize, run_chunk
 
 
 def invert(x):
@@ -59,11 +59,6 @@ def test_dask_is_told_to_reschedule():
 
     with pytest.raises(Reschedule):
         run_chunk(again, 10, 0, 0, calls(1))
-
-
-def test_a_chunk_says_which_items_it_has():
-    assert str(Chunk(7, calls(1))) == "item 7"
-    assert str(Chunk(7, calls(1, 2, 3))) == "items 7 to 9"
 
 
 def learned(item_s, item_bytes, rounds=30, target_s=0.1):

@@ -98,11 +98,6 @@ def test_members_of_a_partition_spread_whatever_others_use():
     assert assign(scheduler, c="yx") == {"c": 0}
 
 
-def test_parts_of_a_divided_device_are_devices():
-    scheduler = cluster_of(a="P", b="P")
-    assert assign(scheduler, a=["MIG-1"], b=["MIG-2"]) == {"a": 0, "b": 0}
-
-
 def test_a_worker_that_has_gone_gets_none():
     scheduler = cluster_of(a="P")
     assert assign(scheduler, a="x", gone="x") == {"a": 0}

@@ -1,17 +1,13 @@
 """Undoing partitions: what the scheduler, workers and nannies know is what they knew before."""
 
-import asyncio
 import os
 import signal
 import threading
-from concurrent.futures import ThreadPoolExecutor
-from types import SimpleNamespace
 
 import pytest
-from distributed import Client, Event, get_worker
+from distributed import Event, get_worker
 
 from poolpart import (
-    Partition,
     Pool,
     PoolError,
     declare,
@@ -24,7 +20,6 @@ from poolpart import (
     steward,
     worker_identities,
 )
-from poolpart import reconciler as their
 
 LONG_S = 120.0
 
@@ -87,11 +82,6 @@ def declared(client):
     return {str(worker["name"]): worker["resources"] for worker in workers}
 
 
-def join(client, name):
-    client.cluster.worker_spec[name] = next(iter(client.cluster.worker_spec.values()))
-    client.sync(client.cluster._correct_state)
-
-
 def test_everything_is_as_before(start, wait_until):
     workers = {"native": {"resources": {"GPU": 2}}, "disk": {"resources": {"DISK": 1}}}
     client = start({**{name: {} for name in "abcd"}, **workers})
@@ -103,7 +93,6 @@ def test_everything_is_as_before(start, wait_until):
     part, _ = pool.partition("GPU", workers=["native"], slots=5)
     client.gather([part.submit(here), *(p.submit(here) for p in parts.values())])
     parts["A"].grow(1)
-    parts["C"].minimum  # noqa: B018 - asks the scheduler
     wait_until(lambda: client.cluster.scheduler.tasks.keys() == {"held"})
     assert known(client) != before
     assert sorted(Pool.from_client(client).dissolve()) == ["A", "B", "C", "GPU"]
@@ -125,28 +114,6 @@ def test_nannies_are_as_before(nannies, wait_until):
     assert known(nannies) == before
     nannies.restart()
     assert declared(nannies) == {"0": {}, "1": {}}
-    assert known(nannies)["nannies"] == before["nannies"]
-
-
-def test_a_nanny_whose_worker_dies_before_it_has_answered(nannies, wait_until, monkeypatch):
-    before, answered = known(nannies), their.call
-    pids, killed = nannies.run(os.getpid), []
-
-    async def call(scheduler, address, function, **arguments):
-        answer = await answered(scheduler, address, function, **arguments)
-        if function is their.keep_on_nanny and not killed:
-            killed.extend(w for w, state in scheduler.workers.items() if state.nanny == address)
-            os.kill(pids[killed[0]], signal.SIGKILL)
-            while killed[0] in scheduler.workers:
-                await asyncio.sleep(0.01)
-            await asyncio.sleep(0)  # the steward does not get to read the answer
-        return answer
-
-    monkeypatch.setattr(their, "call", call)
-    [part] = Pool.from_client(nannies).divide({"A": rest()}).values()
-    wait_until(lambda: declared(nannies) == {"0": {"A": 1}, "1": {"A": 1}}, LONG_S)
-    part.dissolve()
-    assert len(killed) == 1
     assert known(nannies)["nannies"] == before["nannies"]
 
 
@@ -191,43 +158,6 @@ def test_nothing_stays_but_of_workers_that_do_not_answer(start, wait_until, monk
     assert known(client) == before
 
 
-def test_two_who_dissolve_the_same_partition(start, wait_until):
-    client = start({"a": {}, "b": {}})
-    before = known(client)
-    part, _ = Pool.from_client(client).partition("A", n_workers=1, exclusive=True)
-    event = Event("both", client)
-    task = part.submit(wait_for, "both")
-    wait_until(lambda: any(w.processing for w in client.cluster.scheduler.workers.values()))
-    with ThreadPoolExecutor(2) as both:
-        dissolved = [both.submit(Pool(client, []).dissolve) for _ in range(2)]
-        ticker = client.cluster.scheduler.plugins[steward.NAME]
-        wait_until(lambda: ticker.asked == 2)
-        event.set()
-    assert sorted(one.result() for one in dissolved) == [[], ["A"]]
-    task.release()
-    wait_until(lambda: not client.cluster.scheduler.tasks)
-    assert known(client) == before
-
-
-def test_what_somebody_makes_while_it_waits_is_undone_too(start, wait_until):
-    client = start({"a": {}, "b": {}})
-    before = known(client)
-    part, others = Pool.from_client(client).partition("A", workers=["a"])
-    event = Event("made", client)
-    task = part.submit(wait_for, "made")
-    wait_until(lambda: any(w.processing for w in client.cluster.scheduler.workers.values()))
-    with ThreadPoolExecutor(1) as other:
-        dissolved = other.submit(Pool(client, []).dissolve)
-        ticker = client.cluster.scheduler.plugins[steward.NAME]
-        wait_until(lambda: ticker.asked == 1)
-        others.partition("B", workers=["b"], exclusive=True)
-        event.set()
-    assert sorted(dissolved.result()) == ["A", "B"]
-    task.release()
-    wait_until(lambda: not client.cluster.scheduler.tasks)
-    assert known(client) == before
-
-
 def test_one_partition(start):
     client = start({name: {} for name in "abc"})
     parts = Pool.from_client(client).divide({"A": named("a"), "B": rest()})
@@ -237,16 +167,6 @@ def test_one_partition(start):
     assert len(parts["B"]) == 3
     parts["B"].dissolve()
     assert declared(client) == {"a": {}, "b": {}, "c": {}}
-
-
-def test_workers_that_join_afterwards_are_left_alone(start):
-    client = start({"a": {}})
-    pool = Pool.from_client(client)
-    pool.divide({"A": rest()})
-    pool.dissolve()
-    join(client, "late")
-    client.wait_for_workers(2, timeout=LONG_S)
-    assert declared(client) == {"a": {}, "late": {}}
 
 
 def test_tasks_that_have_not_ended_are_waited_for(start, wait_until):
@@ -288,36 +208,6 @@ def test_dividing_once_more(start):
         parts = pool.divide({names[0]: n_workers(1), names[1]: rest()})
         assert [part.submit(here).result() in "ab" for part in parts.values()] == [True, True]
         assert sorted(pool.dissolve()) == ["P", "Q"]
-
-
-def test_another_client_can_undo_it(start):
-    client = start({"a": {}})
-    with Client(client.cluster) as other:
-        Pool.from_client(other).divide({"A": rest()})
-    Pool.from_client(client).dissolve()
-    assert declared(client) == {"a": {}}
-    assert len(Partition("A", client)) == 0
-
-
-def test_a_scheduler_with_many_tasks_is_not_kept_from_them_by_looking(monkeypatch):
-    """By a clock of its own, on which one look takes 40 ms."""
-    clock = SimpleNamespace(now=0.0, looked=0.0)
-
-    def look(scheduler, names):
-        clock.now, clock.looked = clock.now + 0.04, clock.looked + 0.04
-        return [SimpleNamespace(key="long")]
-
-    async def sleep(seconds):
-        clock.now += seconds
-
-    monkeypatch.setattr(declare, "time", SimpleNamespace(monotonic=lambda: clock.now))
-    monkeypatch.setattr(declare, "asyncio", SimpleNamespace(sleep=sleep))
-    monkeypatch.setattr(declare, "_unfinished", look)
-    book = SimpleNamespace(rules={"A": rest()})
-    asked = declare._dissolve(SimpleNamespace(book=book, scheduler=None), ["A"], 10.0)
-    with pytest.raises(PoolError, match="After 10 s 1 task of A had not ended"):
-        asyncio.run(asked)
-    assert clock.looked < 0.1 * clock.now < 1.1
 
 
 def start_once(path, dask_worker):

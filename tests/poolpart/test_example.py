@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from distributed import Client, LocalCluster
 
-from poolpart import Partition, Pipe
+from poolpart import Partition
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "thumbnails.py"
 
@@ -77,28 +77,6 @@ def test_a_writer_goes_on_where_one_has_died(start, tmp_path):
     path.write_bytes(thumbnails(5) + b"half")
     runpy.run_path(str(EXAMPLE))["run"](client, path, 9)
     assert path.read_bytes() == thumbnails(9)
-
-
-def test_news_of_a_writer_may_come_all_at_once(start, tmp_path, monkeypatch):
-    # «Again» and, behind it, what was written of keys that were sent before it was read.
-    polled, held, until = Pipe.poll, [], time.monotonic() + 120
-
-    def poll(pipe):
-        if not pipe.name.startswith("written"):  # the writer's own, in the same process
-            return polled(pipe)
-        held.extend(polled(pipe))
-        # It may also be less, where a result was not found and all after it is ignored.
-        news = held[:] if len(held) > 5 or time.monotonic() > until else []
-        del held[: len(news)]
-        if news:
-            monkeypatch.setattr(Pipe, "poll", polled)
-        return news
-
-    client = start({name: {} for name in "abc"})
-    monkeypatch.setattr(Pipe, "poll", poll)
-    path = tmp_path / "out.bin"
-    runpy.run_path(str(EXAMPLE))["run"](client, path, 40)
-    assert path.read_bytes() == thumbnails(40)
 
 
 def test_an_error_of_the_writer_reaches_the_driver(start, tmp_path):

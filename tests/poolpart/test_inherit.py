@@ -100,11 +100,6 @@ def test_unless_they_say_otherwise(client):
     assert mixed == ("B-0", "A-0")
 
 
-def test_keys_are_as_without(client):
-    inherit(client, "A")
-    assert Partition("A", client).submit(here).key.startswith("here-")
-
-
 def test_a_worker_that_left_the_partition_gets_none(client):
     inherit(client, "A")
     workers = client.cluster.scheduler.workers.values()

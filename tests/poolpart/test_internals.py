@@ -45,6 +45,14 @@ def test_nothing_else_reaches_into_dask():
             assert not found or (path.name, set(found)) == ("inherit.py", {"valid_workers"}), path
 
 
+def test_the_tests_that_the_documentation_names_are_there():
+    root = Path(__file__).parents[2]
+    page = (root / "docs/pool-partitions.md").read_text(encoding="utf-8")
+    for file, name in set(re.findall(r"(test_\w+\.py)::(test_\w+)", page)):
+        sources = [path.read_text(encoding="utf-8") for path in root.glob(f"tests/*/{file}")]
+        assert any(f"def {name}(" in source for source in sources), (file, name)
+
+
 class Owner:
     def __init__(self):
         self.calls = 0

@@ -196,18 +196,6 @@ def test_a_script_without_a_main_guard_is_told_so(tmp_path):
     assert "freeze_support" not in errors
 
 
-def test_advice_where_there_is_no_home(monkeypatch):
-    def no_home():
-        raise RuntimeError("Could not determine home directory.")
-
-    monkeypatch.setattr("poolpart.local.FixedCluster", lambda **_: no_home())
-    with pytest.raises(PoolError, match=r"under `if __name__.* killed while it started: .*memory"):
-        local_cluster({"A": (1, 1)})
-    monkeypatch.setattr("poolpart.local.Path.home", no_home)
-    with pytest.raises(PoolError, match=r"home directory\.\)\. .* let HOME name one"):
-        local_cluster({"A": (1, 1)})
-
-
 def test_a_worker_that_is_slow_to_come_back_is_not_given_up():
     """Dask's SpecCluster closes the nanny of a worker that is not back after this time."""
     with (

@@ -17,8 +17,6 @@ from distributed.comm import tcp
 
 from poolpart import Partition, Pool
 
-LONG_S = 120.0
-
 
 def twice(x):
     return 2 * x
@@ -49,17 +47,6 @@ def fail_at_3(x):
 def stop_at_3(x):
     if x == 3:
         raise StopIteration
-    return x
-
-
-class UnpicklableError(Exception):
-    def __init__(self, text, more):
-        super().__init__(text)
-
-
-def fail_unpicklably(x):
-    if x == 3:
-        raise UnpicklableError("what happened", "more")
     return x
 
 
@@ -107,12 +94,6 @@ def gate(client):
 
 def task_count(client):
     return len(client.cluster.scheduler.tasks)
-
-
-def unfinished(client):
-    """Number of tasks that are under way."""
-    tasks = list(client.cluster.scheduler.tasks.values())
-    return sum(task.state in ("waiting", "queued", "no-worker", "processing") for task in tasks)
 
 
 def test_results_are_in_the_order_of_the_items(a):
@@ -215,12 +196,6 @@ def test_an_error_names_its_item_and_lets_go_of_the_others(a, client, ordered, c
 
 
 @pytest.mark.parametrize("chunk", [1, 10])
-def test_an_error_that_cannot_be_sent_comes_as_its_text(a, chunk):
-    with pytest.raises(Exception, match="what happened"):
-        list(a.map(fail_unpicklably, range(50), chunk=chunk))
-
-
-@pytest.mark.parametrize("chunk", [1, 10])
 def test_stop_iteration_in_a_task_does_not_end_the_map_silently(a, chunk):
     with pytest.raises(RuntimeError, match=r"stop_at_3.* raised StopIteration"):
         list(a.map(stop_at_3, range(50), chunk=chunk))
@@ -254,13 +229,6 @@ def test_stopping_lets_go_of_tasks_that_have_not_started(
     else:
         del results
     gate.set()
-    wait_until(lambda: task_count(client) == 0)
-
-
-def test_leaving_a_loop_stops(b, client, gate, wait_until):
-    gate.set()
-    for _ in b.map(wait_for, itertools.repeat(gate.name), chunk=1):
-        break
     wait_until(lambda: task_count(client) == 0)
 
 

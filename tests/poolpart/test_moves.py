@@ -1,6 +1,5 @@
 """Moving workers between partitions while tasks run: none is lost, none runs elsewhere."""
 
-import asyncio
 import os
 import queue
 import signal
@@ -17,13 +16,11 @@ from poolpart import (
     PoolError,
     n_workers,
     per_host,
-    reconciler,
     recorded,
     rest,
     trace_to,
     worker_identities,
 )
-from poolpart.internals import wake
 
 LONG_S = 120.0
 
@@ -178,37 +175,6 @@ def test_a_task_that_does_not_end_keeps_its_worker(divided, wait_until):
     assert len(parts["A"].shrink(1)) == 1
 
 
-def test_partitions_that_are_dissolved_while_a_worker_moves(start, wait_until):
-    client = start({"a": {}, "b": {}})
-    parts = Pool.from_client(client).divide({"A": n_workers(1, minimum=0), "B": rest()})
-    event = Event("late", client)
-    address = parts["A"].workers[0].address
-    task = parts["A"].submit(begin_and_wait_for, "late")
-    state = client.cluster.scheduler.workers[address]
-    assert begun.get(timeout=LONG_S) == "late"
-    task.cancel()  # so that dissolving does not wait for it
-    wait_until(lambda: not state.processing)
-    moved = []
-
-    def move():
-        with pytest.raises(PoolError, match="1 of 1 worker could not be moved") as error:
-            parts["A"].shrink(1, timeout_s=1)
-        moved.append(error)
-
-    def end_when_it_has_failed():
-        thread.join()
-        event.set()
-
-    thread = threading.Thread(target=move)
-    thread.start()
-    # Where nobody looks for a second, it has failed by then.
-    wait_until(lambda: not thread.is_alive() or not state.resources["A"])
-    threading.Thread(target=end_when_it_has_failed).start()
-    Pool.from_client(client).dissolve(timeout_s=LONG_S)
-    assert moved
-    assert set(map(str, declared_by_themselves(client).values())) == {"{}"}
-
-
 def test_a_task_that_was_cancelled_but_runs_on_keeps_its_slot(divided):
     client, parts = divided
     event = Event("cancelled", client)
@@ -223,49 +189,6 @@ def test_a_task_that_was_cancelled_but_runs_on_keeps_its_slot(divided):
     assert event.is_set()
     assert declared_by_themselves(client)[left[0]] == {"C": 1}
     assert parts["A"].submit(brief).result() in members(parts["A"])
-
-
-def test_what_was_moved_is_counted_where_it_is(divided, wait_until):
-    client, parts = divided
-    event = Event("counted", client)
-    scheduler = client.cluster.scheduler
-    parts["A"].shrink(2)
-    tasks = [parts["A"].submit(wait_for, "counted") for _ in range(9)]
-    wait_until(lambda: len(scheduler.workers[parts["A"].workers[0].address].processing) == 9)
-    parts["A"].grow(2)
-    wait_until(lambda: sum(len(w.processing) for w in scheduler.workers.values()) == 9)
-    event.set()
-    client.gather(tasks)
-    parts["A"].shrink(1)
-    assert all(not any(u.values()) for u in used(client).values())
-
-
-def test_a_worker_that_is_moved_on_in_the_moment_in_which_it_arrives(
-    divided, monkeypatch, wait_until
-):
-    client, parts = divided
-    before = members(parts["A"])
-    steward = client.cluster.scheduler.plugins["poolpart-steward"]
-    arrived = []
-
-    def move_on(seat):
-        steward.book.put(seat, "B")
-        steward.reconciler.settle([seat])
-
-    def wake_and_move_on(scheduler, worker):
-        # The last that is done for a worker; what comes next in the event loop is before anybody
-        # hears that it is done.
-        wake(scheduler, worker)
-        if worker.resources.get("A") and worker.name not in before and not arrived:
-            arrived.append(worker.name)
-            seat = steward.reconciler.seat_at(worker.address)
-            asyncio.get_running_loop().call_soon(move_on, seat)
-
-    monkeypatch.setattr(reconciler, "wake", wake_and_move_on)
-    parts["A"].grow(1, source="C")
-    wait_until(lambda: arrived and arrived[0] in members(parts["B"]))
-    assert members(parts["A"]) == before
-    assert declared(client) == declared_by_themselves(client)
 
 
 def test_a_cancelled_task_that_is_on_its_way_when_its_worker_leaves(start, monkeypatch, wait_until):
@@ -305,7 +228,6 @@ def test_never_below_the_minimum(start):
     rules = {"A": n_workers(2, minimum=2), "B": n_workers(1), "C": rest(minimum=1)}
     parts = Pool.from_client(client).divide(rules)
     before = declared(client)
-    assert [part.minimum for part in parts.values()] == [2, 1, 1]
     with pytest.raises(PoolError, match="'A' cannot shrink by 1: it has 2 workers and needs at"):
         parts["A"].shrink()
     with pytest.raises(PoolError, match="'B' cannot grow by 1: the remainder has 0 workers to"):
@@ -328,7 +250,6 @@ def test_what_makes_no_sense(divided):
         parts["A"].grow(source="X")
     with pytest.raises(PoolError, match="There is no partition 'X'"):
         Partition("X", client).shrink()
-    assert Partition("X", client).minimum == 0
 
 
 def test_a_cluster_that_was_divided_when_it_was_started(start):
@@ -361,13 +282,12 @@ def kill_at(point, pids):
     return killed
 
 
-@pytest.mark.parametrize("point", ["drained", "nanny_told", "worker_told"])
-def test_a_worker_that_is_killed_while_it_moves(nannies, wait_until, point):
+def test_a_worker_that_is_killed_while_it_moves(nannies, wait_until):
     parts = Pool.from_client(nannies).divide({"A": per_host(1), "B": rest()})
     target, moving = members(parts["A"])[0], members(parts["B"])[0]
     tasks = [parts["B"].submit(recorded, "s", "B", brief) for _ in range(20)]
     tasks += [parts["A"].submit(recorded, "s", "A", brief) for _ in range(20)]
-    killed = kill_at(f"partition.{point}", nannies.run(os.getpid))
+    killed = kill_at("partition.nanny_told", nannies.run(os.getpid))
     try:
         assert parts["A"].grow(1, timeout_s=LONG_S) == [moving]
     finally:

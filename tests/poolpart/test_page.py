@@ -66,9 +66,9 @@ def cluster(dashboard):
         yield client
 
 
-@pytest.fixture(params=[True, False], ids=["bokeh", "plain"])
-def client(request):
-    with cluster(request.param) as client:
+@pytest.fixture
+def client():
+    with cluster(dashboard=True) as client:
         yield client
 
 

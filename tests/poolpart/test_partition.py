@@ -120,10 +120,6 @@ def test_submit_many_takes_iterators_and_runs_equal_calls_each_by_itself(a):
     assert len({future.result() for future in futures}) == 20
 
 
-def test_wait_returns_when_the_workers_are_there(a):
-    a.wait(2, timeout_s=0)
-
-
 def test_wait_names_what_is_missing(client):
     with pytest.raises(PoolError, match=r"'C' has 0 of 2 workers after 0.05 s: .*C=1"):
         Partition("C", client).wait(2, timeout_s=0.05)

@@ -128,18 +128,6 @@ def _threads_client(_threads):
         yield client
 
 
-def test_a_single_producer_never_goes_beyond_the_capacity(client, make_pipe, pool):
-    pipe = make_pipe(client, capacity=3)
-    producer = pool.submit(produce, again(pipe), range(60))
-    received, depths = [], []
-    while len(received) < 60:
-        depths.append(pipe.depth)
-        received += pipe.poll()
-    producer.result(LONG_S)
-    assert received == list(range(60))
-    assert max(depths) <= 3
-
-
 def test_a_producer_waits_while_the_pipe_is_full(client, make_pipe, pool, wait_until):
     pipe = make_pipe(client, capacity=2)
     producer = pool.submit(produce, again(pipe), range(5))
@@ -257,39 +245,11 @@ def test_the_first_reason_stays(client, make_pipe):
         again(pipe).get()
 
 
-def test_closing_does_not_undo_a_failure_that_was_not_seen(client, make_pipe):
-    pipe = make_pipe(client)
-    late = again(pipe)
-    late.put(1)  # has read the state
-    pipe.fail("broken")
-    late.close()
-    with pytest.raises(PipeFailed, match="broken"):
-        again(pipe).get()
-
-
-def test_advice_does_not_undo_a_closing_that_was_not_seen(client, make_pipe):
-    pipe = make_pipe(client)
-    adviser = again(pipe)
-    assert adviser.advice == 1
-    pipe.close()
-    adviser.advise(7)
-    assert again(pipe).advice == 7
-    with pytest.raises(PipeClosed):
-        again(pipe).get()
-
-
 def test_advice_can_return_to_what_it_was(client, make_pipe):
     pipe = make_pipe(client)
     pipe.advise(5)
     again(pipe).advise(1)
     assert again(pipe).advice == 1
-
-
-def test_failing_without_a_reason_fails_all_the_same(client, make_pipe):
-    pipe = make_pipe(client)
-    pipe.fail("")
-    with pytest.raises(PipeFailed, match="no reason was given"):
-        again(pipe).put(1)
 
 
 def test_changes_at_the_same_moment_all_count(client, make_pipe, pool):
@@ -442,13 +402,6 @@ def test_two_pipes_of_one_name(client, make_pipe):
     assert pipe.get() == "mine"
     pipe.delete()
     assert again(pipe).create().depth == 0
-
-
-def test_a_pipe_of_a_client_that_has_left_is_not_made(client, before):
-    """One that was killed while it asked may be known to be gone before it is heard."""
-    arguments = {"name": "late", "owner": "gone", "state": {}}
-    assert not client.run_on_scheduler(pipe_module._open, **arguments)
-    assert known(client) == before
 
 
 @pytest.mark.parametrize(

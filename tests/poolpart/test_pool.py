@@ -1,7 +1,6 @@
 """Pools on clusters: what they find, how they are divided, what they refuse."""
 
 import logging
-from dataclasses import replace
 
 import pytest
 from distributed import Client, LocalCluster, get_worker
@@ -201,17 +200,6 @@ def test_one_worker_for_each_gpu_of_a_host(start, monkeypatch):
     gpu, rest = pool.partition("GPU", max_workers_per_gpu=1)
     assert (len(gpu), len(rest), gpu.note) == (2, 3, "")
     assert {worker.gpus for worker in rest} == {("x", "y")}
-
-
-def test_two_hosts_of_different_size(start):
-    pool = Pool.from_client(start({name: {} for name in "abcde"}))
-    views = {"a": ("h1", ("x",)), "b": ("h1", ("x",)), "c": ("h2", ("u", "v"))}
-    views |= {"d": ("h2", ("u", "v")), "e": ("h2", ("u", "v"))}
-    workers = [replace(w, host=views[w.name][0], gpus=views[w.name][1]) for w in pool]
-    gpu, rest = Pool(pool.client, workers).partition("GPU", max_workers_per_gpu=1)
-    chosen = {worker.name for worker in gpu.workers}
-    assert (len(chosen & {"a", "b"}), len(chosen & {"c", "d", "e"})) == (1, 2)
-    assert len(rest) == 2
 
 
 def test_without_gpus_the_fall_back_is_seen(start, caplog):

@@ -61,16 +61,6 @@ def test_a_partition_that_was_made_twice_keeps_the_later_slots(nannies):
     assert [(w.name, w.resources) for w in part.workers] == [("0", {"P": 4})]
 
 
-def test_every_worker_of_two_partitions_at_once(nannies):
-    one, rest = Pool.from_client(nannies).partition("ONE", n_workers=1)
-    two, _ = rest.partition("TWO", n_workers=1)
-    nannies.restart()
-    for part in (one, two):
-        assert (len(part), part.slots) == (1, 1)
-        name = part.workers[0].name
-        assert part.submit(here).result(LONG_S) == name
-
-
 def test_a_partition_of_a_cluster_declared_so(processes):
     gpu = Partition("GPU", processes)
     waiting = kill_and_submit_at_once(processes, gpu, "GPU-0")

@@ -305,28 +305,6 @@ def test_a_worker_that_left_is_replaced_by_one_that_joins_and_waiting_tasks_run(
     assert declared(client) == {"a": {"B": 1}, "late": {"A": 1}}
 
 
-def test_rules_are_asked_again_only_when_something_has_changed(start, wait_until, monkeypatch):
-    asked = []
-
-    def ask(worker, *args):
-        asked.append(worker.name)
-        return partition_for(worker, *args)
-
-    monkeypatch.setattr(steward, "partition_for", ask)
-    client = start({"a": {}})
-    Pool.from_client(client).divide({"A": n_workers(1)})
-    join(client, "unwanted")
-    ticker = client.cluster.scheduler.plugins[steward.NAME]
-    wait_until(lambda: ticker._looked_at is not None)
-    asked.clear()
-    for _ in range(3):
-        client.sync(_tick, ticker)
-    assert not asked
-    leave(client, "a")
-    wait_until(lambda: declared(client) == {"unwanted": {"A": 1}})
-    assert asked == ["unwanted"]
-
-
 async def _tick(ticker):
     ticker._tick()
 
@@ -352,18 +330,6 @@ def test_a_later_partition_of_the_remainder_forgets_no_gpus(start, wait_until, m
     wait_until(lambda: seats["late"].info.gpus == ("x",))
     assert seats["late"].partition is None
     assert len(gpu) == 1
-
-
-def test_a_late_worker_that_cannot_be_asked_has_no_gpu(start, wait_until, monkeypatch):
-    client = start({"a": {}})
-    Pool.from_client(client).divide({"GPU": per_gpu(1), "OTHER": rest()})
-
-    def broken():
-        raise ZeroDivisionError("no driver")
-
-    monkeypatch.setattr(probe, "visible_gpus", broken)
-    join(client, "late")
-    wait_until(lambda: declared(client).get("late") == {"OTHER": 1})
 
 
 def test_a_late_worker_that_declares_a_partition_belongs_to_it(start, wait_until):
@@ -397,16 +363,6 @@ def test_rules_that_a_cluster_cannot_meet_change_nothing(start):
             pool.divide(rules)
     assert declared(client) == {"a": {}, "b": {"O": 1}}
     assert set(client.cluster.scheduler.plugins) == plugins
-
-
-def test_two_who_divide_one_cluster_at_a_time(start):
-    client = start({"a": {}, "b": {}})
-    mine, theirs = Pool.from_client(client), Pool.from_client(client)
-    mine._cluster_now = theirs._cluster_now = lambda: list(mine)
-    mine.partition("P", workers=["a"])
-    with pytest.raises(PoolError, match="Worker a already declares P; a worker belongs to one"):
-        theirs.divide({"Q": rest()})
-    assert declared(client) == {"a": {"P": 1}, "b": {}}
 
 
 def test_an_exclusive_partition_keeps_others_out(start):

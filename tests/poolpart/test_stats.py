@@ -15,8 +15,6 @@ from poolpart.stats import (
     StageStats,
     Statistics,
     partition_stats,
-    unwatch,
-    watch,
 )
 
 LONG_S = 120.0
@@ -72,7 +70,7 @@ def test_tasks_that_wait_run_and_end(client, wait_until):
 
 def test_failures(client, wait_until):
     part = Partition("A", client)
-    watch(client)
+    Partition("A", client).stats()  # counts from here on
     tasks = [part.submit(broken, i) for i in range(3)]
     dependent = part.submit(after, tasks[0])
     wait_until(lambda: dependent.status == "error" and all(t.done() for t in tasks))
@@ -81,7 +79,7 @@ def test_failures(client, wait_until):
 
 
 def test_partitions_are_counted_apart_and_from_any_client(client):
-    watch(client)
+    Partition("A", client).stats()  # counts from here on
     a, b = Partition("A", client), Partition("B", client)
     kept = client.gather([a.submit(after), b.submit(after), client.submit(after, 1)])
     with Client(client.scheduler.address, set_as_default=False) as other:
@@ -95,7 +93,7 @@ def test_partitions_are_counted_apart_and_from_any_client(client):
 def test_a_task_that_is_computed_again_is_done_once(start, wait_until):
     client = start({"one": {"resources": {"A": 1}}, "two": {"resources": {"A": 1}}})
     part = Partition("A", client)
-    watch(client)
+    Partition("A", client).stats()  # counts from here on
     results = [part.submit(after, i) for i in range(4)]
     names = client.gather(results)
     scheduler = client.cluster.scheduler
@@ -164,7 +162,7 @@ def test_a_restart_starts_counting_anew(client, wait_until):
 
 
 def test_memory_is_bounded(client, monkeypatch, wait_until):
-    watch(client)
+    Partition("A", client).stats()  # counts from here on
     statistics = client.cluster.scheduler.plugins[NAME]
     assert isinstance(statistics, SchedulerPlugin)
     assert statistics.recent.maxlen == RECENT_TASKS
@@ -179,16 +177,9 @@ def test_memory_is_bounded(client, monkeypatch, wait_until):
 
 
 def test_totals_that_users_tell(client):
-    watch(client)
+    Partition("A", client).stats()  # counts from here on
     statistics: Statistics = client.cluster.scheduler.plugins[NAME]
     client.log_event("poolpart-totals", {f"number {i}": i for i in range(30)})
     client.log_event("poolpart-totals", "nonsense")
     client.log_event("other", {"number": 1})
     assert list(statistics.totals.values()) == list(range(10, 30))
-
-
-def test_unwatch(client):
-    watch(client)
-    unwatch(client)
-    unwatch(client)
-    assert NAME not in client.cluster.scheduler.plugins

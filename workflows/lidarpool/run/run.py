@@ -13,7 +13,6 @@ from distributed.client import FutureCancelledError
 from distributed.comm.core import CommClosedError
 
 from poolpart import (
-    Backoff,
     Partition,
     PipeClosed,
     PipeFailed,
@@ -49,6 +48,7 @@ PROGRESS_EVERY_S = 0.1
 SAVE_EVERY_S = 1.0  # how many frames were handed out
 LOST_S = 0.5  # for a client to notice that its scheduler is gone
 PAUSED_S = 0.1  # from one look at a paused run to the next
+LONGEST_PAUSE_S = 0.05  # while nothing moves
 
 
 class Run:
@@ -198,7 +198,7 @@ class Run:
         started: float,
     ) -> dict[type, float]:
         """Step the pumps until all have finished; returns when each did, in seconds."""
-        pause = Backoff(least_s=0.001, most_s=0.05)
+        pause_s = 0.0
         watch = Watch(
             self.client,
             [GPU, OTHER] if trials else [GPU],
@@ -230,9 +230,8 @@ class Run:
             if still:
                 time.sleep(PAUSED_S)
             else:
-                if moved:
-                    pause.reset()
-                (time.sleep if survey.finished else survey.wait)(0.0 if moved else pause.next())
+                pause_s = 0.0 if moved else min(max(0.001, 2 * pause_s), LONGEST_PAUSE_S)
+                (time.sleep if survey.finished else survey.wait)(pause_s)
         return times
 
     def _look_at_pause(self, pumps: Sequence[SurveyDriver | TrialPump]) -> bool:
