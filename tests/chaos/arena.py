@@ -131,7 +131,7 @@ class Arena:
         nannies = list(self.cluster.workers.items())
         return [name for name, nanny in nannies if nanny.status.name in ("closed", "failed")]
 
-    def wait_until_whole(self, timeout_s: float = 120.0) -> None:
+    def wait_until_whole(self, timeout_s: float = 300.0) -> None:
         """Wait until every worker is there."""
         deadline = time.monotonic() + timeout_s
         while absent := [name for name in self.cluster.worker_spec if not self.address(name)]:

@@ -7,7 +7,7 @@ from typing import Any
 
 from distributed import Client
 
-SETTLE_S = 120.0  # for what was closed to be gone: connections end a moment later
+SETTLE_S = 300.0  # for what was closed to be gone: connections end a moment later
 
 
 def scheduler_state(client: Client) -> dict[str, Any]:

@@ -39,9 +39,17 @@ def local_client() -> Iterator[Client]:
 
 
 @pytest.fixture
-def client(local_client: Client, wait_for_all: Callable[[Client, int], None]) -> Client:
-    """The local cluster with all its workers: an earlier test may have killed some."""
-    wait_for_all(local_client, 4)
+def client(local_client: Client) -> Client:
+    """The local cluster with all its workers: an earlier test may have killed some.
+
+    One that was killed may be listed for a moment yet, and a run that begins then is without it.
+    """
+
+    def all_answer() -> bool:
+        answers = local_client.run(os.getpid, on_error="return").values()
+        return len(answers) == 4 and all(isinstance(pid, int) for pid in answers)
+
+    _wait(all_answer)
     return local_client
 
 
@@ -83,23 +91,6 @@ def sabotage(client: Client, tmp_path: Path) -> Iterator[Callable[..., Path]]:
 
     yield sabotage
     client.unregister_worker_plugin("saboteur")
-
-
-@pytest.fixture(scope="session")
-def wait_for_all() -> Callable[[Client, int], None]:
-    """Wait until so many workers are there and answer.
-
-    One that was killed may be listed for a moment yet, and a run that begins then is without it.
-    """
-
-    def wait_for_all(client: Client, count: int) -> None:
-        def all_answer() -> bool:
-            answers = client.run(os.getpid, on_error="return").values()
-            return len(answers) == count and all(isinstance(pid, int) for pid in answers)
-
-        _wait(all_answer)
-
-    return wait_for_all
 
 
 @pytest.fixture
@@ -152,7 +143,7 @@ def left_over() -> Callable[[Client], tuple[list[str], list[str], list[str]]]:
         return [str(key) for key in dask_scheduler.tasks], list(queues), list(variables)
 
     def left_over(client: Client) -> tuple[list[str], list[str], list[str]]:
-        until = time.monotonic() + 120  # cancelling is told to the scheduler, not asked
+        until = time.monotonic() + 300  # cancelling is told to the scheduler, not asked
         while any(found := client.run_on_scheduler(look)) and time.monotonic() < until:
             time.sleep(0.05)
         return found
@@ -273,8 +264,8 @@ def outside(
         cluster.close()
 
 
-def _wait(condition: Callable[[], bool], seconds: float = 120) -> None:
-    stop = time.monotonic() + seconds
+def _wait(condition: Callable[[], bool]) -> None:
+    stop = time.monotonic() + 300
     while not condition():
         assert time.monotonic() < stop, "waited in vain"
         time.sleep(0.05)
@@ -339,7 +330,7 @@ def small_batches(monkeypatch: pytest.MonkeyPatch) -> None:
 
 # -- the command as a process of its own ---------------------------------------------------------
 
-ENDS_WITHIN_S = 180  # on a busy machine; a second or two on an idle one
+ENDS_WITHIN_S = 300  # on a busy machine; a second or two on an idle one
 
 
 class RunningCommand:
@@ -374,7 +365,7 @@ class RunningCommand:
 
     def wait_for(self, pattern: str) -> RunningCommand:
         """Wait until the run says something."""
-        stop = time.monotonic() + 180
+        stop = time.monotonic() + ENDS_WITHIN_S
         while not re.search(pattern, self.said):
             assert self.process.poll() is None, self.said
             assert time.monotonic() < stop, self.said

@@ -22,7 +22,7 @@ from lidarpool.run.progress import Progress
 from lidarpool.run.run import Run
 from lidarpool.run.store import RunStore
 
-LONG_S = 120.0
+LONG_S = 300.0
 SENSOR = Sensor.grid(rays_per_revolution=720, layers=8)
 
 

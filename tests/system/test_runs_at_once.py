@@ -30,7 +30,7 @@ def test_they_run_one_after_the_other(cluster, left_over, same_cloud):
 
     def hold(_: Frame) -> None:
         """Do not end before another has found the slots taken."""
-        assert refused.wait(120)
+        assert refused.wait(300)
 
     def run(go: threading.Barrier) -> None:
         with Client(cluster, set_as_default=False) as client:
@@ -47,7 +47,7 @@ def test_they_run_one_after_the_other(cluster, left_over, same_cloud):
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join(120)
+        thread.join(300)
         assert not thread.is_alive(), "it waits for slots"
     assert len(results) == 3
     assert all(same_cloud(results[0].cloud, other.cloud) for other in results)
@@ -78,7 +78,7 @@ def test_two_surveys_and_a_foreign_user_do_not_see_each_other(threads, same_clou
 
         def meet(_: Frame) -> None:
             if not met:  # none is done before all have begun
-                met.append(all_there.wait(120))
+                met.append(all_there.wait(300))
 
         with Client(address, set_as_default=False) as client:
             return simulate(Scene.seed(), survey, planning, client=client, on_frame=meet)
@@ -90,10 +90,10 @@ def test_two_surveys_and_a_foreign_user_do_not_see_each_other(threads, same_clou
             queue = Queue("foreign", client=client)
             for count in range(20):
                 if count == 10:
-                    all_there.wait(120)
+                    all_there.wait(300)
                 queue.put(count)
-                results.append(client.submit(pow, count, 2, pure=False).result(120))
-                taken.append(queue.get(timeout=120))
+                results.append(client.submit(pow, count, 2, pure=False).result(300))
+                taken.append(queue.get(timeout=300))
             queue.close()
         return results, taken
 
