@@ -144,7 +144,7 @@ def _simulate(
                     in_place,
                     only_cloud=only_cloud,
                 )
-        return result, report, log_file if log.written else None
+    return result, report, log_file if log.written else None  # which is when it was closed
 
 
 @contextmanager
