@@ -16,9 +16,8 @@ from typing import Any
 from distributed import Client, get_worker
 
 from . import probe
-from .remote import on_scheduler
 from .task_context import WorkerLeft, in_event_loop, own_client, telling_departure
-from .worker_info import WorkerInfo
+from .workers import WorkerInfo, on_scheduler
 
 _HELD = "poolpart-gpu"  # in what the scheduler knows of a worker: UUID of the device it uses
 

@@ -8,12 +8,12 @@ the outputs of shuffles go to the remainder of the cluster, whoever submitted th
 
 What a fence does not concern: tasks that a worker was given before go on there; `Client.run`
 reaches all workers; data that is scattered, replicated or rebalanced may be put anywhere
-(give ``workers=`` to keep it out).
+(give ``workers=`` to keep it out). A task with ``allow_other_workers=True`` is Dask's to place
+where none of the workers that it names, or no worker outside, has room.
 
-The fence lives on the scheduler until it is lowered, also when the client has gone. It
-follows what the workers declare, so workers that join late, are restarted or move between
-partitions need nothing else. Tasks that no worker outside may take wait; the scheduler logs
-that, every client gets a warning, and statistics count them.
+The fence lives on the scheduler until it is lowered, also when the client has gone. Workers
+that join late, are restarted or move between partitions need nothing else. Tasks that no worker
+outside may take wait; the scheduler logs that, and every client gets a warning.
 
 A fence is a rule that is asked whenever the scheduler decides where a task goes, see
 `internals.py`; nothing is written on tasks or workers. Two ways that need no such rule were tried:
@@ -28,20 +28,17 @@ from __future__ import annotations
 import logging
 import pickle
 import time
-from itertools import islice
 from typing import Any
 
-from distributed import Client
 from distributed.diagnostics.plugin import SchedulerPlugin
 
-from .internals import FenceRules, open_to_all
-from .remote import on_scheduler
+from .internals import Rules, could_take, open_to_all, rule_for_fences, take_back_fences
 
 logger = logging.getLogger(__name__)
 
 NAME = "poolpart-fences"
 COMPLAIN_EVERY_S = 10.0
-_LOOK_AT_MOST = 1000
+_EXPECTED = "poolpart-partition"  # in what the scheduler knows of a worker
 
 
 def enclose(scheduler: Any, name: str) -> None:
@@ -55,9 +52,17 @@ def enclose(scheduler: Any, name: str) -> None:
     fences: Fences | None = scheduler.plugins.get(NAME)
     if fences is None:
         fences = Fences(scheduler)
-        fences.install()
     fences.names.add(name)
     fences.look_again()
+
+
+def expect(scheduler: Any, worker: Any, name: str | None) -> None:
+    """Note to which partition a worker is to belong: it is behind its fence from now on."""
+    worker.extra.pop(_EXPECTED, None)
+    if name is not None:
+        worker.extra[_EXPECTED] = name
+    if fences := scheduler.plugins.get(NAME):
+        fences.look_at(worker)
 
 
 def lower(scheduler: Any, name: str) -> None:
@@ -77,18 +82,6 @@ def fences_of(scheduler: Any) -> frozenset[str]:
     return frozenset(fences.names) if fences else frozenset()
 
 
-def kept_out(scheduler: Any) -> int:
-    """Count tasks that wait because only workers behind fences could take them.
-
-    Of those that no worker may take at all, the first thousand are looked at.
-    """
-    fences: Fences | None = scheduler.plugins.get(NAME)
-    if fences is None:
-        return 0
-    waiting = sum(map(fences.holds_up, islice(scheduler.unrunnable, _LOOK_AT_MOST)))
-    return waiting + (0 if fences.remainder else len(scheduler.queued))
-
-
 class Fences(SchedulerPlugin):
     """The rule: a worker behind a fence takes tasks only that ask for the fence's resource."""
 
@@ -98,49 +91,36 @@ class Fences(SchedulerPlugin):
         self.scheduler = scheduler
         self.names: set[str] = set()
         self.closed: set[Any] = set()  # states of the workers behind fences
-        self._rules = FenceRules(scheduler, self.closed, self.stop, self._look_at)
+        self._rules = Rules()
         self._complained_at = float("-inf")
-
-    # -- coming and going --------------------------------------------------------------
-
-    def install(self) -> None:
-        """Have a say in what the scheduler decides.
-
-        Raises
-        ------
-        PoolError
-            If this version of Dask decides by other means.
-        """
-        self._rules.install()
-        self.scheduler.add_plugin(self)
+        rule_for_fences(self._rules, scheduler, self.closed, self.stop)
+        scheduler.add_plugin(self)
 
     def uninstall(self) -> None:
         """Take everything back."""
-        self._rules.uninstall()
+        take_back_fences(self._rules, self.scheduler)
         self.scheduler.remove_plugin(NAME)
 
     # -- who is behind a fence ---------------------------------------------------------
 
-    @property
-    def remainder(self) -> set[Any]:
-        """Workers that all tasks may run on now."""
-        remainder: set[Any] = self.scheduler.running - self.closed
-        return remainder
-
     def look_again(self) -> None:
         """Find out which workers are behind fences."""
         for worker in self.scheduler.workers.values():
-            self._look_at(worker)
+            self.look_at(worker)
 
-    def _look_at(self, worker: Any) -> None:
-        """Enclose a worker, or open it, by what it declares."""
+    def look_at(self, worker: Any) -> None:
+        """Enclose a worker, or open it, by what it declares and where it is to belong."""
         declares = any(worker.resources.get(name) for name in self.names)
-        if declares:
+        if declares or worker.extra.get(_EXPECTED) in self.names:
             self.closed.add(worker)
             self.scheduler.idle_task_count.discard(worker)
         elif worker in self.closed:
             self.closed.discard(worker)
             open_to_all(self.scheduler, worker)
+
+    def add_worker(self, scheduler: Any, worker: str) -> None:
+        """Enclose a worker that joins, if it is to be."""
+        self.look_at(scheduler.workers[worker])
 
     def remove_worker(self, scheduler: Any, worker: str, **kwargs: Any) -> None:
         """Forget a worker that has left."""
@@ -155,10 +135,7 @@ class Fences(SchedulerPlugin):
 
     def holds_up(self, task: Any) -> bool:
         """Whether fences are why no worker may take a task now."""
-        if not self.stop(task):
-            return False
-        # What nobody could take anyhow is not our affair.
-        could = self._rules.could_take(task)
+        could: set[Any] = could_take(self.scheduler, task) if self.stop(task) else set()
         return bool(could) and could <= self.closed
 
     # -- never silently ----------------------------------------------------------------
@@ -183,30 +160,3 @@ class Fences(SchedulerPlugin):
         )
         logger.warning(complaint)
         self.scheduler.log_event("warn", {"message": pickle.dumps(complaint)})
-
-
-def raise_fence(client: Client, name: str) -> None:
-    """Keep tasks that do not ask for the resource `name` away from workers that declare it.
-
-    Tasks that such workers were given before end there. Raising a fence that is there does
-    nothing.
-
-    Raises
-    ------
-    PoolError
-        If the scheduler lacks this package, or what this needs of Dask.
-    """
-    on_scheduler(client, _raise, name=name)
-
-
-def lower_fence(client: Client, name: str) -> None:
-    """Let all tasks in again; those that wait are sent at once. Nothing is left behind."""
-    on_scheduler(client, _lower, name=name)
-
-
-async def _raise(name: str, dask_scheduler: Any = None) -> None:
-    enclose(dask_scheduler, name)
-
-
-async def _lower(name: str, dask_scheduler: Any = None) -> None:
-    lower(dask_scheduler, name)

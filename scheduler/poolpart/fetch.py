@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import random
-import threading
 from asyncio import wait_for
 from collections import defaultdict
 from collections.abc import Collection, Coroutine
@@ -19,7 +18,6 @@ T = TypeVar("T")
 _HANDLER = "poolpart_take_held"  # what a worker that holds bytes is asked by
 
 _held: dict[str, Any] = {}  # {name: bytes} of this process
-_lock = threading.Lock()
 
 
 def fetch_available(
@@ -134,9 +132,8 @@ def hold_for_driver(name: str, data: Any) -> str:
     Whoever calls it bounds how much is held: it stays for ever if nobody fetches it.
     """
     worker = get_worker()
-    with _lock:
-        _held[name] = data
-        answer_to(worker, _HANDLER, _hand_over)
+    _held[name] = data
+    answer_to(worker, _HANDLER, _hand_over)
     return str(worker.address)
 
 

@@ -26,32 +26,49 @@ from distributed.diagnostics.plugin import SchedulerPlugin
 
 from .errors import PoolError
 from .internals import Resources, Rules, rule_for_graphs, rule_for_shuffles
-from .remote import on_scheduler
+from .workers import on_scheduler
 
 logger = logging.getLogger(__name__)
 
 NAME = "poolpart-inherit"
 
 
-def keep_shuffles_in(client: Client) -> None:
-    """Have shuffles and rechunks of tasks that ask for a partition stay in it, from now on."""
-    on_scheduler(client, _keep_shuffles_in)
+class Inheritance(SchedulerPlugin):
+    """The scheduler's side: looks at each graph before its tasks are made, and at shuffles."""
+
+    name = NAME
+
+    def __init__(self, scheduler: Any) -> None:
+        self.scheduler = scheduler
+        self.names: set[str] = set()
+        self.note = ""  # what a user should know where this version of Dask has no room for it
+        self._rules = Rules()
+        try:
+            rule_for_graphs(self._rules, scheduler, self._bequeath)
+            rule_for_shuffles(self._rules, scheduler)
+        except PoolError as error:  # partitions are of use without
+            self.note = f"tasks from inside tasks may run anywhere: {error}"
+            logger.warning("Partitions: %s", self.note)
+        scheduler.add_plugin(self)
+
+    def _bequeath(self, task: Any) -> Resources:
+        """Resources for what a task submits; none if it belongs to no partition."""
+        asked = task.resource_restrictions
+        return dict.fromkeys(self.names & asked.keys(), 0) if asked else {}
+
+    def uninstall(self) -> None:
+        """Take the rules back."""
+        self._rules.take_back()
+        self.scheduler.remove_plugin(NAME)
 
 
-async def _keep_shuffles_in(dask_scheduler: Any = None) -> None:
-    _rules_of(dask_scheduler)
+def begin_inheritance(scheduler: Any, *names: str) -> str:
+    """Have tasks that tasks of these partitions submit belong to them, and shuffles stay there.
 
-
-def begin_inheritance(scheduler: Any, name: str) -> str:
-    """Have tasks that tasks of the partition submit belong to it, from now on.
-
-    Returns
-    -------
-    note
-        What a user should know where this version of Dask has no room for the rule; else empty.
+    Returns what a user should know, where there is anything.
     """
-    rule = _rules_of(scheduler)
-    rule.names.add(name)
+    rule: Inheritance = scheduler.plugins.get(NAME) or Inheritance(scheduler)
+    rule.names.update(names)
     return rule.note
 
 
@@ -64,49 +81,10 @@ def end_inheritance(scheduler: Any, name: str | None) -> None:
             rule.uninstall()
 
 
-def _rules_of(scheduler: Any) -> Inheritance:
-    rule: Inheritance | None = scheduler.plugins.get(NAME)
-    if rule is None:
-        rule = Inheritance(scheduler)
-        rule.install()
-    return rule
+def keep_shuffles_in(client: Client) -> None:
+    """Have shuffles and rechunks of tasks that ask for a partition stay in it, from now on."""
+    on_scheduler(client, _keep_shuffles_in)
 
 
-class Inheritance(SchedulerPlugin):
-    """The scheduler's side: looks at each graph before its tasks are made, and at shuffles."""
-
-    name = NAME
-
-    def __init__(self, scheduler: Any) -> None:
-        self.scheduler = scheduler
-        self.names: set[str] = set()
-        self.note = ""
-        self._rules = Rules()
-
-    def install(self) -> None:
-        """See all graphs from now on, as far as this version of Dask allows it."""
-        try:
-            rule_for_graphs(self._rules, self.scheduler, self._bequeath)
-            self._rules.after(self.scheduler, "valid_workers", self._valid_workers, "ts")
-            rule_for_shuffles(self._rules, self.scheduler)
-        except PoolError as error:  # partitions are of use without
-            self.note = f"tasks from inside tasks may run anywhere: {error}"
-            logger.warning("Partitions: %s", self.note)
-        self.scheduler.add_plugin(self)
-
-    def uninstall(self) -> None:
-        """Take that back."""
-        self._rules.take_back()
-        self.scheduler.remove_plugin(NAME)
-
-    def _bequeath(self, task: Any) -> Resources:
-        """Resources for what a task submits; none if it belongs to no partition."""
-        asked = task.resource_restrictions
-        return dict.fromkeys(self.names & asked.keys(), 0) if asked else {}
-
-    def _valid_workers(self, valid: Any, task: Any) -> Any:
-        """Workers that have none of a resource any more would do for a task that needs 0."""
-        asked = task.resource_restrictions
-        if not valid or not asked or 0 not in asked.values():
-            return valid
-        return {worker for worker in valid if all(worker.resources.get(name) for name in asked)}
+async def _keep_shuffles_in(dask_scheduler: Any = None) -> None:
+    begin_inheritance(dask_scheduler)

@@ -8,17 +8,17 @@ of a scheduler, worker or nanny.
 
 from __future__ import annotations
 
-import asyncio
 import inspect
 import logging
 import time
-import uuid
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable
+from contextlib import AbstractContextManager
 from typing import Any
 
+import dask
 import distributed
-from distributed import Client, Future, Queue, SpecCluster, Status
+from distributed import Client, Future, SpecCluster, Status
 from distributed.protocol import to_serialize
 from distributed.protocol.pickle import dumps
 from distributed.protocol.serialize import Serialize, Serialized, deserialize
@@ -197,91 +197,62 @@ def rule_for_shuffles(rules: Rules, scheduler: Any) -> None:
     rules.after(shuffle, "_calculate_worker_for", after, "spec")
 
 
-class FenceRules:
-    """Rules that keep tasks away from workers behind a fence.
+def rule_for_fences(
+    rules: Rules, scheduler: Any, closed: set[Any], stop: Callable[[Any], bool]
+) -> None:
+    """Keep tasks away from workers behind a fence.
 
     Parameters
     ----------
-    scheduler
-        The scheduler.
+    rules, scheduler
+        Where the rule goes.
     closed
         States of the workers behind fences; read each time.
     stop
         Whether a task is to stay out.
-    on_change
-        Called with the state of a worker whose resources have changed.
+
+    Raises
+    ------
+    PoolError
+        If this version of Dask decides by other means.
     """
+    if not isinstance(getattr(scheduler, "idle_task_count", None), set):
+        raise PoolError(
+            f"The scheduler of distributed {distributed.__version__} keeps no set of idle "
+            "workers, which fences build on: use a version that poolpart asks for."
+        )
 
-    def __init__(
-        self,
-        scheduler: Any,
-        closed: set[Any],
-        stop: Callable[[Any], bool],
-        on_change: Callable[[Any], None],
-    ) -> None:
-        self.scheduler, self.closed, self.stop = scheduler, closed, stop
-        self._on_change = on_change
-        self._rules = Rules()
-
-    def install(self) -> None:
-        """Have them asked from now on.
-
-        Raises
-        ------
-        PoolError
-            If this version of Dask decides by other means.
-        """
-        scheduler, after = self.scheduler, self._rules.after
-        if not isinstance(getattr(scheduler, "idle_task_count", None), set):
-            raise PoolError(
-                f"The scheduler of distributed {distributed.__version__} keeps no set of idle "
-                "workers, which fences build on: use a version that poolpart asks for."
-            )
-        after(scheduler, "valid_workers", self._valid_workers, "ts")
-        after(scheduler, "decide_worker_non_rootish", self._elsewhere, "ts")
-        after(scheduler, "decide_worker_rootish_queuing_disabled", self._rootish, "ts")
-        after(scheduler, "add_resources", self._changed, "worker", "resources")
-        if stealing := scheduler.extensions.get("stealing"):
-            after(stealing, "_get_thief", self._thief, "scheduler", "ts")
-        rule_for_shuffles(self._rules, scheduler)
-        scheduler.handlers["set_resources"] = scheduler.add_resources
-        scheduler.idle_task_count = _OpenWorkers(self.closed, scheduler.idle_task_count)
-
-    def uninstall(self) -> None:
-        """Take everything back."""
-        self._rules.take_back()
-        self.scheduler.handlers["set_resources"] = self.scheduler.add_resources
-        self.scheduler.idle_task_count = set(self.scheduler.idle_task_count)
-
-    def could_take(self, task: Any) -> Any:
-        """Workers that Dask itself would let take a task."""
-        valid = type(self.scheduler).valid_workers(self.scheduler, task)
-        return self.scheduler.running if valid is None else valid
-
-    def _valid_workers(self, valid: Any, task: Any) -> Any:
-        if not self.stop(task):
+    def valid_workers(valid: Any, task: Any) -> Any:
+        if not stop(task):
             return valid
-        remainder = self.scheduler.running - self.closed
+        remainder = scheduler.running - closed
         if valid is None:
             return remainder
-        allowed = valid - self.closed
+        allowed = valid - closed
         # Restrictions that are mere wishes; without this Dask would then take any worker.
         return allowed or (remainder if task.loose_restrictions else allowed)
 
-    def _elsewhere(self, worker: Any, task: Any) -> Any:
-        return None if worker in self.closed and self.stop(task) else worker
+    def rootish(worker: Any, task: Any) -> Any:
+        return (
+            scheduler.decide_worker_non_rootish(task) if worker in closed and stop(task) else worker
+        )
 
-    def _rootish(self, worker: Any, task: Any) -> Any:
-        if self._elsewhere(worker, task) is worker:
-            return worker
-        return self.scheduler.decide_worker_non_rootish(task)
+    rules.after(scheduler, "valid_workers", valid_workers, "ts")
+    rules.after(scheduler, "decide_worker_rootish_queuing_disabled", rootish, "ts")
+    rule_for_shuffles(rules, scheduler)
+    scheduler.idle_task_count = _OpenWorkers(closed, scheduler.idle_task_count)
 
-    def _thief(self, thief: Any, scheduler: Any, task: Any, *args: Any, **kwargs: Any) -> Any:
-        return self._elsewhere(thief, task)
 
-    def _changed(self, answer: Any, worker: str, resources: Any = None) -> Any:
-        self._on_change(self.scheduler.workers[worker])
-        return answer
+def take_back_fences(rules: Rules, scheduler: Any) -> None:
+    """Have the scheduler decide without that rule."""
+    rules.take_back()
+    scheduler.idle_task_count = set(scheduler.idle_task_count)
+
+
+def could_take(scheduler: Any, task: Any) -> Any:
+    """Workers that Dask itself would let take a task."""
+    valid = type(scheduler).valid_workers(scheduler, task)
+    return scheduler.running if valid is None else valid
 
 
 class _OpenWorkers(set[Any]):
@@ -301,24 +272,16 @@ class _OpenWorkers(set[Any]):
 
 
 def show(scheduler: Any, worker: Any, resources: Resources) -> None:
-    """Have tasks placed by these resources of a worker from now on, and wake those that waited.
-
-    Parameters
-    ----------
-    scheduler
-        The scheduler.
-    worker
-        Its state of the worker.
-    resources
-        All that the worker is to count as declaring.
-    """
-    for name in worker.resources.keys() - resources.keys():
-        del worker.resources[name]
-        scheduler.resources[name].pop(worker.address, None)
-    # The scheduler's own method, since fences listen to it.
-    scheduler.add_resources(worker.address, resources)
+    """Have tasks placed by these resources of a worker, and no others, from now on."""
+    for name in worker.resources.keys() | resources.keys():
+        declaring = scheduler.resources.setdefault(name, {})
+        declaring.pop(worker.address, None)
+        if name in resources:
+            declaring[worker.address] = resources[name]
+        elif not declaring:
+            del scheduler.resources[name]
+    worker.resources = dict(resources)
     recount(worker)
-    wake(scheduler, worker)
 
 
 def recount(worker: Any) -> None:
@@ -327,10 +290,11 @@ def recount(worker: Any) -> None:
     Dask forgets them when a worker declares something while it is busy, and counts a task
     that was moved by work stealing against the worker that it was moved from.
     """
-    worker.used_resources = dict.fromkeys(worker.resources, 0)
+    # Also of names that it does not declare any more: a task that was stolen may still come.
+    worker.used_resources = defaultdict(float, dict.fromkeys(worker.resources, 0))
     for task in worker.processing:
         for name, quantity in (task.resource_restrictions or {}).items():
-            worker.used_resources[name] = worker.used_resources.get(name, 0) + quantity
+            worker.used_resources[name] += quantity
 
 
 def wake(scheduler: Any, worker: Any) -> None:
@@ -351,13 +315,6 @@ def open_to_all(scheduler: Any, worker: Any) -> None:
     if worker.status is Status.running:
         wake(scheduler, worker)
         scheduler.stimulus_queue_slots_maybe_opened(stimulus_id=f"poolpart-opened-{time.time()}")
-
-
-def forget_resources(scheduler: Any, names: Iterable[str]) -> None:
-    """Forget names of resources that no worker declares."""
-    for name in names:
-        if not scheduler.resources.get(name, True):
-            del scheduler.resources[name]
 
 
 def asks_for(task: Any, names: Collection[str]) -> bool:
@@ -418,19 +375,11 @@ def hand_off(scheduler: Any, worker: Any, names: Collection[str], asked: set[Any
             stealing.move_task_request(task, worker, thief)
 
 
-# -- what a worker declares, and what its nanny starts it with ---------------------------
-#
-# The scheduler's request to declare other resources goes by another connection than the tasks
-# that it sends, and may arrive first. A task that was sent and cancelled at once is forgotten by
-# the scheduler while it is on its way; a worker that gets a task for a resource which it does not
-# declare breaks down. So a barrier is sent behind the tasks, and the worker waits for it.
-
-_HELD_S = 1.0  # how long a worker waits for tasks to give a resource back
-_BARRIER = "poolpart-barrier"
+# -- what a worker declares --------------------------------------------------------------
 
 
 async def call(scheduler: Any, address: str, function: Callable[..., Any], **arguments: Any) -> Any:
-    """Call a function in the event loop of a worker or nanny, which it gets as `dask_worker`.
+    """Call a function in the event loop of a worker, which it gets as `dask_worker`.
 
     Raises
     ------
@@ -448,123 +397,35 @@ async def call(scheduler: Any, address: str, function: Callable[..., Any], **arg
     return result.data if isinstance(result, Serialize) else result
 
 
-async def send_barrier(scheduler: Any, address: str) -> None:
-    """Send a barrier behind all messages to a worker; OSError if the worker does not answer."""
-    number = uuid.uuid4().hex
-    await call(scheduler, address, _await_barrier, number=number)
-    if address in scheduler.stream_comms:
-        scheduler.worker_send(address, {"op": _BARRIER, "number": number})
+def declare_on_worker(resources: Resources, dask_worker: Any = None) -> bool:
+    """Declare these resources, and none of any other; runs on a worker.
 
-
-def _is_awaited(worker: Any) -> bool:
-    """Whether a barrier is still on its way; runs on the worker."""
-    return _BARRIER in worker.stream_handlers
-
-
-def _await_barrier(number: str, dask_worker: Any = None) -> None:
-    awaited = number
-
-    def arrive(number: str) -> None:
-        # Barriers arrive in the order in which they were sent: behind this one there is none.
-        if number == awaited:
-            del dask_worker.stream_handlers[_BARRIER]
-
-    dask_worker.stream_handlers[_BARRIER] = arrive
-
-
-async def declare_on_worker(
-    resources: Resources, after_barrier: bool = False, dask_worker: Any = None
-) -> bool:
-    """Declare these resources and no others; runs on a worker.
-
-    Parameters
-    ----------
-    resources
-        What to declare.
-    after_barrier
-        Whether to wait for what the scheduler has sent before.
+    The names of others stay: this request goes by another connection than tasks, of which one
+    that was cancelled may still be on its way, and a worker breaks down that gets a task for a
+    resource whose name it does not know.
 
     Returns
     -------
     done
-        False if tasks still hold a resource that is to go: they give it back when they end,
-        and must find it then. Such a task may be one that was cancelled, of which the
-        scheduler knows nothing any more; it may even be on its way.
+        False if tasks still hold a resource that is to go. Such a task may be one that was
+        cancelled but runs on, of which the scheduler knows nothing any more.
     """
     state = dask_worker.state
     total, available = state.total_resources, state.available_resources
-    leaving = total.keys() - resources.keys()
-    for _ in range(int(_HELD_S / 0.01)):
-        held = any(available[name] < total[name] for name in leaving)
-        if not held and not (after_barrier and _is_awaited(dask_worker)):
-            break
-        await asyncio.sleep(0.01)
-    else:
+    if any(available[name] < total[name] for name in total.keys() - resources.keys()):
         return False
-    for name in leaving:
-        del total[name], available[name]
-    for name, quantity in resources.items():
+    for name, quantity in {**dict.fromkeys(total, 0), **resources}.items():
         available[name] = available.get(name, 0) + quantity - total.get(name, 0)
         total[name] = quantity
     return True
 
 
 def resources_here(worker: Any) -> tuple[str, ...]:
-    """Names of the resources that a worker declares; runs on the worker."""
-    return tuple(sorted(worker.state.total_resources))
-
-
-_FOUND = "poolpart_found"  # on a nanny: what it started its worker with before
-
-
-def keep_on_nanny(resources: Resources, dask_worker: Any = None) -> None:
-    """Start the worker with these resources from now on; runs on a nanny.
-
-    Resources set on a running worker are lost when its nanny restarts it. Setting them once
-    more from inside the new worker comes too late for tasks that found no worker meanwhile:
-    nothing wakes those. A resource in what the nanny starts the worker with is there when the
-    worker registers, and that does wake them.
-
-    The nanny itself keeps what it had before: the answer to this may be lost, when its worker
-    dies at the same moment, and then nobody else would know.
-    """
-    nanny = dask_worker  # the server that this runs on
-    if not hasattr(nanny, _FOUND):
-        started = nanny.process.worker_kwargs["resources"] if nanny.process else nanny.resources
-        setattr(nanny, _FOUND, (nanny.resources, started))
-    _start_with(nanny, dict(resources), dict(resources))
-
-
-def restore_on_nanny(dask_worker: Any = None) -> None:
-    """Have the nanny as `keep_on_nanny` found it; runs on a nanny, any number of times."""
-    nanny = dask_worker
-    if hasattr(nanny, _FOUND):
-        _start_with(nanny, *getattr(nanny, _FOUND))
-        delattr(nanny, _FOUND)
-
-
-def _start_with(nanny: Any, resources: Resources | None, again: Resources | None) -> None:
-    nanny.resources = resources
-    if nanny.process is not None:
-        nanny.process.worker_kwargs["resources"] = again
+    """Names of the resources of which a worker has any; runs on the worker."""
+    return tuple(sorted(name for name, slots in worker.state.total_resources.items() if slots))
 
 
 # -- queues and variables, which a pipe is made of ---------------------------------------
-
-
-class AttachedQueue(Queue):
-    """A Queue that exists already.
-
-    Constructing a `Queue` creates it where it does not exist and counts as a reference, which
-    a killed worker never gives back: a consumer that starts late would revive the queue of
-    a pipe that was deleted. This one does neither.
-    """
-
-    def _maybe_start(self) -> None:
-        """Do not create the queue."""
-
-
-_LATE_WORD_S = 2.0  # clients send word of futures that they have every few milliseconds
 
 
 def depth_of(scheduler: Any, name: str) -> int | None:
@@ -601,25 +462,18 @@ async def take_all(scheduler: Any, name: str) -> list[Any]:
     return [record["value"] for record in records]
 
 
+async def put_into(scheduler: Any, name: str, item: Any) -> None:
+    """Put plain data into a queue without a limit."""
+    await scheduler.extensions["queues"].put(name=name, data=item)
+
+
 async def forget_queue(scheduler: Any, name: str) -> None:
     """Forget a queue and the variable of the same name, whoever refers to them."""
     queues, variables = scheduler.extensions["queues"], scheduler.extensions["variables"]
     while name in queues.queues:
         queues.release(name=name, client="poolpart")
-    _forget_counts(queues, name)
-    # A consumer's word that it has a future may still be under way, and would be counted.
-    asyncio.get_running_loop().call_later(_LATE_WORD_S, _forget_counts, queues, name)
-    # Futures that were taken by a consumer which died before it could say so.
-    if f"queue-{name}" in scheduler.clients:
-        scheduler.remove_client(f"queue-{name}")
     if name in variables.variables:
         await variables.delete(name=name, client="poolpart")
-
-
-def _forget_counts(queues: Any, name: str) -> None:
-    if name not in queues.queues:
-        for counted in [counted for counted in queues.future_refcount if counted[0] == name]:
-            del queues.future_refcount[counted]
 
 
 # -- the scheduler's HTTP server ---------------------------------------------------------
@@ -708,6 +562,15 @@ def as_bytes(data: Any) -> Any:
 
 
 # -- a cluster on this machine -----------------------------------------------------------
+
+
+def forked_workers() -> AbstractContextManager[object]:
+    """Have nannies fork workers from the fork server, also when they start one again.
+
+    Dask would have it import pandas and whatever else it knows; it has imported what is needed.
+    """
+    distributed.utils._forkserver_preload_set = True
+    return dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"})
 
 
 class FixedCluster(SpecCluster):

@@ -71,8 +71,8 @@ def local_cluster(
     Raises
     ------
     PoolError
-        If there would be no worker, a number of workers is below 0 or of slots below 1, the
-        workers do not start, or a certificate is asked for and the package cryptography is missing.
+        If there would be no worker, a number of workers is below 0 or of slots below 1, or the
+        workers do not start.
 
     Examples
     --------
@@ -86,7 +86,8 @@ def local_cluster(
         check_count(f"The number of slots of partition {name!r}", slots)
     if not any(count for count, _ in partitions.values()):
         raise PoolError('There would be no worker; give {"NAME": (workers, slots)}.')
-    security = _security(security)
+    if not isinstance(security, Security):
+        security = Security.temporary() if security else Security()
     workers = {
         f"{name}-{number}": _worker_spec(host, environment or {}, security, name, slots)
         for name, (count, slots) in partitions.items()
@@ -113,21 +114,6 @@ def local_cluster(
             f"The workers did not start ({error.__cause__ or error}). Each imports the script "
             "that starts the cluster: do that under `if __name__ == '__main__':` in it. If it does "
             "so, or there is none, one was killed while it started: look whether memory is short."
-        ) from error
-
-
-def _security(wanted: Security | bool) -> Security:
-    """Certificates to use: those given, new ones, or none but for Dask's configuration."""
-    if isinstance(wanted, Security):
-        return wanted
-    if not wanted:
-        return Security()
-    try:
-        return Security.temporary()
-    except ImportError as error:
-        raise PoolError(
-            "A certificate for the cluster cannot be made, the package cryptography is "
-            "missing: pip install cryptography, or start the cluster without encryption."
         ) from error
 
 

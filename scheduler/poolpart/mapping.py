@@ -13,12 +13,11 @@ import queue
 import reprlib
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice, repeat
-from types import TracebackType
 from typing import Any, NoReturn
 
 from dask.sizeof import sizeof
@@ -26,12 +25,18 @@ from dask.utils import funcname
 from distributed import CancelledError, Client, Future, Reschedule
 
 from .internals import when_done
-from .remote import worker_identities
+from .workers import all_workers
+
+logger = logging.getLogger(__name__)
 
 NOTE = "poolpart: "  # how the notes that name a failed item start
 MOST_ITEMS = 1024
 GROWTH = 4  # from one size that was tried to the next
 MOST_BYTES = 2**20
+LOOK_S = 5.0  # between looks at how many slots there are
+CHUNK_S = 0.1  # a task is to take so long …
+CHUNK_S_PER_SLOT = 0.005  # … or, with many slots, so long that the scheduler keeps up
+PATIENCE = 4  # a task ends after so many times that; the rest of its items are sent again
 
 Call = tuple[Any, ...]  # the arguments of one call
 Row = tuple[Call, ...]  # of one item, by stage: what it is called with beside the result before
@@ -39,22 +44,10 @@ Row = tuple[Call, ...]  # of one item, by stage: what it is called with beside t
 
 @dataclass(frozen=True)
 class Chunk:
-    """Items that travel as one task.
-
-    Parameters
-    ----------
-    first
-        Index of the first of them among all items.
-    rows
-        What the functions are called with, item by item.
-    """
+    """Items that travel as one task: index of the first, and calls of each, by stage."""
 
     first: int
     rows: Sequence[Row]
-
-    def __str__(self) -> str:
-        last = self.first + len(self.rows) - 1
-        return f"item {self.first}" if last == self.first else f"items {self.first} to {last}"
 
 
 @dataclass(frozen=True)
@@ -104,7 +97,8 @@ def run_chunk(
         except Exception as error:
             if results:
                 break
-            error.add_note(f"{NOTE}this was item {number} of a map: {_shown(call)}")
+            shown = ", ".join(reprlib.repr(argument) for argument in call)
+            error.add_note(f"{NOTE}this was item {number} of a map: {shown}")
             raise
         if time.perf_counter() - start > patience_s:
             break
@@ -120,10 +114,6 @@ def _call(function: Callable[..., Any], call: Call) -> Any:
     except StopIteration as error:
         # Out of an iterator's `__next__` it would end the map as if there were no more items.
         raise RuntimeError(f"{function} raised StopIteration") from error
-
-
-def _shown(call: Call) -> str:
-    return ", ".join(reprlib.repr(argument) for argument in call)
 
 
 class ChunkSize:
@@ -163,72 +153,43 @@ class ChunkSize:
         return int(max(1, min(GROWTH * self._tried, by_time, by_bytes, MOST_ITEMS)))
 
 
-logger = logging.getLogger(__name__)
-
-LOOK_S = 5.0  # between looks at how many slots there are
-CHUNK_S = 0.1  # a task is to take so long …
-CHUNK_S_PER_SLOT = 0.005  # … or, with many slots, so long that the scheduler keeps up
-PATIENCE = 4  # a task ends after so many times that; the rest of its items are sent again
-
-
 @dataclass(frozen=True)
-class MapOptions:
-    """How to map; see `Partition.map`."""
+class Stage:
+    """A function that is mapped, where and how; see `Partition.map` for the options."""
 
+    client: Client
+    partition: str
+    function: Callable[..., Any]
     ordered: bool = True
     window: int | None = None
     chunk: int | None = None
     priority: int = 0
     retries: int = 0
     slots: int = 1
+    at: int = 0  # number of the argument that is the result of the stage before
 
     def __post_init__(self) -> None:
-        if not isinstance(self.retries, int) or self.retries < 0:
-            raise ValueError(f"retries is {self.retries!r}; give a whole number, 0 or more.")
-        for name in ("window", "chunk"):
+        options = (("window", 1), ("chunk", 1), ("retries", 0))
+        for name, least in options:
             value = getattr(self, name)
-            if value is not None and (not isinstance(value, int) or value < 1):
-                raise ValueError(f"{name} is {value!r}; give a whole number, 1 or more.")
+            if value is not None and (not isinstance(value, int) or value < least):
+                raise ValueError(f"{name} is {value!r}; give a whole number, {least} or more.")
 
-
-@dataclass(frozen=True)
-class Stage:
-    """A function that is mapped, and where.
-
-    Parameters
-    ----------
-    client, partition
-        Client of the cluster, and name of the partition.
-    function, options
-        What is mapped, and how.
-    at
-        Number of the argument that is the result of the stage before.
-    """
-
-    client: Client
-    partition: str
-    function: Callable[..., Any]
-    options: MapOptions
-    at: int = 0
-
-    def slots(self) -> int:
+    def running(self) -> int:
         """Tasks of this stage that run at a time."""
-        declared = (i["resources"].get(self.partition, 0) for i in self._workers())
-        return sum(int(slots) // self.options.slots for slots in declared)
-
-    def _workers(self) -> Iterable[dict[str, Any]]:
-        return worker_identities(self.client).values()
+        workers = all_workers(self.client)
+        return sum(int(w.resources.get(self.partition, 0)) // self.slots for w in workers)
 
     def send(self, patience_s: float, *columns: Sequence[Any]) -> list[Future]:
         """Submit a task for each row of columns."""
         return send(
             self.client,
-            {self.partition: self.options.slots},
+            {self.partition: self.slots},
             partial(run_chunk, self.function, patience_s, self.at),
             columns,
             key=f"map-{funcname(self.function)}",
-            priority=self.options.priority,
-            retries=self.options.retries,
+            priority=self.priority,
+            retries=self.retries,
         )
 
 
@@ -277,8 +238,6 @@ class Results(Iterator[Any]):
         self._next_item = 0  # the one to be delivered next, if in order
         self._ready: deque[Any] = deque()  # results to be delivered
         self._failed: tuple[Chunk, Future] | None = None  # to be raised after these
-        sized = [len(iterable) for iterable in iterables if isinstance(iterable, Sized)]
-        self._total = min(sized, default=None)
         maps = [n for n, i in enumerate(iterables) if isinstance(i, Results) and not i._begun]
         # Of two, the second is an iterable like others: their tasks are not of the same items.
         before = iterables[maps[0]] if maps else None
@@ -296,8 +255,6 @@ class Results(Iterator[Any]):
         calls: Iterator[Call] = zip(*iterables, strict=False) if iterables else repeat(())
         self._stages = (*before._stages, stage)
         self._source = ((*row, call) for call, row in zip(calls, before._source, strict=False))
-        if before._total is not None:
-            self._total = min(before._total, before._total if self._total is None else self._total)
         self._taken = before._taken
         self._look()
         sent = []
@@ -328,9 +285,7 @@ class Results(Iterator[Any]):
     def __enter__(self) -> Results:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: Any, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def __repr__(self) -> str:
@@ -370,16 +325,13 @@ class Results(Iterator[Any]):
 
     def _look(self) -> None:
         """See how many slots there are: partitions grow, shrink, and lose workers."""
-        slots = [stage.slots() for stage in self._stages]
-        self._slots = max(slots)
-        self._window = sum(
-            stage.options.window or max(2, 2 * has)
-            for stage, has in zip(self._stages, slots, strict=True)
-        )
-        self._next_look = time.monotonic() + LOOK_S
-        for stage, has in zip(self._stages, slots, strict=True):
-            if not has:
+        running = [stage.running() for stage in self._stages]
+        self._slots, self._window = max(running), 0
+        for stage, number in zip(self._stages, running, strict=True):
+            self._window += stage.window or max(2, 2 * number)
+            if not number:
                 logger.warning("Partition %r has no workers: a map on it waits.", stage.partition)
+        self._next_look = time.monotonic() + LOOK_S
 
     def _submit(self) -> None:
         """Send chunks, several in one message, up to the window."""
@@ -400,7 +352,7 @@ class Results(Iterator[Any]):
         stages = list(enumerate(self._stages))
         futures = done
         for number, stage in stages if done is None else stages[-1:]:
-            patience_s = math.inf if stage.options.chunk else PATIENCE * self._target_s()
+            patience_s = math.inf if stage.chunk else PATIENCE * self._target_s()
             calls = [[row[number] for row in chunk.rows] for chunk in chunks]
             # Nobody holds what a stage has made but the task that takes it.
             futures = stage.send(patience_s, firsts, calls, *([futures] if futures else []))
@@ -410,27 +362,18 @@ class Results(Iterator[Any]):
 
     def _next_chunk(self, fresh: bool) -> Chunk | None:
         """Take items: first those to be sent once more, then, if `fresh`, from the source."""
+        own = (stage.chunk for stage in self._stages[::-1] if stage.chunk)
+        size = next(own, 0) or self._size.items(self._target_s())
         if self._again:
             first, rows = heapq.heappop(self._again)
-            size = self._chunk_size(len(rows))
             if len(rows) > size:
                 heapq.heappush(self._again, (first + size, rows[size:]))
             return Chunk(first, rows[:size])
         if not fresh:
             return None
-        left = None if self._total is None else max(0, self._total - self._taken)
-        rows = list(islice(self._source, self._chunk_size(left)))
+        rows = list(islice(self._source, size))
         first, self._taken = self._taken, self._taken + len(rows)
         return Chunk(first, rows) if rows else None
-
-    def _chunk_size(self, left: int | None) -> int:
-        if chunk := next((s.options.chunk for s in self._stages[::-1] if s.options.chunk), None):
-            return chunk
-        size = self._size.items(self._target_s())
-        if left is not None:
-            # Smaller towards the end, so that all slots come to it together.
-            size = min(size, -(-left // (2 * max(1, self._slots))))
-        return max(1, size)
 
     def _target_s(self) -> float:
         return max(CHUNK_S, CHUNK_S_PER_SLOT * self._slots)
@@ -471,7 +414,7 @@ class Results(Iterator[Any]):
     def _deliver(self) -> None:
         """Make results ready whose turn it is."""
         while self._back and self._failed is None:
-            first = self._next_item if self._stages[-1].options.ordered else next(iter(self._back))
+            first = self._next_item if self._stages[-1].ordered else next(iter(self._back))
             if first not in self._back:
                 return
             chunk, answer = self._back.pop(first)
@@ -492,6 +435,7 @@ class Results(Iterator[Any]):
         except Exception as error:
             # Without a note of its own it comes from Dask, not from an item.
             if not any(note.startswith(NOTE) for note in getattr(error, "__notes__", ())):
-                error.add_note(f"{NOTE}the task was for {chunk} of a map")
+                last = chunk.first + len(chunk.rows) - 1
+                error.add_note(f"{NOTE}the task was for items {chunk.first} to {last} of a map")
             raise
-        raise AssertionError(f"the task for {chunk} has not failed")
+        raise AssertionError("the task has not failed")

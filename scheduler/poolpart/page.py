@@ -1,166 +1,143 @@
-"""A page in Dask's dashboard: partitions, their workers and tasks, and pipes."""
+"""A page in Dask's dashboard: partitions, stages, workers and pipes, as tables.
+
+It is made on the scheduler and loads itself anew every two seconds: there is no script in it.
+"""
 
 from __future__ import annotations
 
-import base64
-import hashlib
-import re
-import time
-from importlib.resources import files
+from collections.abc import Iterable, Iterator
+from html import escape
 from typing import Any
 
 from distributed import Client
 from tornado import web
 
 from .errors import PoolError
-from .fence import fences_of, kept_out
-from .internals import depth_of, queues_of, serve, serve_no_longer, serves, state_of
-from .remote import on_scheduler
-from .stats import TOTALS_TOPIC, Ran, running_on, slots_of, statistics_of, told
+from .fence import fences_of
+from .internals import depth_of, serve, serve_no_longer, serves
+from .pipe import pipes_of
+from .stats import running_on, slots_of, statistics_of, told
+from .workers import on_scheduler
 
 PATH = "partitions"
-MOST_RUNNING = 64  # running tasks that are told of a worker
-_FAILURE_LENGTH = 200
+_LONGEST = 200  # characters of a cell
+
+_HEAD = """<!doctype html>
+<html lang="en">
+<meta charset="utf-8">
+<meta http-equiv="refresh" content="2">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>Partitions</title>
+<style>
+:root { color-scheme: light dark; }
+body { max-width: 70rem; margin: 1.5rem auto; font: 14px/1.5 system-ui, sans-serif; }
+table { border-collapse: collapse; margin-bottom: 2rem; font-variant-numeric: tabular-nums; }
+caption { text-align: left; font-size: 1.2rem; font-weight: 600; }
+th, td { padding: .2rem 1rem .2rem 0; border-bottom: 1px solid #8885; text-align: right; }
+th:first-child, td:first-child { text-align: left; }
+</style>
+"""
+
+_COUNTS = ("waiting", "queued", "running", "done", "failed")
 
 
-def snapshot(scheduler: Any, since: int) -> dict[str, Any]:
-    """Gather what the page shows now.
-
-    Parameters
-    ----------
-    scheduler
-        The scheduler.
-    since
-        Number of tasks that the page has heard of: `ran` of the last snapshot.
-
-    Returns
-    -------
-    dict
-        Plain values, for JSON.
-    """
+def page_of(scheduler: Any) -> str:
+    """HTML of what the page shows now."""
     statistics = statistics_of(scheduler)
     workers = list(scheduler.workers.values())
     names = {name for worker in workers for name, slots in worker.resources.items() if slots}
     names |= fences_of(scheduler) | {name for name, _ in statistics.tallies if name}
-    return {
-        "time": time.time(),
-        "ran": statistics.ran,
-        "tasks": [_task(ran) for ran in statistics.since(since)],
-        "partitions": [told(scheduler, name) for name in [*sorted(names), ""]],
-        "workers": [_worker(worker) for worker in workers],
-        "pipes": _pipes(scheduler),
-        "totals": {name: str(value)[:40] for name, value in statistics.totals.items()},
-        "kept_out": kept_out(scheduler),
-    }
-
-
-def _task(ran: Ran) -> list[Any]:
-    return [ran.worker, ran.stage, round(ran.start, 4), round(ran.stop, 4), int(ran.failed)]
-
-
-def _worker(worker: Any) -> dict[str, Any]:
-    partition = next((name for name, slots in worker.resources.items() if slots), "")
-    slots = slots_of(worker, partition)
-    executing = [  # by the last heartbeat: the scheduler is told of nothing else but ends
-        [str(task.key), task.prefix.name, round(worker.last_seen - seconds, 3)]
-        for task, seconds in list(worker.executing.items())[:MOST_RUNNING]
-        if task.processing_on is worker
+    partitions = told(scheduler, [*sorted(names), ""])
+    stages = [
+        [
+            stage,
+            _shown(p["name"]),
+            *(counts[count] for count in _COUNTS),
+            f"{counts['seconds']:.1f}",
+        ]
+        for p in partitions
+        for stage, counts in p["stages"].items()
     ]
-    return {
-        "name": str(worker.name),
-        "address": worker.address,
-        "partition": partition,
-        "threads": worker.nthreads,
-        "slots": slots,
-        "busy": running_on(worker, partition)[1],
-        "status": worker.status.name,
-        "given": len(worker.processing),
-        "seen": round(worker.last_seen, 3),
-        "executing": executing,
-    }
+    sections = [
+        _HEAD,
+        _table(
+            "Partitions",
+            ["", "workers", "slots", "busy", *_COUNTS, "seconds"],
+            [_partition(p) for p in partitions],
+        ),
+        _table("Stages", ["", "partition", *_COUNTS, "seconds"], stages),
+        _table(
+            "Workers",
+            ["", "partition", "slots", "busy", "tasks given", "status", "address"],
+            [_worker(worker) for worker in workers],
+        ),
+        _table("Pipes", ["", "depth", "state"], _pipes(scheduler)),
+    ]
+    return "".join(sections)
 
 
-def _pipes(scheduler: Any) -> list[dict[str, Any]]:
-    """Pipes are queues beside which there is a variable of their name with a pipe's state."""
-    pipes = []
-    for name in queues_of(scheduler):
-        state = state_of(scheduler, name)
-        if isinstance(state, dict) and {"closed", "failure"} <= state.keys():
-            failure = str(state["failure"])[:_FAILURE_LENGTH]
-            shown = "failed" if failure else "closed" if state["closed"] else "open"
-            depth = depth_of(scheduler, name)
-            pipes.append({"name": name, "depth": depth, "state": shown, "failure": failure})
-    return pipes
+def _table(title: str, head: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
+    """Make a table, or nothing of no rows. Names come from users: all text is escaped."""
+
+    def line(tag: str, cells: Iterable[object]) -> str:
+        texts = (escape(str(cell)[:_LONGEST]) for cell in cells)
+        return "<tr>" + "".join(f"<{tag}>{text}</{tag}>" for text in texts) + "</tr>\n"
+
+    body = "".join(line("td", row) for row in rows)
+    if not body:
+        return ""
+    return f"<table>\n<caption>{title}</caption>\n{line('th', head)}{body}</table>\n"
+
+
+def _shown(partition: str) -> str:
+    return partition or "remainder"
+
+
+def _partition(p: dict[str, Any]) -> list[object]:
+    stages = p["stages"].values()
+    sums = [sum(counts[count] for counts in stages) for count in _COUNTS]
+    name = _shown(p["name"]) + (" (exclusive)" if p["exclusive"] else "")
+    seconds = sum(counts["seconds"] for counts in stages)
+    return [name, p["workers"], p["slots"], p["busy"], *sums, f"{seconds:.1f}"]
+
+
+def _worker(worker: Any) -> list[object]:
+    partition = next((name for name, slots in worker.resources.items() if slots), "")
+    slots, busy = slots_of(worker, partition), running_on(worker, partition)[1]
+    given, status = len(worker.processing), worker.status.name
+    return [worker.name, _shown(partition), slots, busy, given, status, worker.address]
+
+
+def _pipes(scheduler: Any) -> Iterator[list[object]]:
+    for name, state in pipes_of(scheduler).items():
+        failed = state["failure"] and f"failed: {state['failure']}"
+        shown = failed or ("closed" if state["closed"] else "open")
+        yield [name, depth_of(scheduler, name), shown]
 
 
 class _Handler(web.RequestHandler):
+    """Sends the page; the browser is told to load and run nothing else."""
+
     def initialize(self, scheduler: Any) -> None:
         self.scheduler = scheduler
 
-    def set_default_headers(self) -> None:
+    def get(self) -> None:
         self.set_header("Cache-Control", "no-store")
-        self.set_header("X-Content-Type-Options", "nosniff")
-        self.set_header("Referrer-Policy", "no-referrer")
-
-
-class PageHandler(_Handler):
-    """The page, one file; the browser is told to load and run nothing else."""
-
-    def get(self) -> None:
-        """Send the page."""
-        text = files(__package__).joinpath("page.html").read_text(encoding="utf-8")
-        [script] = re.findall(r"<script>(.*?)</script>", text, re.DOTALL)
-        digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-        self.set_header(
-            "Content-Security-Policy",
-            f"default-src 'none'; script-src 'sha256-{digest}'; style-src 'unsafe-inline'; "
-            "connect-src 'self'; base-uri 'none'; form-action 'none'",
-        )
-        self.finish(text)
-
-
-class DataHandler(_Handler):
-    """The page's data."""
-
-    def get(self) -> None:
-        """Send what has changed since the last time."""
-        since = self.get_query_argument("since", "0")
-        self.finish(snapshot(self.scheduler, int(since) if since.isdecimal() else 0))
+        self.set_header("Content-Security-Policy", "default-src 'none'; style-src 'unsafe-inline'")
+        self.finish(page_of(self.scheduler))
 
 
 class PageApplication(web.Application):
     """The page, as the scheduler's HTTP server takes it and gives it back."""
 
 
-def open_page(scheduler: Any) -> None:
-    """Serve the page from the scheduler's own HTTP server."""
-    if not is_open(scheduler):
-        # A `dask scheduler --dashboard-prefix` is part of the path.
-        handlers = [
-            (r"(?:/.*)?/" + PATH, PageHandler, {"scheduler": scheduler}),
-            (r"(?:/.*)?/" + PATH + r"/data", DataHandler, {"scheduler": scheduler}),
-        ]
-        serve(scheduler, PageApplication(handlers))
-    statistics_of(scheduler)
-
-
-def is_open(scheduler: Any) -> bool:
-    """Whether the page is served."""
-    return serves(scheduler, PageApplication)
-
-
-def close_page(scheduler: Any) -> None:
-    """Serve it no longer."""
-    serve_no_longer(scheduler, PageApplication)
-
-
 def partitions_page(client: Client) -> str:
     """Add the page to the dashboard of the client's cluster; returns its URL.
 
-    The page shows workers by partition, tasks over time, depths of pipes and totals, for all
-    users of the cluster. It is there until `remove_partitions_page` or the scheduler's end.
-    It reads; nobody can change anything with it. It needs no bokeh, and is as open as the
-    dashboard is: on a shared network, whoever reaches the one sees the other.
+    The page shows partitions, stages, workers and pipes, for all users of the cluster. It is
+    there until all partitions are dissolved, or the scheduler ends. It reads; nobody can change
+    anything with it. It needs no bokeh, and is as open as the dashboard is: on a shared network,
+    whoever reaches the one sees the other.
 
     Raises
     ------
@@ -181,28 +158,14 @@ def partitions_page(client: Client) -> str:
     return link.removesuffix("/").removesuffix("/status") + f"/{PATH}"
 
 
-def has_partitions_page(client: Client) -> bool:
-    """Whether somebody has added the page."""
-    return bool(on_scheduler(client, _is_open))
-
-
-def remove_partitions_page(client: Client) -> None:
-    """Take the page away; a browser that has it open shows that it is gone."""
-    on_scheduler(client, _close)
-
-
-def tell_page(client: Client, **totals: Any) -> None:
-    """Have the page show totals, such as ``replayed=3``; where no tasks are counted, nothing."""
-    client.log_event(TOTALS_TOPIC, totals)
-
-
 async def _open(dask_scheduler: Any = None) -> None:
-    open_page(dask_scheduler)
+    if not serves(dask_scheduler, PageApplication):
+        # A `dask scheduler --dashboard-prefix` is part of the path.
+        handlers = [(r"(?:/.*)?/" + PATH, _Handler, {"scheduler": dask_scheduler})]
+        serve(dask_scheduler, PageApplication(handlers))
+    statistics_of(dask_scheduler)
 
 
-async def _is_open(dask_scheduler: Any = None) -> bool:
-    return is_open(dask_scheduler)
-
-
-async def _close(dask_scheduler: Any = None) -> None:
-    close_page(dask_scheduler)
+def close_page(scheduler: Any) -> None:
+    """Serve the page no longer."""
+    serve_no_longer(scheduler, PageApplication)

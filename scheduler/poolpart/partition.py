@@ -13,16 +13,14 @@ import dask
 from dask.utils import funcname
 from distributed import Client, Future
 
-from . import moves
-from .declare import dissolve
+from . import division
 from .errors import PoolError
 from .inherit import keep_shuffles_in
-from .mapping import MapOptions, Results, Stage, send
-from .remote import worker_identities
+from .mapping import Results, Stage, send
 from .stats import PartitionStats, partition_stats
 from .task_context import own_client
 from .wording import counted
-from .worker_info import WorkerInfo
+from .workers import WorkerInfo, all_workers
 
 # What `with partition:` has to undo, innermost last; of this thread or coroutine.
 _entered: ContextVar[tuple[ExitStack, ...]] = ContextVar("_entered", default=())
@@ -75,29 +73,19 @@ class Partition:
     @property
     def workers(self) -> tuple[WorkerInfo, ...]:
         """The members now, by name."""
-        identities = worker_identities(self.client)
-        members = (WorkerInfo.from_identity(a, i) for a, i in identities.items())
-        return tuple(sorted((w for w in members if w.resources.get(self.name)), key=_by_name))
+        members = (w for w in all_workers(self.client) if w.resources.get(self.name))
+        return tuple(sorted(members, key=lambda w: (len(w.name), w.name)))  # 10 behind 9
 
     @property
     def slots(self) -> int:
         """Tasks that the partition runs at a time."""
-        return _slots(self.workers, self.name)
+        return int(sum(worker.resources[self.name] for worker in self.workers))
 
     def __len__(self) -> int:
         return len(self.workers)
 
     def __repr__(self) -> str:
-        if self.client.status != "running":
-            return f"<Partition {self.name!r}: its client is {self.client.status}>"
-        workers = self.workers
-        names = [worker.name for worker in workers]
-        shown = ", ".join(names[:4]) + (", …" if len(names) > 4 else "")
-        note = f"; {self.note}" if self.note else ""
-        return (
-            f"<Partition {self.name!r}: {counted(len(names), 'worker')} "
-            f"({shown}), {counted(_slots(workers, self.name), 'slot')}{note}>"
-        )
+        return f"<Partition {self.name!r}{'; ' + self.note if self.note else ''}>"
 
     def stats(self) -> PartitionStats:
         """How busy it is and what it has done, whoever submitted the tasks."""
@@ -275,8 +263,8 @@ class Partition:
             If the window, the chunk or `slots` is below 1, or `retries` below 0.
         """
         self._taking(slots)
-        options = MapOptions(ordered, window, chunk, priority, retries, slots)
-        return Results(Stage(self.client, self.name, function, options), iterables)
+        options = (ordered, window, chunk, priority, retries, slots)
+        return Results(Stage(self.client, self.name, function, *options), iterables)
 
     # -- collections and data ----------------------------------------------------------
 
@@ -399,7 +387,7 @@ class Partition:
         >>> gpu.grow(2, source="OTHER")                                # doctest: +SKIP
         ['5', '6']
         """
-        return moves.grow(self.client, self.name, workers, source, timeout_s)
+        return division.grow(self.client, self.name, workers, source, timeout_s)
 
     def shrink(self, workers: int = 1, *, timeout_s: float = 60.0) -> list[str]:
         """Move workers out of this partition while everything runs; returns their names.
@@ -412,17 +400,8 @@ class Partition:
         PoolError
             If fewer than its minimum would be left, or their tasks do not end in time.
         """
-        return moves.shrink(self.client, self.name, workers, timeout_s)
+        return division.shrink(self.client, self.name, workers, timeout_s)
 
     def dissolve(self, timeout_s: float = 30.0) -> None:
         """Undo this partition; see `Pool.dissolve`."""
-        dissolve(self.client, [self.name], timeout_s)
-
-
-def _slots(workers: Iterable[WorkerInfo], name: str) -> int:
-    return int(sum(worker.resources[name] for worker in workers))
-
-
-def _by_name(worker: WorkerInfo) -> tuple[int, str]:
-    """Sort key that puts worker 10 behind worker 9."""
-    return len(worker.name), worker.name
+        division.dissolve(self.client, [self.name], timeout_s)

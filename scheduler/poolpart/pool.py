@@ -9,15 +9,14 @@ from dataclasses import replace
 
 from distributed import Client
 
-from .declare import declare, dissolve
+from .division import declare, dissolve
 from .errors import PoolError
 from .page import partitions_page
 from .partition import Partition
 from .probe import probe_worker
-from .remote import ask_workers, worker_identities
-from .rules import Rule, by_name, check_rules, divide, named, rule_of
+from .rules import Named, Rule, by_name, check_rules, divide, rule_of
 from .wording import counted
-from .worker_info import WorkerInfo
+from .workers import WorkerInfo, all_workers, ask_workers
 
 logger = logging.getLogger(__name__)
 
@@ -61,31 +60,26 @@ class Pool:
             If the cluster has no workers, one cannot import this package, or the client is
             closed or asynchronous.
         """
-        identities = worker_identities(client)
-        if not identities:
+        workers = all_workers(client)
+        if not workers:
             raise PoolError(
                 f"The cluster at {client.scheduler.address} has no workers: start some with "
                 f'dask worker {client.scheduler.address} --resources "GPU=1"'
             )
         if declaring is not None:
-            identities = {a: i for a, i in identities.items() if declaring & set(i["resources"])}
-            if not identities:
-                return cls(client, [])
-        facts = ask_workers(client, probe_worker, list(identities))
-        for address, fact in facts.items():
+            workers = [worker for worker in workers if declaring & set(worker.resources)]
+        facts = ask_workers(client, probe_worker, [worker.address for worker in workers])
+        asked = []
+        for worker in workers:
+            fact = facts.get(worker.address)
             if isinstance(fact, BaseException):
                 raise PoolError(
-                    f"Worker {identities[address]['name']} at {address} cannot tell about its "
+                    f"Worker {worker.name} at {worker.address} cannot tell about its "
                     f"machine ({type(fact).__name__}: {fact}); is poolpart installed there?"
                 )
-        return cls(
-            client,
-            [
-                WorkerInfo.from_identity(address, identity, facts[address]["gpus"])
-                for address, identity in identities.items()
-                if address in facts  # one may have gone since
-            ],
-        )
+            if fact is not None:  # it may have gone since
+                asked.append(worker.with_gpus(fact["gpus"]))
+        return cls(client, asked)
 
     # -- looking -----------------------------------------------------------------------
 
@@ -228,7 +222,8 @@ class Pool:
         minimum
             Workers that the partition keeps whatever is moved.
         exclusive
-            Whether tasks of others are kept off its workers, see `raise_fence`.
+            Whether tasks of others are kept off its workers: un-annotated ones, collections,
+            those of other users. What a worker was given before ends there.
 
         Returns
         -------
@@ -247,14 +242,13 @@ class Pool:
             "n_workers": n_workers,
             "workers": workers,
         }
-        common = {"slots": slots, "minimum": minimum, "exclusive": exclusive}
-        rule = rule_of(name, selectors, **common)
+        rule = rule_of(name, selectors, slots=slots, minimum=minimum, exclusive=exclusive)
         cluster = self._cluster_now()
         mine = self._mine(cluster)
         notes: dict[str, str] = {}
-        if workers is not None:
-            chosen = {name: by_name(name, mine, workers)}
-            rule = named(*(worker.name for worker in chosen[name]), **common)
+        if isinstance(rule, Named):
+            chosen = {name: by_name(name, mine, rule.names)}
+            rule = replace(rule, names=tuple(worker.name for worker in chosen[name]))
         else:
             wanted = replace(rule, minimum=n_workers or max(1, minimum))
             chosen, notes = divide({name: wanted}, mine)
@@ -310,9 +304,8 @@ class Pool:
         """Every worker of the cluster; the GPUs of those in this pool are known."""
         gpus = {worker.name: worker.gpus for worker in self.workers}
         gpus |= {worker.address: worker.gpus for worker in self.workers}
-        identities = worker_identities(self.client)
-        workers = (WorkerInfo.from_identity(a, i) for a, i in identities.items())
-        return [replace(w, gpus=gpus.get(w.address, gpus.get(w.name, ()))) for w in workers]
+        workers = all_workers(self.client)
+        return [w.with_gpus(gpus.get(w.address, gpus.get(w.name, ()))) for w in workers]
 
     def _mine(self, cluster: Iterable[WorkerInfo]) -> list[WorkerInfo]:
         """Those of the workers that are in this pool, also those that were restarted since.

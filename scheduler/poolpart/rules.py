@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from .errors import PoolError
 from .wording import counted
-from .worker_info import WorkerInfo
+from .workers import WorkerInfo
 
 NO_GPU = "no GPU in the pool: CPU workers instead"
 
@@ -180,17 +180,8 @@ def divide(
 
     Workers that a rule names are kept for it. Members of a partition come first, so that the
     same rules, again, make the same partitions. Workers that declare something else are left
-    alone.
-
-    Returns
-    -------
-    chosen, notes
-        Workers by partition, and what a user should know of a choice, where there is anything.
-
-    Raises
-    ------
-    PoolError
-        If a partition would have fewer workers than its minimum.
+    alone. Returns the workers by partition, and what a user should know of a choice, where there
+    is anything. PoolError if a partition would have fewer workers than its minimum.
     """
     chosen: dict[str, list[WorkerInfo]] = {}
     notes: dict[str, str] = {}
@@ -232,31 +223,14 @@ def _left_alone(partition: str, pool: Sequence[WorkerInfo]) -> str:
 
 
 def by_name(partition: str, pool: Sequence[WorkerInfo], wanted: Sequence[str]) -> list[WorkerInfo]:
-    """Take these workers, by name or address.
-
-    Raises
-    ------
-    PoolError
-        If one cannot be had, or a name is that of several.
-    """
-    known: dict[str, list[WorkerInfo]] = {}  # {name or address: workers}
-    for worker in pool:
-        for key in {worker.name, worker.address}:
-            known.setdefault(key, []).append(worker)
-    times = Counter(map(str, wanted))
-    if unknown := [name for name in times if name not in known]:
+    """Take these workers, by name or address; PoolError if one cannot be had."""
+    names = set(map(str, wanted))
+    if unknown := sorted(names - {known for w in pool for known in (w.name, w.address)}):
         raise PoolError(
             f"Partition {partition!r}: {', '.join(unknown)} not in this pool, which has "
             f"{', '.join(worker.name for worker in pool) or 'no workers'}."
         )
-    for name, count in times.items():
-        if len(known[name]) > count:  # all of them are meant if it is listed for each
-            raise PoolError(
-                f"Partition {partition!r}: {len(known[name])} workers are named {name}; give "
-                f"addresses: {', '.join(worker.address for worker in known[name])}."
-            )
-    asked = {worker.address for name in times for worker in known[name]}
-    chosen = [worker for worker in pool if worker.address in asked]
+    chosen = [worker for worker in pool if names & {worker.name, worker.address}]
     for worker in chosen:
         if others := sorted(worker.partitions - {partition}):
             raise PoolError(
@@ -267,13 +241,7 @@ def by_name(partition: str, pool: Sequence[WorkerInfo], wanted: Sequence[str]) -
 
 
 def rule_of(partition: str, selectors: Mapping[str, Any], **common: Any) -> Rule:
-    """Make the rule that goes on choosing as a selector of `Pool.partition` does.
-
-    Raises
-    ------
-    PoolError
-        If there is not exactly one selector, or it makes no sense.
-    """
+    """Make the rule of a selector of `Pool.partition`; PoolError if it makes no sense."""
     given = {key: value for key, value in selectors.items() if value is not None}
     if len(given) != 1:
         raise PoolError(
@@ -283,13 +251,14 @@ def rule_of(partition: str, selectors: Mapping[str, Any], **common: Any) -> Rule
     [(key, value)] = given.items()
     if key == "workers" and (isinstance(value, str) or not value):
         raise PoolError(f"workers is {value!r}; give a list of names or addresses, 1 or more.")
-    rule: Rule
-    if key == "max_workers_per_gpu":
-        rule = per_gpu(value, **common)
-    elif key == "max_workers_per_host":
-        rule = per_host(value, **common)
-    else:
-        rule = n_workers(value, **common) if key == "n_workers" else named(*value, **common)
+    if key == "workers":
+        return named(*value, **common)
+    rules: dict[str, Callable[..., Rule]] = {
+        "max_workers_per_gpu": per_gpu,
+        "max_workers_per_host": per_host,
+        "n_workers": n_workers,
+    }
+    rule = rules[key](value, **common)
     check_rules({partition: rule})
     return rule
 

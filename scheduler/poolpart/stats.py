@@ -1,17 +1,16 @@
 """How busy a partition is and what it has done.
 
-A plugin of the scheduler counts tasks by partition and stage. A task's partition is the
-resource that it asks for, "" for a task that asks for none; its stage is the prefix of its key,
-which for most tasks is the function's name. What is kept is bounded: counters for so many
-stages, the latest tasks, and the keys of tasks that the scheduler itself still keeps.
+A plugin of the scheduler counts tasks that have ended, by partition and stage. A task's partition
+is the resource that it asks for, "" for a task that asks for none; its stage is the prefix of its
+key, which for most tasks is the function's name; there are as many as Dask itself keeps. What is
+under way is counted when somebody asks.
 """
 
 from __future__ import annotations
 
-import logging
-from collections import Counter, deque
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from itertools import islice
 from typing import Any
 
@@ -19,52 +18,20 @@ from distributed import Client
 from distributed.diagnostics.plugin import SchedulerPlugin
 
 from .fence import fences_of
-from .remote import on_scheduler
-
-logger = logging.getLogger(__name__)
+from .workers import on_scheduler
 
 NAME = "poolpart-stats"
-RECENT_TASKS = 4000
-MOST_STAGES = 200  # counters, over all partitions; later stages share one
-OTHER_STAGES = "(others)"
-TOTALS_TOPIC = "poolpart-totals"  # `Client.log_event` of it adds to the totals of the page
-_MOST_TOTALS = 20
 _LOOK_AT_MOST = 1000  # tasks of one worker, in search of those that run
-_PRESENT = frozenset(("waiting", "queued", "no-worker", "processing"))
+_WAITING = {"waiting": "waiting", "queued": "queued", "no-worker": "queued", "processing": "given"}
 
 
 @dataclass(slots=True)
 class Tally:
-    """Counts of one stage in one partition."""
+    """Tasks of one stage in one partition that have ended."""
 
-    waiting: int = 0  # for other tasks
-    queued: int = 0  # for a worker, on the scheduler
-    processing: int = 0  # given to a worker, running or not
     done: int = 0
     failed: int = 0
-    recomputed: int = 0
     seconds: float = 0.0
-
-    def enter(self, state: str, by: int) -> None:
-        """Count a task in or out of a state."""
-        if state == "processing":
-            self.processing += by
-        elif state == "waiting":
-            self.waiting += by
-        elif state in _PRESENT:
-            self.queued += by
-
-
-@dataclass(frozen=True, slots=True)
-class Ran:
-    """A task that has run; times are seconds since the epoch."""
-
-    worker: str
-    partition: str
-    stage: str
-    start: float
-    stop: float
-    failed: bool
 
 
 class Statistics(SchedulerPlugin):
@@ -74,85 +41,21 @@ class Statistics(SchedulerPlugin):
 
     def __init__(self, scheduler: Any) -> None:
         self.scheduler = scheduler
-        self.totals: dict[str, Any] = {}  # what users have told, for the page
         self.tallies: dict[tuple[str, str], Tally] = {}  # {(partition, stage): counts}
-        self.recent: deque[Ran] = deque(maxlen=RECENT_TASKS)
-        self.ran = 0  # tasks that were ever put into `recent`
-        self._done: set[Any] = set()  # keys that were counted as done and are still known
-        self._count_present()
-
-    def _count_present(self) -> None:
-        for task in self.scheduler.tasks.values():
-            if task.state in _PRESENT:
-                self._tally(task).enter(task.state, +1)
-
-    # -- what the scheduler tells ------------------------------------------------------
 
     def transition(
         self, key: Any, start: str, finish: str, *args: Any, stimulus_id: str = "", **kwargs: Any
     ) -> None:
-        """Count a change of a task's state."""
+        """Count a task that has ended."""
+        if start != "processing" or finish not in ("memory", "erred"):
+            return
         task = self.scheduler.tasks[key]
-        tally = self._tally(task)
-        if start in _PRESENT:
-            tally.enter(start, -1)
-        if finish in _PRESENT:
-            tally.enter(finish, +1)
-        elif finish == "forgotten":
-            self._done.discard(key)
-        elif start == "processing" and finish in ("memory", "erred"):
-            self._ended(task, tally, finish == "erred", kwargs)
-
-    def _ended(self, task: Any, tally: Tally, failed: bool, told: Mapping[str, Any]) -> None:
-        if failed:
-            tally.failed += 1
-        elif task.key in self._done:
-            tally.recomputed += 1
-        else:
-            tally.done += 1
-            self._done.add(task.key)
-        worker = self.scheduler.workers.get(told.get("worker"))
-        for span in told.get("startstops") or ():
+        tally = self.tallies.setdefault((partition_of(task), task.prefix.name), Tally())
+        tally.done += finish == "memory"
+        tally.failed += finish == "erred"
+        for span in kwargs.get("startstops") or ():
             if span["action"] == "compute":
                 tally.seconds += span["stop"] - span["start"]
-                name = str(worker.name) if worker else ""
-                where = partition_of(task), task.prefix.name
-                self.recent.append(Ran(name, *where, span["start"], span["stop"], failed))
-                self.ran += 1
-
-    def restart(self, scheduler: Any) -> None:
-        """Forget what is under way: the scheduler has."""
-        self._done.clear()
-        for tally in self.tallies.values():
-            tally.waiting = tally.queued = tally.processing = 0
-        self._count_present()
-
-    def log_event(self, topic: str, msg: Any) -> None:
-        """Keep totals that somebody tells, a dictionary of plain values."""
-        if topic == TOTALS_TOPIC and isinstance(msg, dict):
-            self.totals.update((str(name)[:40], value) for name, value in msg.items())
-            for name in list(self.totals)[:-_MOST_TOTALS]:
-                del self.totals[name]
-
-    def _tally(self, task: Any) -> Tally:
-        where = partition_of(task), task.prefix.name
-        tally = self.tallies.get(where)
-        if tally is None:
-            if len(self.tallies) >= MOST_STAGES:
-                where = where[0], OTHER_STAGES
-            tally = self.tallies.setdefault(where, Tally())
-        return tally
-
-    # -- answers -----------------------------------------------------------------------
-
-    def stages(self, partition: str) -> dict[str, Tally]:
-        """Get the counts of a partition by stage."""
-        return {stage: t for (name, stage), t in self.tallies.items() if name == partition}
-
-    def since(self, number: int) -> Iterator[Ran]:
-        """Tasks that have run after the first `number`, as far as they are kept."""
-        fresh = min(len(self.recent), max(0, self.ran - number))
-        return islice(self.recent, len(self.recent) - fresh, None)
 
 
 def partition_of(task: Any) -> str:
@@ -209,22 +112,19 @@ class StageStats:
         Tasks that run. The scheduler does not see when a task starts: of what it gave to a
         worker, as many count as running as the worker has slots.
     done
-        Tasks that have ended well; each once, however often it ran.
-    recomputed
-        Times that a task ended well again, since its result was lost with a worker.
+        Times that a task ended well; again where its result was lost with a worker.
     failed
         Times that a task raised an error or was given up after too many dead workers. Those
         that depend on it and never ran do not count.
     seconds
-        Time that tasks have run, with the recomputed and failed ones; of those that were lost
-        with their worker, nobody knows.
+        Time that tasks have run, with the failed ones; of those that were lost with their
+        worker, nobody knows.
     """
 
     waiting: int = 0
     queued: int = 0
     running: int = 0
     done: int = 0
-    recomputed: int = 0
     failed: int = 0
     seconds: float = 0.0
 
@@ -233,8 +133,8 @@ class StageStats:
 class PartitionStats(StageStats):
     """What a partition does now and has done since its tasks are counted.
 
-    Counting begins when the cluster is divided, when the first statistics are asked for, or
-    when the page is opened, whichever comes first.
+    Those that have ended are counted from when the cluster is divided, the first statistics are
+    asked for, or the page is opened, whichever comes first.
 
     Parameters
     ----------
@@ -297,30 +197,42 @@ def forget_statistics(scheduler: Any) -> None:
 
 
 async def _told(name: str, dask_scheduler: Any = None) -> dict[str, Any]:
-    return told(dask_scheduler, name)
+    return told(dask_scheduler, [name])[0]
 
 
-def told(scheduler: Any, name: str) -> dict[str, Any]:
-    """Statistics of a partition as plain values; runs on the scheduler."""
-    workers = members(scheduler, name)
-    by_worker = [running_on(worker, name) for worker in workers]
-    running: Counter[str] = sum((stages for stages, _ in by_worker), Counter())
-    return {
-        "name": name,
-        "workers": len(workers),
-        "slots": sum(slots_of(worker, name) for worker in workers),
-        "busy": sum(held for _, held in by_worker),
-        "exclusive": name in fences_of(scheduler),
-        "stages": {
-            stage: {
-                "waiting": tally.waiting,
-                "queued": tally.queued + max(0, tally.processing - running[stage]),
-                "running": min(running[stage], tally.processing),
-                "done": tally.done,
-                "recomputed": tally.recomputed,
-                "failed": tally.failed,
-                "seconds": tally.seconds,
+def told(scheduler: Any, names: Sequence[str]) -> list[dict[str, Any]]:
+    """Statistics of partitions as plain values; runs on the scheduler."""
+    statistics = statistics_of(scheduler)
+    under_way: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)
+    for task in scheduler.tasks.values():
+        if count := _WAITING.get(task.state):
+            under_way[partition_of(task), task.prefix.name][count] += 1
+    places = sorted(under_way.keys() | statistics.tallies.keys())
+    answers = []
+    for name in names:
+        workers = members(scheduler, name)
+        by_worker = [running_on(worker, name) for worker in workers]
+        running: Counter[str] = sum((stages for stages, _ in by_worker), Counter())
+        stages = {}
+        for place in places:
+            partition, stage = place
+            if partition == name:
+                now, ended = under_way[place], statistics.tallies.get(place, Tally())
+                runs = min(running[stage], now["given"])
+                stages[stage] = {
+                    "waiting": now["waiting"],
+                    "queued": now["queued"] + now["given"] - runs,
+                    "running": runs,
+                    **asdict(ended),
+                }
+        answers.append(
+            {
+                "name": name,
+                "workers": len(workers),
+                "slots": sum(slots_of(worker, name) for worker in workers),
+                "busy": sum(held for _, held in by_worker),
+                "exclusive": name in fences_of(scheduler),
+                "stages": stages,
             }
-            for stage, tally in statistics_of(scheduler).stages(name).items()
-        },
-    }
+        )
+    return answers

@@ -1,7 +1,16 @@
-"""Keeps workers in their partitions; a plugin of the scheduler.
+"""Who belongs to which partition: the one place that knows, a plugin of the scheduler.
 
-It lives on the scheduler, so what was divided stays divided when the client has gone. It enters
-into the book who comes and goes, and `reconciler.py` makes the book come true.
+The steward has the rules by partition, and a seat for each worker that says where it belongs.
+Clients ask it to change that (`division.py`), and workers that come and go do. Whatever
+happens, one loop for each worker (`Steward._settle`) brings three things into step with the seat:
+
+1. what the worker itself declares, which a task that it gets must find there;
+2. what the scheduler places tasks by: less while a worker leaves a partition, so that it gets no
+   more of its tasks, and more only when the worker has declared it;
+3. which workers are behind a fence, from the moment in which they are meant to be.
+
+Nothing is written on nannies: a worker that its nanny starts again declares what it was started
+with, joins, and is settled anew. So it may be cut off anywhere, and undoing it leaves nothing.
 """
 
 from __future__ import annotations
@@ -9,28 +18,82 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Coroutine, Iterator
+from collections.abc import Collection, Hashable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from distributed.diagnostics.plugin import SchedulerPlugin
-from tornado.ioloop import PeriodicCallback
 
-from .book import Book, Seat, seat_key
-from .internals import call, forget_resources
+from .errors import PoolError
+from .fence import expect
+from .internals import (
+    Resources,
+    call,
+    declare_on_worker,
+    hand_off,
+    held_by,
+    recount,
+    show,
+    wake,
+)
 from .probe import probe_worker
-from .reconciler import Nannies, Reconciler, has_gone
-from .rules import PerGpu, partition_for
-from .worker_info import WorkerInfo
+from .rules import Count, Declared, PerGpu, Rest, Rule, partition_for
+from .tracing import trace
+from .workers import WorkerInfo
 
 logger = logging.getLogger(__name__)
 
 NAME = "poolpart-steward"
-TICK_S = 0.1
+HOLD_S = 30.0  # how long a worker's place is kept while its nanny starts it again
+LOOK_EVERY_S = 0.01
+_PLACE_EVERY_S = 0.1  # to ask all rules for a thousand workers takes as long
+
+
+@dataclass(eq=False)
+class Seat:
+    """Where one worker belongs, also while its nanny starts it again.
+
+    Parameters
+    ----------
+    key
+        What identifies it, see `seat_key`.
+    info
+        What is known of it.
+    nanny
+        Address of its nanny, None for none.
+    found
+        Resources that it was started with.
+    declared
+        What it declares now, as far as it was told.
+    partition
+        Where it belongs; None for nowhere.
+    slots
+        How many of the partition's slots it has.
+    unplaced
+        It joined after the cluster was divided, and no rule has wanted it yet.
+    away
+        It has left, and its nanny may be starting it again.
+    gone
+        Nobody waits for it any more.
+    """
+
+    key: Hashable
+    info: WorkerInfo
+    nanny: str | None = None
+    found: Resources = field(default_factory=dict)
+    declared: Resources = field(default_factory=dict)
+    partition: str | None = None
+    slots: float = 0
+    unplaced: bool = False
+    away: bool = False
+    gone: bool = False
+    settling: asyncio.Task[None] | None = None
+    giving_up: asyncio.TimerHandle | None = None
 
 
 class Steward(SchedulerPlugin):
-    """Keeps the book.
+    """Keeps workers in their partitions, also when the client has gone.
 
     Parameters
     ----------
@@ -42,80 +105,138 @@ class Steward(SchedulerPlugin):
 
     def __init__(self, scheduler: Any) -> None:
         self.scheduler = scheduler
-        self.book = Book()
+        self.rules: dict[str, Rule] = {}  # by partition, in the order in which they choose
+        self.seats: dict[Hashable, Seat] = {}  # by key
         self.asked = 0  # questions of clients that are being answered
-        self.nannies = Nannies(scheduler)
-        self.reconciler = Reconciler(scheduler, self.book, self.nannies, self._find_place)
-        self._looked_at: Any = None  # rules and members when nobody wanted those without a place
-        self._resources_before = set(scheduler.resources)
-        self._work: set[asyncio.Task[None]] = set()  # else it might be collected
+        self._names: set[str] = set()  # of all partitions that there ever were
+        self._placing: asyncio.TimerHandle | None = None
         for worker in scheduler.workers.values():
             self._seat(worker)
-        self._ticker = PeriodicCallback(self._tick, 1000 * TICK_S)
-        self._ticker.start()
 
-    # -- who is there ------------------------------------------------------------------
+    # -- what should be ----------------------------------------------------------------
+
+    def members(self, name: str, present: bool = False) -> list[Seat]:
+        """Seats of a partition, those only whose workers are there if `present`."""
+        members = (seat for seat in self.seats.values() if seat.partition == name)
+        return [seat for seat in members if not (present and seat.away)]
+
+    def free(self) -> list[Seat]:
+        """Workers that are there and belong to no partition, nor declare anything else."""
+        return [
+            seat
+            for seat in self.seats.values()
+            if not seat.away and not seat.partition and not any(self.wanted(seat).values())
+        ]
+
+    def remainder(self) -> str | None:
+        """Partition that has what the others leave, if there is one."""
+        return next((name for name, rule in self.rules.items() if isinstance(rule, Rest)), None)
+
+    def wanted(self, seat: Seat) -> Resources:
+        """Resources that a worker should declare: those of its own, and its partition's."""
+        if seat.partition is None:
+            return {r: q for r, q in seat.found.items() if r not in self.rules}
+        own = {r: q for r, q in seat.found.items() if r not in self._names}
+        return {**own, seat.partition: seat.slots}
+
+    def put(self, seat: Seat, name: str | None, slots: float | None = None) -> None:
+        """Put a worker into a partition, or None; if not given, slots are as it was started."""
+        seat.partition, seat.unplaced, seat.slots = name, False, 0
+        if name is not None:
+            rule = self.rules[name]
+            seat.slots = slots or rule.slots or seat.found.get(name) or rule.slots_of(seat.info)
+        if worker := self.scheduler.workers.get(seat.info.address):
+            expect(self.scheduler, worker, name)
+        self._place_soon()
+
+    def enter(self, name: str, rule: Rule) -> None:
+        """Enter a partition, or change its rule. What takes the rest stays the last to choose."""
+        self._names.add(name)
+        rules = {**self.rules, name: rule}.items()
+        self.rules = dict(sorted(rules, key=lambda item: isinstance(item[1], Rest)))
+
+    def adopt(self, name: str) -> None:
+        """Enter a partition whose workers declare it by themselves.
+
+        Raises
+        ------
+        PoolError
+            If there is no such partition.
+        """
+        if name in self.rules:
+            return
+        members = [s for s in self.seats.values() if s.partition is None and s.found.get(name)]
+        if not members:
+            raise PoolError(
+                f"There is no partition {name!r}: no worker declares it, and it has not been "
+                "made with Pool.partition or Pool.divide."
+            )
+        self.enter(name, Declared(minimum=0))
+        for seat in members:
+            self.put(seat, name, seat.found[name])
+
+    def resize(self, name: str | None, change: int) -> None:
+        """Have a rule want more or fewer workers, where it is one that counts."""
+        if name in self.rules and isinstance(rule := self.rules[name], Count):
+            workers = rule.workers + change
+            self.rules[name] = replace(rule, workers=workers, minimum=min(rule.minimum, workers))
+
+    # -- workers that come and go ------------------------------------------------------
 
     def _seat(self, worker: Any) -> Seat:
         """Seat of a worker that has come, or come back."""
-        self.reconciler.meet(worker)
         key = seat_key(worker.name, worker.address, worker.nanny)
-        seat = self.book.seats.get(key)
-        gpus = seat.info.gpus if seat else ()
-        info = WorkerInfo.from_identity(worker.address, worker.identity(), gpus)
-        if seat is None:
-            seat = self.book.seats[key] = Seat(key, info, dict(worker.resources))
-        elif worker.nanny is None or worker.nanny != seat.nanny:
-            # Somebody has started another worker under this name.
-            seat.found = dict(worker.resources)
-            if seat.nanny is not None:
-                self.nannies.forget(seat.nanny)
-        seat.info, seat.nanny = info, worker.nanny
-        seat.absent_since = None
+        info = WorkerInfo.from_identity(worker.address, worker.identity())
+        seat = self.seats.setdefault(key, Seat(key, info))
+        seat.info, seat.nanny = info.with_gpus(seat.info.gpus), worker.nanny
+        seat.found, seat.declared = dict(worker.resources), dict(worker.resources)
+        seat.away = False
+        if seat.giving_up:
+            seat.giving_up.cancel()
         return seat
+
+    def seat_at(self, address: str) -> Seat | None:
+        """Seat of the worker at an address; None if there is no such worker."""
+        worker = self.scheduler.workers.get(address)
+        if worker is None:
+            return None
+        return self.seats[seat_key(worker.name, worker.address, worker.nanny)]
 
     def add_worker(self, scheduler: Any, worker: str) -> None:
         """Give a worker that joins its partition: its own, the one it declares, or by rule."""
-        known = {s.key for s in self.book.seats.values() if s.holds}
+        known = set(self.seats)
         seat = self._seat(scheduler.workers[worker])
-        if seat.key not in known:
-            declared = [name for name in self.book.rules if seat.found.get(name)]
-            if declared:
-                self.book.put(seat, declared[0], seat.found[declared[0]])
-            elif not any(seat.found.values()):
-                seat.partition, seat.unplaced = None, True
-        self.reconciler.settle([seat])
+        declared = [name for name in self.rules if seat.found.get(name)]
+        if seat.key in known:
+            expect(scheduler, scheduler.workers[worker], seat.partition)
+        elif declared:
+            self.put(seat, declared[0], seat.found[declared[0]])
+        else:
+            seat.unplaced = not any(seat.found.values())
+        self.settle([seat])
 
     def remove_worker(self, scheduler: Any, worker: str, **kwargs: Any) -> None:
         """Note that a worker has left; its place is held for a while if it has a nanny."""
-        self.reconciler.miss(worker)
-        for seat in self.book.seats.values():
-            if seat.info.address == worker and seat.absent_since is None:
-                seat.absent_since = time.monotonic()
-                self._begin(self._miss(seat))
+        for seat in list(self.seats.values()):
+            if seat.info.address == worker and not seat.away:
+                seat.away = True
+                if seat.settling:
+                    seat.settling.cancel()
+                    seat.settling = None
+                loop = asyncio.get_running_loop()
+                seat.giving_up = loop.call_later(HOLD_S if seat.nanny else 0, self._give_up, seat)
 
-    def _begin(self, work: Coroutine[Any, Any, None]) -> None:
-        task = asyncio.ensure_future(work)
-        self._work.add(task)
-        task.add_done_callback(self._work.discard)
-
-    async def _miss(self, seat: Seat) -> None:
-        """Give up the place of a worker whose nanny is gone as well, so that another has it."""
-        nanny, absent_since = seat.nanny, seat.absent_since
-        while nanny is not None and seat.holds:
-            await asyncio.sleep(10 * TICK_S)
-            gone = await has_gone(nanny)
-            if seat.absent_since != absent_since:  # it has come back
-                return
-            if gone:
-                self.nannies.forget(nanny)
-                seat.nanny = None
+    def _give_up(self, seat: Seat) -> None:
+        seat.gone = True
+        del self.seats[seat.key]
+        self._place_soon()
+        self.remove_if_done()
 
     def valid_workers_downscaling(self, scheduler: Any, workers: list[Any]) -> list[Any]:
         """Choose those that an adaptive cluster may stop: each partition keeps its minimum."""
         may_stop = {worker.address: worker for worker in workers}
-        for name, rule in self.book.rules.items():
-            members = self.book.members(name, present=True)
+        for name, rule in self.rules.items():
+            members = self.members(name, present=True)
             offered = [m.info.address for m in members if m.info.address in may_stop]
             # The busiest stay.
             offered.sort(key=lambda address: -len(may_stop[address].processing))
@@ -123,53 +244,29 @@ class Steward(SchedulerPlugin):
                 del may_stop[address]
         return list(may_stop.values())
 
-    async def close(self) -> None:
-        """Stop with the scheduler."""
-        self.stop()
+    # -- a place for workers that join -------------------------------------------------
 
-    def stop(self) -> None:
-        """Do nothing more."""
-        self._ticker.stop()
-        self.reconciler.stop()
-        for task in self._work:
-            task.cancel()
+    def _place_soon(self) -> None:
+        """Try again to place workers that nobody wanted: rules or members have changed."""
+        if self._placing is None:
+            loop = asyncio.get_running_loop()
+            self._placing = loop.call_later(_PLACE_EVERY_S, self._place_all)
 
-    def _tick(self) -> None:
-        if not self.book.rules:
-            self.remove_if_done()
-            return
-        if any(seat.absent_since is not None for seat in self.book.seats.values()):
-            self.book.forget(time.monotonic())
-            self.nannies.forget_others({seat.nanny for seat in self.book.seats.values()})
-        waiting = [s for s in self.book.seats.values() if s.unplaced and s.absent_since is None]
-        if waiting:
-            self._look_for_places(waiting)
+    def _place_all(self) -> None:
+        self._placing = None
+        waiting = [s for s in self.seats.values() if s.unplaced and not s.away]
+        self.settle([seat for seat in waiting if self._place(seat)])
 
-    def _look_for_places(self, waiting: list[Seat]) -> None:
-        """Place workers that nobody wanted: another may have gone for good since.
-
-        Only when something has changed. To ask all rules for a thousand workers takes as long
-        as from one tick to the next.
-        """
-        book = self.book
-        now = dict(book.rules), {n: [s.key for s in book.members(n)] for n in book.rules}
-        if now == self._looked_at:
-            return
-        seats = [seat for seat in waiting if not self.reconciler.is_under_way(seat)]
-        self.reconciler.settle([seat for seat in seats if self._place(seat)])
-        # Those that are on their way look for themselves, perhaps before what has changed.
-        self._looked_at = now if len(seats) == len(waiting) else None
-
-    # -- by rule -----------------------------------------------------------------------
-
-    async def _find_place(self, seat: Seat) -> None:
-        """Place a worker that has joined."""
-        await self._ask_for_gpus(seat)
-        if seat.unplaced:
-            self._place(seat)
+    def _place(self, seat: Seat) -> bool:
+        """Find a partition for a worker that has none; whether there is one."""
+        groups = {name: [member.info for member in self.members(name)] for name in self.rules}
+        name = partition_for(seat.info, self.rules, groups)
+        if name is not None:
+            self.put(seat, name)
+        return name is not None
 
     async def _ask_for_gpus(self, seat: Seat) -> None:
-        if not any(isinstance(rule, PerGpu) for rule in self.book.rules.values()):
+        if not any(isinstance(rule, PerGpu) for rule in self.rules.values()):
             return
         try:
             facts = await call(self.scheduler, seat.info.address, probe_worker)
@@ -178,33 +275,118 @@ class Steward(SchedulerPlugin):
             return
         seat.info = seat.info.with_gpus(facts["gpus"])
 
-    def _place(self, seat: Seat) -> bool:
-        """Find a partition for a worker that has none; whether there is one."""
-        name = partition_for(seat.info, self.book.rules, self.book.groups())
-        if name is not None:
-            self.book.put(seat, name)
-        return name is not None
+    # -- bringing it about -------------------------------------------------------------
+
+    def settled(self, seat: Seat) -> bool:
+        """Whether a worker declares what it should, and the scheduler knows it."""
+        worker = self.scheduler.workers.get(seat.info.address)
+        return worker is not None and worker.resources == seat.declared == self.wanted(seat)
+
+    def settle(self, seats: Iterable[Seat]) -> None:
+        """Have workers declare what they should; `settled` tells when they do."""
+        for seat in seats:
+            # Where it is at work, it looks at what should be again before it ends.
+            if not seat.away and (seat.settling is None or seat.settling.done()):
+                seat.settling = asyncio.ensure_future(self._settle(seat, seat.info.address))
+                seat.settling.add_done_callback(self._ended)
+
+    def _ended(self, task: asyncio.Task[None]) -> None:
+        if not task.cancelled() and (error := task.exception()):
+            logger.error("A worker is not in its partition", exc_info=error)
+        self.remove_if_done()
+
+    async def _settle(self, seat: Seat, address: str) -> None:
+        if seat.unplaced:
+            await self._ask_for_gpus(seat)
+            if seat.unplaced:
+                self._place(seat)
+        asked = set[Any]()
+        while (worker := self.scheduler.workers.get(address)) and not self.settled(seat):
+            try:
+                if not await self._step(seat, worker, asked):
+                    await asyncio.sleep(LOOK_EVERY_S)
+            except OSError as error:  # it is going, or the connection was bad
+                logger.info("The worker at %s does not answer: %s", address, error)
+                await asyncio.sleep(10 * LOOK_EVERY_S)
+        # Somebody may have set the resource by hand before, which wakes nobody.
+        if worker:
+            wake(self.scheduler, worker)
+
+    async def _step(self, seat: Seat, worker: Any, asked: set[Any]) -> bool:
+        """Bring a worker nearer to what it should declare; False if its tasks must end first."""
+        wanted = self.wanted(seat)
+        leaving = {name for name, slots in seat.declared.items() if slots and name not in wanted}
+        if leaving:
+            # No new tasks; those that it has end here or move. It declares the resource as long.
+            kept = {name: q for name, q in seat.declared.items() if name not in leaving}
+            self._show(seat, worker, kept)
+            hand_off(self.scheduler, worker, leaving, asked)
+            if held_by(self.scheduler, worker, leaving):
+                return False
+            trace("partition.drained", worker=worker.address, leaves=sorted(leaving))
+        if not await call(self.scheduler, worker.address, declare_on_worker, resources=wanted):
+            return False
+        if self.scheduler.workers.get(worker.address) is worker:
+            seat.declared = wanted
+            trace("partition.worker_told", worker=worker.address, declares=dict(wanted))
+            if self.wanted(seat) == wanted:
+                self._show(seat, worker, wanted)
+                for name in leaving:  # those that took over tasks
+                    for address in self.scheduler.resources.get(name, ()):
+                        recount(self.scheduler.workers[address])
+        return True
+
+    def _show(self, seat: Seat, worker: Any, resources: Resources) -> None:
+        show(self.scheduler, worker, resources)
+        expect(self.scheduler, worker, seat.partition)
+
+    async def arrive(self, seats: Collection[Seat], timeout_s: float) -> list[Seat]:
+        """Wait until workers declare what they should; returns those that do not in time.
+
+        Those whose nanny is starting them again are waited for; those that have left are not.
+        """
+        self.settle(seats)
+        deadline = time.monotonic() + timeout_s
+        while late := [seat for seat in seats if not seat.gone and not self.settled(seat)]:
+            if time.monotonic() >= deadline:
+                break
+            await asyncio.sleep(LOOK_EVERY_S)
+        return late
 
     # -- the end -----------------------------------------------------------------------
 
-    def _at_rest(self, seat: Seat) -> bool:
-        """Whether nothing is left to do for a worker, or its nanny, which may start it again."""
-        if seat.absent_since is None:
-            return self.reconciler.settled(seat)
-        # One that takes longer comes as it was: its nanny is asked once more before.
-        return not (seat.holds and self.nannies.was_told(seat))
+    async def close(self) -> None:
+        """Stop with the scheduler."""
+        self._stop()
+
+    def _stop(self) -> None:
+        work = [self._placing, *(w for s in self.seats.values() for w in (s.settling, s.giving_up))]
+        for task in work:
+            if task is not None:
+                task.cancel()
 
     def remove_if_done(self) -> None:
         """Leave the scheduler, once there are no partitions and all workers are as they were."""
-        if self.book.rules or self.asked or not all(map(self._at_rest, self.book.seats.values())):
-            return
-        self.stop()
-        for seat in self.book.seats.values():
-            if self.nannies.was_told(seat):
-                self._begin(self.nannies.restore(seat))
-        forget_resources(self.scheduler, self.book.names - self._resources_before)
-        if self.scheduler.plugins.get(NAME) is self:
-            self.scheduler.remove_plugin(NAME)
+        here = [seat for seat in self.seats.values() if not seat.away]
+        if not self.rules and not self.asked and all(map(self.settled, here)):
+            self._stop()
+            if self.scheduler.plugins.get(NAME) is self:
+                self.scheduler.remove_plugin(NAME)
+
+
+def seat_key(name: Hashable, address: str, nanny: str | None) -> Hashable:
+    """Name a worker for all its lives: by its name or, if it has none, by its nanny.
+
+    A worker that was given no name goes by its address, which is another after a restart. The
+    name is left as it is: to Dask 0, as `LocalCluster` has it, and "0", as from a command line,
+    are two workers.
+    """
+    return name if name != address else nanny or address
+
+
+def names_of(seats: Iterable[Seat]) -> str:
+    """Names of workers, for messages."""
+    return ", ".join(sorted(seat.info.name for seat in seats))
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""What the scheduler knows of a partition now: its tasks, free slots and silent workers."""
+"""What the scheduler knows of a partition now: its free slots, its tasks and silent workers."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 from distributed import Client
 
-from .remote import on_scheduler
+from .workers import on_scheduler
 
 SILENT_S = 20.0  # without a heartbeat; a stopped worker gives none, nor one whose GIL is held
 _BEATS = 3  # heartbeats that a worker may miss at least
@@ -26,33 +26,41 @@ class TaskPlace:
         Addresses of those that run it, or have its result.
     deaths
         Workers that died, unexpectedly, while the task was assigned to them.
+    long_running
+        Whether it runs and has seceded.
     """
 
     state: str
     workers: tuple[str, ...]
     deaths: int
+    long_running: bool = False
 
 
 @dataclass(frozen=True)
 class Whereabouts:
-    """Members of a partition, and tasks, at one moment.
+    """Members of a partition, their slots, and tasks, at one moment.
 
     Parameters
     ----------
-    slots
-        Tasks that the partition runs at a time.
     members
         Addresses of all workers of the partition.
     silent
         Those of them that have sent no heartbeat for long: stopped, cut off or stuck. The
         scheduler itself takes a worker for dead after its ``worker-ttl``, five minutes.
+    free
+        Slots that no task holds or waits for, by address of the worker; below 0 where more
+        tasks were given to a worker than it has slots for. Workers that take no tasks at the
+        moment, or are silent, are left out.
+    slots
+        Slots of the workers that take tasks at the moment, free or not.
     tasks
         {key: its place}, of those keys asked for that the scheduler knows.
     """
 
-    slots: int = 0
     members: frozenset[str] = frozenset()
     silent: frozenset[str] = frozenset()
+    free: dict[str, int] = field(default_factory=dict)
+    slots: int = 0
     tasks: dict[str, TaskPlace] = field(default_factory=dict)
 
     def out_of_reach(self, key: str) -> bool:
@@ -60,36 +68,47 @@ class Whereabouts:
         place = self.tasks.get(key)
         return place is not None and bool(place.workers) and self.silent.issuperset(place.workers)
 
+    def runs_for_long(self, key: str) -> bool:
+        """Whether a task runs and has seceded."""
+        return key in self.tasks and self.tasks[key].long_running
 
-def look_for_tasks(
-    client: Client, resource: str, keys: Collection[str], patience_s: float | None = None
-) -> Whereabouts:
-    """Ask the scheduler about the workers of a partition and some tasks.
+    def without(self, addresses: Collection[str]) -> Whereabouts:
+        """Leave out what is free on some workers."""
+        free = {address: count for address, count in self.free.items() if address not in addresses}
+        return replace(self, free=free)
 
-    Parameters
-    ----------
-    client
-        Client of the cluster.
-    resource
-        Name of the partition.
-    keys
-        The tasks' keys.
-    patience_s
-        Seconds without a heartbeat that make a worker silent; by default `SILENT_S`.
+
+def look_for_tasks(client: Client, partition: str, keys: Collection[str] = ()) -> Whereabouts:
+    """Ask the scheduler about the slots of a partition and some tasks.
+
+    Dask places a task by a worker's total resources, not by what is free, and prefers the
+    worker with the least work ahead; one whose only slot is held by a task that has seceded
+    looks idle to it. A long-running task that lands there waits as long as the other runs.
+    Whoever starts several of them should choose their workers.
     """
-    members, silent, tasks = on_scheduler(
-        client,
-        _look_for_tasks,
-        resource=resource,
-        keys=list(keys),
-        patience_s=SILENT_S if patience_s is None else patience_s,
+    arguments = {"partition": partition, "keys": list(keys), "patience_s": SILENT_S}
+    found: Whereabouts = on_scheduler(client, _look, **arguments)
+    return found
+
+
+def _look(
+    partition: str, keys: list[str], patience_s: float, dask_scheduler: Any = None
+) -> Whereabouts:
+    members = [ws for ws in dask_scheduler.workers.values() if ws.resources.get(partition)]
+    silent = _silent_workers(dask_scheduler, patience_s)
+    usable = [ws for ws in members if ws.status.name == "running" and ws.address not in silent]
+    places = {key: _place(dask_scheduler.tasks[key]) for key in keys if key in dask_scheduler.tasks}
+    return Whereabouts(
+        members=frozenset(ws.address for ws in members),
+        silent=frozenset(ws.address for ws in members if ws.address in silent),
+        free={ws.address: int(ws.resources[partition] - _in_use(ws, partition)) for ws in usable},
+        slots=sum(int(ws.resources[partition]) for ws in usable),
+        tasks=places,
     )
-    places = {key: TaskPlace(*place) for key, place in tasks.items()}
-    return Whereabouts(sum(members.values()), frozenset(members), frozenset(silent), places)
 
 
-def silent_workers(scheduler: Any, patience_s: float) -> set[str]:
-    """Addresses of workers without a heartbeat for so long; runs on the scheduler."""
+def _silent_workers(scheduler: Any, patience_s: float) -> set[str]:
+    """Addresses of workers without a heartbeat for so long."""
     # The scheduler's own clock: where all have been silent for as long, it is the scheduler
     # that was stopped or busy, and they are about to be heard.
     now = max((ws.last_seen for ws in scheduler.workers.values()), default=0.0)
@@ -98,87 +117,12 @@ def silent_workers(scheduler: Any, patience_s: float) -> set[str]:
     return {ws.address for ws in scheduler.workers.values() if now - ws.last_seen > patience_s}
 
 
-def _look_for_tasks(
-    resource: str, keys: list[str], patience_s: float, dask_scheduler: Any = None
-) -> tuple[Any, ...]:
-    workers = dask_scheduler.workers.values()
-    members = {ws.address: int(n) for ws in workers if (n := ws.resources.get(resource))}
-    silent = silent_workers(dask_scheduler, patience_s)
-    tasks = {}
-    for key in keys:
-        task = dask_scheduler.tasks.get(key)
-        if task is not None:
-            holders = task.who_has or ([task.processing_on] if task.processing_on else [])
-            places = tuple(ws.address for ws in holders)
-            tasks[key] = (task.state, places, task.suspicious)
-    return members, [address for address in members if address in silent], tasks
-
-
-@dataclass(frozen=True)
-class Slots:
-    """Slots of a partition at one moment.
-
-    Parameters
-    ----------
-    free
-        Slots that no task holds or waits for, by address of the worker; below 0 where more
-        tasks were given to a worker than it has slots for. Workers that take no tasks at the
-        moment, or give no sign of life, are left out.
-    present
-        Addresses of all workers of the partition.
-    running
-        Those of the keys asked for whose tasks run for long, that is, have seceded.
-    known
-        Those of the keys asked for that the scheduler has heard of.
-    silent
-        Addresses of those workers that give no sign of life, see `Whereabouts`.
-    total
-        Slots of the workers that take tasks at the moment, free or not.
-    """
-
-    free: dict[str, int]
-    present: frozenset[str]
-    running: frozenset[str]
-    known: frozenset[str] = frozenset()
-    silent: frozenset[str] = frozenset()
-    total: int = 0
-
-    def without(self, addresses: Collection[str]) -> Slots:
-        """Leave out what is free on some workers."""
-        free = {address: count for address, count in self.free.items() if address not in addresses}
-        return replace(self, free=free)
-
-
-def look_at_slots(client: Client, resource: str, keys: Collection[str] = ()) -> Slots:
-    """See which slots of a partition are free.
-
-    Dask places a task by a worker's total resources, not by what is free, and prefers the
-    worker with the least work ahead; one whose only slot is held by a task that has seceded
-    looks idle to it. A long-running task that lands there waits as long as the other runs.
-    Whoever starts several of them should choose their workers.
-    """
-    free, total, *sets = on_scheduler(
-        client, _look_at_slots, resource=resource, keys=list(keys), patience_s=SILENT_S
-    )
-    present, running, known, silent = map(frozenset, sets)
-    return Slots(free, present, running, known, silent, total)
-
-
-def _look_at_slots(
-    resource: str, keys: list[str], patience_s: float, dask_scheduler: Any = None
-) -> tuple[Any, ...]:
-    silent = silent_workers(dask_scheduler, patience_s)
-    members = [ws for ws in dask_scheduler.workers.values() if ws.resources.get(resource)]
-    usable = [ws for ws in members if ws.status.name == "running" and ws.address not in silent]
-    free = {ws.address: int(ws.resources[resource] - _in_use(ws, resource)) for ws in usable}
-    total = sum(int(ws.resources[resource]) for ws in usable)
-    known = [key for key in keys if key in dask_scheduler.tasks]
-    running = [key for key in known if _runs_for_long(dask_scheduler.tasks[key])]
-    return free, total, [ws.address for ws in members], running, known, list(silent)
-
-
-def _runs_for_long(task: Any) -> bool:
-    return task.processing_on is not None and task in task.processing_on.long_running
+def _place(task: Any) -> TaskPlace:
+    worker = task.processing_on
+    holders = task.who_has or ([worker] if worker else [])
+    long_running = worker is not None and task in worker.long_running
+    places = tuple(ws.address for ws in holders)
+    return TaskPlace(task.state, places, task.suspicious, long_running)
 
 
 def _in_use(worker: Any, resource: str) -> float:

@@ -94,8 +94,8 @@ def _nannies():
 @pytest.fixture
 def patient(monkeypatch):
     """Have the scheduler wait long: a busy machine needs time to start a worker again."""
-    monkeypatch.setattr("poolpart.book.HOLD_S", 3600.0)
-    monkeypatch.setattr("poolpart.declare.PATIENCE_S", 120.0)
+    monkeypatch.setattr("poolpart.steward.HOLD_S", 3600.0)
+    monkeypatch.setattr("poolpart.division.PATIENCE_S", 120.0)
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Undoing partitions: what the scheduler, workers and nannies know is what they knew before."""
+"""Undoing partitions: what the scheduler and workers know is what they knew before."""
 
 import os
 import signal
@@ -10,12 +10,9 @@ from distributed import Event, get_worker
 from poolpart import (
     Pool,
     PoolError,
-    declare,
     n_workers,
     named,
     per_host,
-    raise_fence,
-    reconciler,
     rest,
     steward,
     worker_identities,
@@ -44,6 +41,7 @@ def known(client):
         "by resource": {
             name: sorted(str(scheduler.workers[a].name) for a in workers)
             for name, workers in scheduler.resources.items()
+            if workers
         },
         "plugins": set(scheduler.plugins),
         "plugins for others": (set(scheduler.worker_plugins), set(scheduler.nanny_plugins)),
@@ -58,7 +56,6 @@ def known(client):
             for key, task in scheduler.tasks.items()
         },
         "themselves": sorted(client.run(_on_worker).values(), key=str),
-        "nannies": sorted(client.run(_on_nanny, nanny=True).values(), key=str),
     }
 
 
@@ -66,15 +63,10 @@ def _on_worker(dask_worker):
     state = dask_worker.state
     return (
         str(dask_worker.name),
-        dict(state.total_resources),
-        dict(state.available_resources),
+        {name: slots for name, slots in state.total_resources.items() if slots},
+        {name: slots for name, slots in state.available_resources.items() if slots},
         sorted(dask_worker.plugins),
     )
-
-
-def _on_nanny(dask_worker):
-    kwargs = dask_worker.process.worker_kwargs
-    return str(dask_worker.name), dask_worker.resources, kwargs["resources"], kwargs.keys()
 
 
 def declared(client):
@@ -101,41 +93,25 @@ def test_everything_is_as_before(start, wait_until):
     assert known(client) == before
 
 
-def test_nannies_are_as_before(nannies, wait_until):
+def test_a_worker_that_comes_back_after_all_is_as_it_was(nannies, wait_until):
+    """There is no partition any more by then."""
     before = known(nannies)
     Pool.from_client(nannies).divide({"A": per_host(1), "B": rest()})
-    addresses = set(worker_identities(nannies))
-    victim = nannies.run(os.getpid).popitem()
-    os.kill(victim[1], signal.SIGKILL)
-    # While one is starting again, too.
-    wait_until(lambda: victim[0] not in worker_identities(nannies))
+    address, pid = nannies.run(os.getpid).popitem()
+    os.kill(pid, signal.SIGKILL)
+    wait_until(lambda: address not in worker_identities(nannies))
     assert Pool(nannies, []).dissolve(timeout_s=LONG_S) == ["A", "B"]
-    assert victim[0] in addresses
+    nannies.wait_for_workers(2, timeout=LONG_S)
     assert known(nannies) == before
-    nannies.restart()
-    assert declared(nannies) == {"0": {}, "1": {}}
-    assert known(nannies)["nannies"] == before["nannies"]
 
 
-def test_a_nanny_whose_worker_has_left_its_partition(nannies):
-    before = known(nannies)
-    part, _ = Pool.from_client(nannies).partition("A", n_workers=2)
-    part.shrink(1)
-    part.dissolve()
-    assert known(nannies)["nannies"] == before["nannies"]
-
-
-@pytest.mark.parametrize("how", ["not exclusive any more", "raised by hand"])
-def test_no_fence_stays(start, how):
+def test_no_fence_stays(start):
     client = start({"a": {}, "b": {}})
     before = known(client)
     pool = Pool.from_client(client)
-    part, _ = pool.partition("A", n_workers=1, exclusive=how == "not exclusive any more")
-    if how == "raised by hand":
-        raise_fence(client, "A")
-    else:
-        pool.partition("A", n_workers=1)
-        assert not part.stats().exclusive
+    pool.partition("A", n_workers=1, exclusive=True)
+    part, _ = pool.partition("A", n_workers=1)
+    assert not part.stats().exclusive
     pool.dissolve()
     assert known(client) == before
 
@@ -145,12 +121,12 @@ def test_nothing_stays_but_of_workers_that_do_not_answer(start, wait_until, monk
     before = known(client)
     pool = Pool.from_client(client)
     pool.divide({"A": n_workers(1, exclusive=True), "B": rest()})
-    arrive = reconciler.Reconciler.arrive
+    arrive = steward.Steward.arrive
 
     async def impatient(self, seats, timeout_s):
         return await arrive(self, seats, 0.0)
 
-    monkeypatch.setattr(reconciler.Reconciler, "arrive", impatient)
+    monkeypatch.setattr(steward.Steward, "arrive", impatient)
     with pytest.raises(PoolError, match="a, b did not answer while A and B were dissolved"):
         pool.dissolve()
     wait_until(lambda: steward.NAME not in client.cluster.scheduler.plugins)
@@ -199,37 +175,3 @@ def test_a_result_that_is_lost_afterwards_is_computed_again(start, wait_until):
     client.cluster.scheduler_comm  # noqa: B018
     client.sync(client.cluster.scheduler.remove_worker, address, stimulus_id="lost")
     assert future.result(LONG_S) == "b"
-
-
-def test_dividing_once_more(start):
-    client = start({"a": {}, "b": {}})
-    for names in ("PQ", "QP", "PQ"):
-        pool = Pool.from_client(client)
-        parts = pool.divide({names[0]: n_workers(1), names[1]: rest()})
-        assert [part.submit(here).result() in "ab" for part in parts.values()] == [True, True]
-        assert sorted(pool.dissolve()) == ["P", "Q"]
-
-
-def start_once(path, dask_worker):
-    """Have a nanny's worker start no sooner than there is such a file, from now on."""
-    wait = f"import os, time\nwhile not os.path.exists({path!r}): time.sleep(0.05)"
-    dask_worker.preload = dask_worker.process.worker_kwargs["preload"] = [wait]
-
-
-def test_a_worker_that_comes_back_after_all_is_as_it_was(
-    own_nannies, wait_until, monkeypatch, tmp_path
-):
-    """There is no partition any more by then."""
-    part = Pool.from_client(own_nannies).divide({"A": rest()})["A"]
-    victim, gate = part.workers[0], tmp_path / "gate"
-    own_nannies.run(start_once, str(gate), nanny=True)
-    monkeypatch.setattr(declare, "_RETURN_S", 0.2)
-    os.kill(own_nannies.run(os.getpid, workers=[victim.address])[victim.address], signal.SIGKILL)
-    wait_until(lambda: len(part.workers) == 1)
-    with pytest.raises(PoolError, match="did not answer while A were dissolved; they become what"):
-        part.dissolve(timeout_s=0.1)
-    gate.touch()
-    own_nannies.wait_for_workers(2, timeout=LONG_S)
-    wait_until(lambda: steward.NAME not in own_nannies.cluster.scheduler.plugins)
-    assert set(map(str, declared(own_nannies).values())) == {"{}"}
-    assert {told[1] for told in own_nannies.run(_on_nanny, nanny=True).values()} == {None}

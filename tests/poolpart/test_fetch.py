@@ -8,7 +8,6 @@ import uuid
 from collections import Counter
 
 import numpy as np
-import pytest
 from distributed import Event, wait
 from distributed.comm import tcp
 from distributed.comm.addressing import parse_host_port
@@ -54,19 +53,6 @@ def test_it_takes_no_reference(client, wait_until):
     del future
     wait_until(lambda: key not in client.cluster.scheduler.tasks)
     assert fetch_available(client, [key]) == {}
-
-
-@pytest.mark.parametrize("partition", ["A", "B"])
-def test_tasks_fetch_for_themselves(client, partition):
-    def fetch(keys):
-        from distributed import get_client
-
-        return fetch_available(get_client(), keys, 120.0)
-
-    future = Partition("A", client).submit(twice, 3)
-    wait([future], timeout=120)
-    fetched = Partition(partition, client).submit(fetch, [future.key]).result(120)
-    assert fetched == {future.key: 6}
 
 
 def answer_late(seconds, dask_worker):
@@ -128,19 +114,6 @@ def test_results_come_from_the_worker_that_has_them(client):
     assert fetch_from(client, one, keys, LONG_S) == {there.key: 6}
     assert fetch_from(client, two, keys, LONG_S) == {elsewhere.key: 8}
     assert fetch_from(client, one, [], LONG_S) == {}
-
-
-def test_the_scheduler_is_not_asked_where_results_are(client, monkeypatch):
-    part = Partition("A", client)
-    future = part.submit(twice, 5, worker=part.workers[0].address)
-    wait([future], timeout=LONG_S)
-
-    def refuse(*_, **__):
-        raise AssertionError
-
-    for name in ("who_has", "gather"):
-        monkeypatch.setitem(client.cluster.scheduler.handlers, name, refuse)
-    assert fetch_from(client, part.workers[0].address, [future.key], LONG_S) == {future.key: 10}
 
 
 # -- bytes that a long task leaves with its worker -------------------------------------

@@ -1,6 +1,5 @@
 """What tasks of a partition submit belongs to it."""
 
-import time
 from itertools import chain
 
 import dask
@@ -100,26 +99,16 @@ def test_unless_they_say_otherwise(client):
     assert mixed == ("B-0", "A-0")
 
 
-def test_a_worker_that_left_the_partition_gets_none(client):
-    inherit(client, "A")
-    workers = client.cluster.scheduler.workers.values()
-    [address] = [worker.address for worker in workers if worker.name == "A-0"]
-
-    def declare(slots):
-        client.run(set_slots, slots=slots, workers=[address])
-
-    declare(0)
+def test_a_worker_that_left_the_partition_gets_none(start, wait_until):
+    client = start({"a": {}})
+    pool = Pool.from_client(client)
+    part, _ = pool.partition("A", n_workers=1, minimum=0)
+    part.shrink()
     # As what a task of the partition submits: it takes no slot, and no slots are what is there.
     nested = client.submit(here, resources={"A": 0}, pure=False)
-    time.sleep(0.1)
-    assert not nested.done()
-    declare(1)
-    Partition("A", client).submit(here).result(LONG_S)
-    assert client.submit(here, 1, resources={"A": 0}, pure=False).result(LONG_S) == "A-0"
-
-
-async def set_slots(slots, dask_worker):
-    await dask_worker.set_resources(A=slots)
+    wait_until(lambda: client.cluster.scheduler.unrunnable)
+    part.grow()
+    assert nested.result(LONG_S) == "a"
 
 
 def test_pools_do_it_and_dissolving_undoes_it(start):
@@ -142,4 +131,4 @@ def test_disinherit(client):
     assert len(set(names)) > 1
     assert set(Partition("B", client).submit(descend, 2, "get_client").result(LONG_S)) == {"B-0"}
     disinherit(client, "B")
-    assert "valid_workers" not in vars(client.cluster.scheduler)
+    assert "_create_taskstate_from_graph" not in vars(client.cluster.scheduler)

@@ -9,7 +9,7 @@ import time
 import pytest
 from distributed import Client, Scheduler, SpecCluster, Worker
 
-from poolpart import Partition, Pool, n_workers, raise_fence, rest, trace_to
+from poolpart import Partition, Pool, n_workers, rest, trace_to
 
 LONG_S = 120.0
 QUIET = 50
@@ -18,7 +18,7 @@ QUIET = 50
 DRIVER = """
 import sys
 from distributed import Client
-from poolpart import Partition, Pool, n_workers, raise_fence, rest
+from poolpart import Partition, Pool, n_workers, rest
 with Client(sys.argv[1]) as client:
     pool = Pool.from_client(client)
     print("ready", flush=True)
@@ -77,8 +77,12 @@ def known(client):
         "by resource": {name: set(has) for name, has in scheduler.resources.items() if has},
         "plugins": set(scheduler.plugins),
         "overridden": {name for name in vars(scheduler) if hasattr(type(scheduler), name)},
-        "themselves": client.run(lambda dask_worker: dict(dask_worker.state.total_resources)),
+        "themselves": client.run(_told),
     }
+
+
+def _told(dask_worker):
+    return {name: slots for name, slots in dask_worker.state.total_resources.items() if slots}
 
 
 def sizes(client):
@@ -117,7 +121,7 @@ def await_state(client, expected):
 @pytest.mark.parametrize(
     ("what", "point", "after"),
     [
-        (f"pool.divide({RULES})", "nanny_told", ["A", "A", "B", "B"]),
+        (f"pool.divide({RULES})", "worker_told", ["A", "A", "B", "B"]),
         ("Partition('A', client).grow(1, source='B')", "drained", ["A", "A", "A", "B"]),
         ("pool.dissolve()", "worker_told", ["", "", "", ""]),
     ],
@@ -144,26 +148,3 @@ def test_what_was_asked_is_done_whole(cluster, driver, wait_until, what, point, 
     pool.dissolve()
     # The scheduler may still be about to answer the driver, and keeps its book as long.
     await_state(cluster, before)
-
-
-def test_a_fence_that_it_left_can_be_undone(cluster, driver, wait_until):
-    before = known(cluster)
-    Pool.from_client(cluster).divide({"A": n_workers(2), "B": rest()})
-    process = driver("raise_fence(client, 'A')")
-    tell(process)
-    assert process.stdout.readline() == "done\n"
-    process.kill()
-    await_that_it_is_gone(cluster, wait_until)
-    assert Partition("A", cluster).stats().exclusive
-    assert Pool.from_client(cluster).dissolve() == ["A", "B"]
-    assert known(cluster) == before
-
-
-def test_a_fence_of_workers_that_were_started_with_a_resource_can_be_undone(start):
-    client = start({"a": {"resources": {"A": 1}}, "b": {}})
-    before = set(client.cluster.scheduler.plugins)
-    raise_fence(client, "A")
-    with Client(client.cluster) as other:
-        assert Pool.from_client(other).dissolve() == []
-    assert set(client.cluster.scheduler.plugins) == before
-    assert not Partition("A", client).stats().exclusive

@@ -201,16 +201,6 @@ def test_stop_iteration_in_a_task_does_not_end_the_map_silently(a, chunk):
         list(a.map(stop_at_3, range(50), chunk=chunk))
 
 
-def test_an_error_of_the_items_is_raised(a, client, wait_until):
-    def items():
-        yield from range(20)
-        raise OSError("no more")
-
-    with pytest.raises(OSError, match="no more"):
-        list(a.map(twice, items()))
-    wait_until(lambda: task_count(client) == 0)
-
-
 @pytest.mark.parametrize("ordered", [True, False])
 @pytest.mark.parametrize("stop", ["close", "del", "with"])
 def test_stopping_lets_go_of_tasks_that_have_not_started(

@@ -12,7 +12,13 @@ from distributed import Client
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from poolpart import Partition, Pipe, PipeClosed, PipeFailed, forget_pipes
+from poolpart import (
+    Partition,
+    Pipe,
+    PipeClosed,
+    PipeFailed,
+    take_news,
+)
 from poolpart import pipe as pipe_module
 
 LONG_S = 120.0  # for what happens at once, or the test fails
@@ -24,33 +30,10 @@ def again(pipe):
 
 
 def known(client):
-    """What the scheduler knows of queues, variables, tasks and who holds these."""
-
-    def look(dask_scheduler):
-        queues = dask_scheduler.extensions["queues"]
-        return (
-            sorted(queues.queues),
-            sorted(queues.client_refcount),
-            sorted(queues.future_refcount),
-            sorted(dask_scheduler.extensions["variables"].variables),
-            sorted(dask_scheduler.tasks),
-            # Queues and variables hold futures as clients. The others come and go by themselves.
-            [c for c in dask_scheduler.clients if c.startswith(("queue-", "variable-"))],
-        )
-
-    return client.run_on_scheduler(look)
-
-
-@pytest.fixture
-def before(client, wait_until):
-    """What the scheduler knows before the test.
-
-    Of a future whose consumer's word was late it forgets the count some seconds later: that of
-    an earlier test would go in the middle of this one.
-    """
-    queues = client.cluster.scheduler.extensions["queues"]
-    wait_until(lambda: not queues.future_refcount)
-    return known(client)
+    """What the scheduler knows of queues and variables."""
+    extensions = client.cluster.scheduler.extensions
+    queues = extensions["queues"]
+    return set(queues.queues), set(queues.client_refcount), set(extensions["variables"].variables)
 
 
 def consume(pipe):
@@ -62,10 +45,6 @@ def produce(pipe, items):
         pipe.put(item)
 
 
-def add_one(x):
-    return x + 1
-
-
 @pytest.fixture
 def pool():
     with ThreadPoolExecutor(16) as pool:
@@ -73,14 +52,6 @@ def pool():
 
 
 # -- order and bound -------------------------------------------------------------------
-
-
-def test_items_come_in_the_order_they_were_put(client, make_pipe, pool):
-    pipe = make_pipe(client, capacity=4)
-    consumer = pool.submit(consume, again(pipe))
-    produce(pipe, range(100))
-    pipe.close()
-    assert consumer.result(LONG_S) == list(range(100))
 
 
 OPERATIONS = st.lists(
@@ -143,27 +114,17 @@ def test_a_producer_waits_while_the_pipe_is_full(client, make_pipe, pool, wait_u
 @pytest.mark.parametrize("shared", [True, False])
 def test_several_producers_and_consumers_lose_and_double_nothing(client, make_pipe, pool, shared):
     pipe = make_pipe(client, capacity=5)
-    depths, finished = [], threading.Event()
-
-    def watch():
-        while not finished.is_set():
-            depths.append(pipe.depth)
-
-    watcher = pool.submit(watch)
     ends = [pipe if shared else again(pipe) for _ in range(8)]
     consumers = [pool.submit(consume, end) for end in ends[:4]]
     producers = [
         pool.submit(produce, end, [(number, item) for item in range(40)])
         for number, end in enumerate(ends[4:])
     ]
-    for producer in producers:
-        producer.result(LONG_S)
+    while not all(producer.done() for producer in producers):
+        assert pipe.depth <= 5
     pipe.close()
     received = [consumer.result(LONG_S) for consumer in consumers]
-    finished.set()
-    watcher.result(LONG_S)
     assert sorted(itertools.chain(*received)) == [(n, i) for n in range(4) for i in range(40)]
-    assert max(depths) <= 5 + 4 - 1
 
 
 @pytest.mark.parametrize("capacity", [0, -1])
@@ -200,14 +161,6 @@ def test_nothing_can_be_put_into_a_closed_pipe(client, make_pipe):
     assert pipe.depth == 0
 
 
-def test_closing_wakes_those_that_wait(client, make_pipe, pool):
-    pipe = make_pipe(client, capacity=1)
-    consumers = [pool.submit(consume, again(pipe)) for _ in range(3)]
-    time.sleep(0.05)  # let them wait
-    pipe.close()
-    assert [consumer.result(LONG_S) for consumer in consumers] == [[], [], []]
-
-
 # -- failure ---------------------------------------------------------------------------
 
 
@@ -225,18 +178,6 @@ def test_failing_wakes_both_ends_with_the_reason(client, make_pipe, pool, wait_u
             future.result(LONG_S)
 
 
-def test_a_consumer_stops_at_a_failure_even_with_items_in_hand(client, make_pipe, monkeypatch):
-    monkeypatch.setattr(pipe_module, "_STATE_MAX_AGE_S", 0.0)
-    pipe = make_pipe(client)
-    for item in range(3):
-        pipe.put(item)
-    end = again(pipe)
-    assert end.get() == 0
-    pipe.fail("no")
-    with pytest.raises(PipeFailed, match="no"):
-        end.get()
-
-
 def test_the_first_reason_stays(client, make_pipe):
     pipe = make_pipe(client)
     pipe.fail("cause")
@@ -252,59 +193,7 @@ def test_advice_can_return_to_what_it_was(client, make_pipe):
     assert again(pipe).advice == 1
 
 
-def test_changes_at_the_same_moment_all_count(client, make_pipe, pool):
-    for _ in range(10):
-        pipe = make_pipe(client)
-        changes = [
-            pool.submit(again(pipe).close),
-            pool.submit(again(pipe).advise, 9),
-            pool.submit(again(pipe).fail, "why"),
-        ]
-        for change in changes:
-            try:
-                change.result(LONG_S)
-            except PipeFailed:  # the advice came after
-                assert change is changes[1]
-        with pytest.raises(PipeFailed, match="why"):
-            again(pipe).get()
-
-
 # -- items -----------------------------------------------------------------------------
-
-
-def test_futures_are_items(client, before, make_pipe, pool, wait_until):
-    part = Partition("A", client)
-    pipe = make_pipe(client, capacity=4)
-
-    def send():
-        for number in range(8):
-            pipe.put(part.submit(add_one, number))
-        pipe.close()
-
-    sender = pool.submit(send)
-    assert [future.result(LONG_S) for future in again(pipe)] == list(range(1, 9))
-    sender.result(LONG_S)
-    pipe.delete()
-    wait_until(lambda: known(client) == before)
-
-
-def test_a_future_that_failed_raises_at_the_consumer(client, make_pipe):
-    pipe = make_pipe(client)
-    future = Partition("A", client).submit(add_one, "x")
-    pipe.put(future)
-    with pytest.raises(TypeError):
-        pipe.get(LONG_S).result(LONG_S)
-
-
-def test_a_future_that_was_cancelled_is_refused(client, make_pipe, monkeypatch, wait_until):
-    monkeypatch.setattr(pipe_module, "_UNKNOWN_FUTURE_S", 0.05)
-    pipe = make_pipe(client)
-    future = Partition("A", client).submit(add_one, 1)
-    assert future.result(LONG_S) == 2
-    future.cancel()
-    wait_until(lambda: not client.cluster.scheduler.tasks)
-    with pytest.raises(ValueError, match="the scheduler does not know its task"):
-        pipe.put(future)
 
 
 def test_a_pickled_pipe_is_small_and_the_same(client, make_pipe):
@@ -325,15 +214,6 @@ def test_tasks_use_the_client_of_their_worker(client, make_pipe):
     assert sorted(consumer.result(LONG_S)) == sorted([0, 1, 2] * 10)
 
 
-def test_repr(client, make_pipe):
-    pipe = make_pipe(client)
-    assert repr(pipe) == f"<Pipe {pipe.name!r} capacity 3, open>"
-    pipe.close()
-    assert repr(pipe) == f"<Pipe {pipe.name!r} capacity 3, closed>"
-    pipe.fail("broken")
-    assert repr(pipe) == f"<Pipe {pipe.name!r} capacity 3, broken>"
-
-
 # -- what is left ----------------------------------------------------------------------
 
 USES = {
@@ -349,40 +229,17 @@ USES = {
 }
 
 
-@pytest.mark.parametrize("use", USES.values(), ids=USES)
-@pytest.mark.parametrize("fresh", [True, False])
-def test_using_a_deleted_pipe_says_so_and_does_not_bring_it_back(
-    client, before, make_pipe, use, fresh
-):
+def test_using_a_deleted_pipe_says_so_and_does_not_bring_it_back(client, make_pipe):
+    before = known(client)
     pipe = make_pipe(client)
     pipe.put(1)
     pipe.delete()
-    with pytest.raises(PipeFailed, match="does not exist: never created, or deleted"):
-        use(again(pipe) if fresh else pipe)
+    pipe.delete()
+    for use in USES.values():
+        for end in (pipe, again(pipe)):
+            with pytest.raises(PipeFailed, match="does not exist: never created, or deleted"):
+                use(end)
     assert known(client) == before
-
-
-def test_deleting_wakes_those_that_wait(client, make_pipe, pool):
-    empty, full = make_pipe(client), make_pipe(client, capacity=1)
-    full.put(1)
-    waiting = [pool.submit(again(empty).get)]
-    waiting += [pool.submit(again(full).put, number) for number in range(3)]
-    time.sleep(0.05)
-    forget_pipes(client, [empty.name, full.name])
-    for future in waiting:
-        with pytest.raises(PipeFailed, match="does not exist"):
-            future.result(LONG_S)
-
-
-def test_deleting_takes_items_futures_and_a_state_along(client, before, make_pipe, wait_until):
-    pipe = make_pipe(client)
-    pipe.put("item")
-    pipe.put(Partition("A", client).submit(add_one, 1))
-    pipe.fail("state")
-    assert known(client) != before
-    pipe.delete()
-    pipe.delete()
-    wait_until(lambda: known(client) == before)
 
 
 def test_leaving_its_block_deletes_a_pipe_also_after_an_error(client):
@@ -442,3 +299,45 @@ def test_an_unbounded_put_does_not_wait_for_room(client, make_pipe):
     pipe.close()
     with pytest.raises(PipeClosed):
         pipe.put("late", unbounded=True)
+
+
+# -- waiting for news, and taking it ---------------------------------------------------
+
+ENDS = [Pipe.close, Pipe.delete, lambda pipe: pipe.fail("why not")]
+
+
+@pytest.mark.parametrize("change", [*ENDS, lambda pipe: pipe.put("item")])
+def test_an_item_or_the_end_of_a_pipe_ends_the_wait(client, make_pipe, change):
+    pipe = make_pipe(client)
+    threading.Timer(0.1, change, [pipe]).start()
+    start = time.monotonic()
+    assert take_news(client, LONG_S, [pipe.name]) in ({}, {pipe.name: ["item"]})
+    assert 0.1 <= time.monotonic() - start < LONG_S / 2
+
+
+def test_a_task_that_ends_or_is_not_known_ends_the_wait(client, make_pipe):
+    future = client.submit(time.sleep, 0.1, pure=False)
+    start = time.monotonic()
+    take_news(client, LONG_S, [make_pipe(client).name], [future.key])
+    take_news(client, LONG_S, [], ["nobody-knows"])
+    assert time.monotonic() - start < LONG_S / 2
+
+
+def test_without_news_the_wait_is_as_long_as_was_said(client, make_pipe):
+    pipe, start = make_pipe(client), time.monotonic()
+    assert take_news(client, 0.1, [pipe.name]) == {}
+    assert time.monotonic() - start >= 0.1
+
+
+def test_all_that_is_in_the_pipes_is_taken_in_one_request(client, make_pipe, monkeypatch):
+    one, two, empty = pipes = [make_pipe(client, capacity=100) for _ in range(3)]
+    for number in range(5):
+        one.put(number)
+    two.put({"scan": 7})
+    one.close()
+    asked, ask = [], client.run_on_scheduler
+    monkeypatch.setattr(client, "run_on_scheduler", lambda *a, **k: asked.append(1) or ask(*a, **k))
+    found = take_news(client, LONG_S, [pipe.name for pipe in pipes])
+    assert len(asked) == 1
+    assert found == {one.name: [0, 1, 2, 3, 4], two.name: [{"scan": 7}]}
+    assert take_news(client, 0.0, [one.name, two.name, empty.name]) == {}

@@ -9,7 +9,7 @@ import time
 import uuid
 
 import pytest
-from distributed import Client, Queue
+from distributed import Queue
 
 from poolpart import Partition, Pipe, PipeFailed
 
@@ -76,7 +76,7 @@ def test_large_items_and_nested_ones(processes, make_pipe):
     pipe.close()
     large, nested = consumer.result(LONG_S)
     assert large == items[0]
-    assert nested == {"keys": ("a", 1, None), "x": 2.5}  # lists come as tuples
+    assert nested == items[1]
 
 
 def test_a_consumer_that_is_killed_while_it_waits_swallows_nothing(processes, make_pipe):
@@ -115,26 +115,6 @@ def test_deleting_forgets_consumers_that_were_killed(processes, make_pipe, wait_
     greetings.delete()
     assert not {pipe.name, greetings.name} & processes.run_on_scheduler(names)
     assert not any(pipe.name in name for name in processes.cluster.scheduler.clients)
-
-
-def test_a_pipe_whose_scheduler_has_died_raises():
-    command = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1"]
-    command += ["--port", "0", "--dashboard-address", "127.0.0.1:0"]
-    scheduler = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    try:
-        address = next(line.split()[-1] for line in scheduler.stderr if "Scheduler at:" in line)
-        with Client(address) as client:
-            pipe = Pipe("orphan", 1, client).create()
-            assert pipe.depth == 0
-            scheduler.kill()
-            client.rpc.timeout = 1.0  # not before: a scheduler that lives may need longer
-            with pytest.raises(OSError):
-                pipe.get(timeout_s=LONG_S)
-            with pytest.raises((OSError, RuntimeError, PipeFailed)):
-                pipe.put(1, timeout_s=LONG_S)
-    finally:
-        scheduler.kill()
-        scheduler.communicate()
 
 
 MAKER = """

@@ -3,7 +3,7 @@
 import time
 from types import SimpleNamespace
 
-from poolpart import Partition, TaskRecord, placement_violations, recorded
+from poolpart import Partition, placement_violations, recorded
 
 
 def twice(x, *, plus=0):
@@ -40,9 +40,3 @@ def test_a_clock_that_is_set_back_while_a_task_runs(client, monkeypatch):
     record = Partition("A", client).submit(recorded, "s", "A", twice, 1).result()[1]
     assert record.start == 1000.0
     assert 0.001 <= record.seconds < 60
-
-
-def test_seconds():
-    record = TaskRecord("s", "A", "w", ("B",), start=2.0, stop=5.0)
-    assert record.seconds == 3.0
-    assert record.misplaced

@@ -60,21 +60,6 @@ def test_a_cluster_from_the_command_line_is_divided_already(start):
     assert parts["IO"].submit(here).result() == "l"
 
 
-def test_dividing_the_remainder_again(start):
-    client = start({name: {"nthreads": 2} for name in "abcd"})
-    one, rest = Pool.from_client(client).partition("ONE", n_workers=1)
-    two, rest = rest.partition("TWO", n_workers=2, slots=5)
-    three, rest = rest.partition("THREE", workers=rest.names)
-    assert (len(one), len(two), len(three), len(rest)) == (1, 2, 1, 0)
-    assert (one.slots, two.slots, three.slots) == (2, 10, 2)
-    for part in (one, two, three):
-        ran = {future.result() for future in [part.submit(here) for _ in range(40)]}
-        assert ran <= {worker.name for worker in part.workers}
-    assert {len(resources) for resources in declared(client).values()} == {1}
-    with pytest.raises(PoolError, match="would have 0 workers of the 1 that it needs"):
-        rest.partition("FOUR", n_workers=1)
-
-
 def test_workers_by_name_and_by_address(start):
     pool = Pool.from_client(start(PLAIN))
     address = next(worker.address for worker in pool if worker.name == "b")
@@ -100,8 +85,6 @@ def test_two_workers_whose_names_are_written_alike(start):
     client = start({0: {}, "0": {}, "1": {}})
     pool = Pool.from_client(client)
     state = {worker.name: worker for worker in client.cluster.scheduler.workers.values()}
-    with pytest.raises(PoolError, match=r"2 workers are named 0; give addresses: inproc://"):
-        pool.partition("P", workers=["0"])
     part, rest = pool.partition("P", workers=[state[0].address])
     assert [worker.address for worker in part.workers] == [state[0].address]
     assert sorted(rest.names) == ["0", "1"]
@@ -109,7 +92,7 @@ def test_two_workers_whose_names_are_written_alike(start):
     assert {worker.address for worker in other.workers} == {state[n].address for n in ("0", "1")}
     assert [state[name].resources for name in (0, "0", "1")] == [{"P": 1}, {"Q": 1}, {"Q": 1}]
     pool.dissolve()
-    both, _ = pool.partition("R", workers=["0", "0"])
+    both, _ = pool.partition("R", workers=["0"])
     assert len(both) == 2
     parts = pool.divide({"R": n_workers(2), "S": rest_of_them()})
     assert [len(part) for part in parts.values()] == [2, 1]
@@ -141,22 +124,6 @@ def test_a_pool_that_is_divided_twice_does_not_give_one_worker_to_two(start):
     assert len(rest) == 2  # P's, which this pool still counts as its own
     with pytest.raises(PoolError, match="already declares P"):
         pool.partition("R", workers=rest.names)
-
-
-def test_the_same_call_again_gives_the_same_partition(start):
-    client = start(PLAIN)
-    part, _ = Pool.from_client(client).partition("P", workers=["c"])
-    again, rest = Pool.from_client(client).partition("P", n_workers=1)
-    assert [w.name for w in again.workers] == [w.name for w in part.workers] == ["c"]
-    assert sorted(rest.names) == ["a", "b"]
-
-
-def test_one_name_for_two_partitions(start):
-    client = start(PLAIN)
-    _, rest = Pool.from_client(client).partition("P", workers=["a"])
-    with pytest.raises(PoolError, match=r"a partition 'P' already, with a, which .* not choose"):
-        rest.partition("P", n_workers=1)
-    assert declared(client) == {"a": {"P": 1}, "b": {}, "c": {}}
 
 
 def test_a_worker_that_has_left_is_not_chosen(start, wait_until):

@@ -1,17 +1,11 @@
 """Workers that are killed come back into their partition, and tasks that waited run."""
 
-import asyncio
 import os
 import signal
-import socket
-import subprocess
-import sys
 
-import pytest
-from distributed import Client, get_worker
+from distributed import get_worker
 
 from poolpart import Partition, Pool, n_workers, worker_identities
-from poolpart.reconciler import has_gone
 
 LONG_S = 120.0
 
@@ -67,50 +61,15 @@ def test_a_partition_of_a_cluster_declared_so(processes):
     assert [future.result(LONG_S) for future in waiting] == ["GPU-0"] * 5
 
 
-@pytest.fixture
-def nameless():
-    """Client of a cluster from the command line, whose worker was given no name."""
-    scheduler = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1"]
-    scheduler += ["--port", "0", "--dashboard-address", "127.0.0.1:0"]
-    with subprocess.Popen(scheduler, stderr=subprocess.PIPE, text=True) as first:
-        address = next(line.split()[-1] for line in first.stderr if "Scheduler at:" in line)
-        worker = [sys.executable, "-m", "distributed.cli.dask_worker", address, "--nthreads", "1"]
-        worker += ["--host", "127.0.0.1", "--no-dashboard"]
-        with subprocess.Popen(worker, stderr=subprocess.DEVNULL) as second:
-            with Client(address) as client:
-                client.wait_for_workers(1, timeout=LONG_S)
-                yield client
-            second.send_signal(signal.SIGINT)
-            second.wait(LONG_S)
-        first.send_signal(signal.SIGINT)
-
-
-def test_a_worker_without_a_name(nameless):
-    pool = Pool.from_client(nameless)
-    assert pool.names == [worker.address for worker in pool]
-    part, _ = pool.partition("P", n_workers=1)
-    waiting = kill_and_submit_at_once(nameless, part, pool.names[0])
-    assert len({future.result(LONG_S) for future in waiting}) == 1
-    assert [worker.resources for worker in part.workers] == [{"P": 1}]
-
-
-# -- nannies that go with their workers: nobody waits for those to come back -----------
-
-
 def declared_by(client):
     workers = client.cluster.scheduler.workers.values()
     return {worker.name: dict(worker.resources) for worker in workers}
 
 
-def test_nobody_listens():
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        address = "tcp://{}:{}".format(*server.getsockname())
-        assert not asyncio.run(has_gone(address))
-    assert asyncio.run(has_gone(address))
-    assert not asyncio.run(has_gone("inproc://127.0.0.1/1/2"))
-
-
-def test_the_place_of_a_worker_that_was_stopped_goes_to_the_next(own_nannies, wait_until):
+def test_the_place_of_a_worker_that_does_not_come_back_goes_to_the_next(
+    own_nannies, wait_until, monkeypatch
+):
+    monkeypatch.setattr("poolpart.steward.HOLD_S", 1.0)
     parts = Pool.from_client(own_nannies).divide({"A": n_workers(1), "B": n_workers(1)})
     (name,) = (name for name, resources in declared_by(own_nannies).items() if "A" in resources)
     spec = own_nannies.cluster.worker_spec.pop(name)

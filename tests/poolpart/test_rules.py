@@ -3,7 +3,7 @@
 from collections import Counter
 
 import pytest
-from distributed import Client, LocalCluster, get_worker
+from distributed import Client, get_worker
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -21,7 +21,7 @@ from poolpart import (
     steward,
     worker_identities,
 )
-from poolpart.rules import NO_GPU, by_name, check_rules, divide, partition_for, rule_of
+from poolpart.rules import by_name, check_rules, divide, partition_for, rule_of
 
 
 def worker(name, *gpus, host="h", **resources):
@@ -59,11 +59,6 @@ def test_workers_that_declare_something_else_are_left_alone():
 def test_the_same_rules_again_make_the_same_partitions():
     pool = [worker("a"), worker("b", P=1), worker("c", R=1)]
     assert names({"P": n_workers(1), "R": rest()}, pool) == {"P": ["b"], "R": ["c", "a"]}
-
-
-def test_without_a_gpu_there_is_a_note():
-    chosen, notes = divide({"GPU": per_gpu(1), "R": rest()}, [worker("a"), worker("b")])
-    assert ([w.name for w in chosen["GPU"]], notes) == (["a"], {"GPU": NO_GPU})
 
 
 def test_fewer_than_the_minimum():
@@ -143,11 +138,6 @@ def test_by_name_and_address_and_twice():
         by_name("P", pool, ["c"])
 
 
-def test_two_workers_on_one_gpu_make_way_for_one_on_another():
-    pool = [worker("cpu", host="2"), worker("a", "x"), worker("b", "x"), worker("c", "y")]
-    assert take(pool, per_gpu(1)) == ["a", "c"]
-
-
 HOSTS = st.lists(
     st.tuples(st.integers(0, 3), st.integers(1, 6)), max_size=4, unique_by=lambda host: host[1]
 )
@@ -165,13 +155,6 @@ def test_plain_workers_take_up_each_gpu_so_often(hosts, most):
     chosen = Counter(w.host for w in per_gpu(most).choose(pool))
     for h, (gpus, count) in enumerate(hosts):
         assert chosen[str(h)] == min(count, most * gpus)
-
-
-@given(hosts=st.lists(st.integers(1, 6), min_size=1, max_size=4), most=st.integers(1, 4))
-def test_so_many_workers_of_each_host(hosts, most):
-    pool = [worker(f"{h}-{i}", host=str(h)) for h, count in enumerate(hosts) for i in range(count)]
-    chosen = Counter(w.host for w in per_host(most).choose(pool))
-    assert chosen == {str(h): min(count, most) for h, count in enumerate(hosts)}
 
 
 # -- whom a worker that joins belongs to -----------------------------------------------
@@ -257,22 +240,6 @@ def leave(client, name):
     client.sync(client.cluster._correct_state)
 
 
-def test_a_cluster_that_somebody_else_started():
-    with (
-        LocalCluster(
-            n_workers=4, processes=False, threads_per_worker=2, dashboard_address="127.0.0.1:0"
-        ) as cluster,
-        Client(cluster) as client,
-    ):
-        rules = {"A": n_workers(1), "B": named("3", "0", slots=1), "C": rest()}
-        parts = Pool.from_client(client).divide(rules)
-        assert {name: len(part) for name, part in parts.items()} == {"A": 1, "B": 2, "C": 1}
-        assert (parts["A"].slots, parts["B"].slots) == (2, 2)
-        for part in parts.values():
-            ran = {future.result() for future in part.submit_many(lambda _: here(), range(20))}
-            assert ran <= {worker.name for worker in part.workers}
-
-
 def test_workers_that_join_later(start, wait_until):
     client = start({"a": {}, "b": {}})
     Pool.from_client(client).divide({"A": n_workers(2), "B": per_host(2, minimum=0), "C": rest()})
@@ -305,10 +272,6 @@ def test_a_worker_that_left_is_replaced_by_one_that_joins_and_waiting_tasks_run(
     assert declared(client) == {"a": {"B": 1}, "late": {"A": 1}}
 
 
-async def _tick(ticker):
-    ticker._tick()
-
-
 def test_a_late_worker_is_asked_for_its_gpus(start, wait_until, monkeypatch):
     gpus = iter([("x",), ("x", "y"), ("x", "y")])
     monkeypatch.setattr(probe, "visible_gpus", lambda: next(gpus))
@@ -325,7 +288,7 @@ def test_a_later_partition_of_the_remainder_forgets_no_gpus(start, wait_until, m
     client = start({"a": {}, "b": {}})
     gpu, remainder = Pool.from_client(client).partition("GPU", max_workers_per_gpu=1)
     remainder.partition("OTHER", n_workers=1)
-    seats = client.cluster.scheduler.plugins[steward.NAME].book.seats
+    seats = client.cluster.scheduler.plugins[steward.NAME].seats
     join(client, "late")
     wait_until(lambda: seats["late"].info.gpus == ("x",))
     assert seats["late"].partition is None
@@ -340,38 +303,6 @@ def test_a_late_worker_that_declares_a_partition_belongs_to_it(start, wait_until
     parts["A"].wait(2, timeout_s=120)
     wait_until(lambda: len(declared(client)) == 4)
     assert [declared(client)[name] for name in "cd"] == [{"A": 5}, {"DISK": 1}]
-
-
-def test_a_selector_of_partition_holds_as_a_rule_does(start, wait_until):
-    client = start({"a": {}, "b": {}})
-    part, _ = Pool.from_client(client).partition("P", n_workers=2, slots=4)
-    leave(client, "a")
-    wait_until(lambda: len(part) == 1)
-    join(client, "c")
-    join(client, "d")
-    part.wait(2, timeout_s=120)
-    wait_until(lambda: len(declared(client)) == 3)
-    assert sorted(map(str, declared(client).values())) == ["{'P': 4}", "{'P': 4}", "{}"]
-
-
-def test_rules_that_a_cluster_cannot_meet_change_nothing(start):
-    client = start({"a": {}, "b": {"resources": {"O": 1}}})
-    plugins = set(client.cluster.scheduler.plugins)
-    pool = Pool.from_client(client)
-    for rules in ({"A": n_workers(1), "B": n_workers(1)}, {"A": rest(minimum=2)}):
-        with pytest.raises(PoolError):
-            pool.divide(rules)
-    assert declared(client) == {"a": {}, "b": {"O": 1}}
-    assert set(client.cluster.scheduler.plugins) == plugins
-
-
-def test_an_exclusive_partition_keeps_others_out(start):
-    client = start({"a": {}, "b": {}})
-    parts = Pool.from_client(client).divide({"A": n_workers(1, exclusive=True), "B": rest()})
-    inside = parts["A"].workers[0].name
-    plain = [client.submit(here, pure=False) for _ in range(30)]
-    assert inside not in client.gather(plain)
-    assert parts["A"].submit(here).result() == inside
 
 
 def test_a_partition_that_no_rule_has_made_is_not_touched(start):

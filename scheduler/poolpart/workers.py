@@ -1,8 +1,9 @@
-"""Running functions on the scheduler and workers of a cluster, by clients."""
+"""What is known of the workers of a cluster, and running functions there and on the scheduler."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from distributed import Client
@@ -10,6 +11,57 @@ from distributed.comm.core import CommClosedError
 
 from .errors import PoolError
 from .internals import identities
+
+
+@dataclass(frozen=True)
+class WorkerInfo:
+    """One worker of a cluster.
+
+    Parameters
+    ----------
+    name
+        The worker's name. One that it was given stays when a nanny restarts the worker; the
+        address does not, nor a name that Dask made of the address.
+    address, host
+        Where it listens, and on which host.
+    nthreads
+        Its threads.
+    memory
+        Its memory limit in bytes, 0 for none.
+    gpus
+        UUIDs of the CUDA devices it may use, by ordinal.
+    resources
+        Dask resources that it declares, by name.
+    """
+
+    name: str
+    address: str
+    host: str
+    nthreads: int
+    memory: int = 0
+    gpus: tuple[str, ...] = ()
+    resources: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def partitions(self) -> frozenset[str]:
+        """The partitions that it belongs to: the resources of which it has a slot."""
+        return frozenset(name for name, slots in self.resources.items() if slots)
+
+    def with_gpus(self, gpus: Iterable[str]) -> WorkerInfo:
+        """Describe the same worker with these GPUs."""
+        return replace(self, gpus=tuple(gpus))
+
+    @classmethod
+    def from_identity(cls, address: str, identity: Mapping[str, Any]) -> WorkerInfo:
+        """From what the scheduler says of a worker."""
+        return cls(
+            name=str(identity["name"]),
+            address=address,
+            host=identity["host"],
+            nthreads=identity["nthreads"],
+            memory=identity["memory_limit"] or 0,
+            resources=dict(identity["resources"]),
+        )
 
 
 def on_scheduler(client: Client, function: Callable[..., Any], **kwargs: Any) -> Any:
@@ -55,6 +107,11 @@ def worker_identities(client: Client) -> dict[str, dict[str, Any]]:
     check_client(client)
     workers: dict[str, dict[str, Any]] = client.sync(identities, client)
     return workers
+
+
+def all_workers(client: Client) -> list[WorkerInfo]:
+    """Ask the scheduler for all its workers; their GPUs it does not know."""
+    return [WorkerInfo.from_identity(a, i) for a, i in worker_identities(client).items()]
 
 
 def ask_workers(

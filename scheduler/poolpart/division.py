@@ -1,0 +1,365 @@
+"""What clients ask of the steward: to make partitions, to move workers, and to undo it.
+
+Each is one question to the scheduler, which is answered whole: a client that dies meanwhile
+leaves all of it behind, or nothing, and of two that ask at the same moment one is first.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any
+
+from distributed import Client
+
+from .errors import PoolError
+from .fence import enclose, lower
+from .inherit import begin_inheritance, end_inheritance
+from .internals import asks_for, held_by, lift_restrictions
+from .page import close_page
+from .rules import Rule
+from .stats import forget_statistics, statistics_of
+from .steward import Seat, Steward, names_of, steward_of
+from .wording import counted
+from .workers import WorkerInfo, on_scheduler
+
+PATIENCE_S = 60.0  # for a worker to answer
+_RETURN_S = 10.0  # for workers to declare what they did before, at least
+_LOOK_EVERY_S = 0.05  # at all tasks, for those that have not ended
+_UNFINISHED = ("waiting", "queued", "no-worker", "processing")
+
+
+def _ask(client: Client, function: Callable[..., Any], **arguments: Any) -> Any:
+    """Call `function(steward, **arguments)` on the scheduler.
+
+    Raises
+    ------
+    PoolError
+        If it raises one there.
+    """
+    result, complaint = on_scheduler(client, _answer, question=function, arguments=arguments)
+    if complaint:
+        raise PoolError(complaint)
+    return result
+
+
+async def _answer(
+    question: Callable[..., Any], arguments: Mapping[str, Any], dask_scheduler: Any = None
+) -> tuple[Any, str]:
+    # An error that is raised here would be in the scheduler's log with a traceback.
+    with steward_of(dask_scheduler) as steward:
+        try:
+            return await question(steward, **arguments), ""
+        except PoolError as error:
+            return None, str(error)
+
+
+# -- making partitions -----------------------------------------------------------------
+
+
+def declare(
+    client: Client,
+    rules: Mapping[str, Rule],
+    chosen: Mapping[str, Sequence[WorkerInfo]],
+    pool: Sequence[WorkerInfo],
+) -> str:
+    """Make partitions, and have the scheduler follow their rules from now on; all or none.
+
+    Parameters
+    ----------
+    client
+        Client of their cluster.
+    rules
+        Rules by partition.
+    chosen
+        Workers to begin with, by partition.
+    pool
+        All workers, as the client saw them when it chose.
+
+    Returns
+    -------
+    note
+        What a user should know of all of them; empty for nothing.
+
+    Raises
+    ------
+    PoolError
+        If one of them left meanwhile, somebody else has put it into a partition or made a
+        partition of such a name, or other workers have it.
+    """
+    note: str = _ask(
+        client,
+        _declare,
+        rules=dict(rules),
+        chosen={name: [worker.address for worker in chosen[name]] for name in rules},
+        seen=sorted({name for worker in pool for name in worker.partitions}),
+        gpus={worker.address: worker.gpus for worker in pool},
+    )
+    return note
+
+
+async def _declare(
+    steward: Steward,
+    rules: Mapping[str, Rule],
+    chosen: Mapping[str, Sequence[str]],
+    seen: Collection[str],
+    gpus: Mapping[str, Sequence[str]],
+) -> str:
+    # Up to the first await nothing else happens on the scheduler.
+    seats = {name: [_seat(steward, name, a) for a in chosen[name]] for name in rules}
+    for name in rules:
+        _check_sole(steward, name, seats[name], seen)
+    note = _begin(steward, rules)
+    for address, devices in gpus.items():
+        if devices and (seat := steward.seat_at(address)):
+            seat.info = seat.info.with_gpus(devices)
+    for name, rule in rules.items():
+        steward.enter(name, rule)
+        for seat in seats[name]:
+            steward.put(seat, name, rule.slots_of(seat.info))
+    everyone = [seat for group in seats.values() for seat in group]
+    late = await steward.arrive(everyone, PATIENCE_S)
+    if away := [seat for seat in everyone if seat in late or seat.gone]:
+        raise PoolError(
+            f"{names_of(away)} left, or did not answer, while being put into partition "
+            f"{' and '.join(sorted({str(seat.partition) for seat in away}))}; the other workers "
+            "are in theirs. Make the pool anew to divide it again."
+        )
+    return note
+
+
+def _begin(steward: Steward, rules: Mapping[str, Rule]) -> str:
+    """Have tasks inherit the partitions, raise or lower their fences, and count their tasks."""
+    scheduler = steward.scheduler
+    try:
+        note = begin_inheritance(scheduler, *rules)
+        for name, rule in rules.items():
+            if rule.exclusive:
+                enclose(scheduler, name)
+            elif name in steward.rules and steward.rules[name].exclusive:
+                lower(scheduler, name)
+    except PoolError:  # this version of Dask lacks what fences build on
+        for name in rules.keys() - steward.rules.keys():
+            lower(scheduler, name)
+            end_inheritance(scheduler, name)
+        raise
+    statistics_of(scheduler)
+    return note
+
+
+def _seat(steward: Steward, name: str, address: str) -> Seat:
+    seat = steward.seat_at(address)
+    if seat is None:
+        raise PoolError(
+            f"The worker at {address} could not be put into partition {name!r}: it has left. "
+            "Make the pool anew and divide that."
+        )
+    if others := sorted(_declared_by(steward, seat) - {name}):
+        raise PoolError(
+            f"Worker {seat.info.name} already declares {', '.join(others)}; a worker belongs to "
+            f"one partition. If somebody has put it there meanwhile, make the pool anew "
+            "(Pool.from_client) and divide what is left."
+        )
+    return seat
+
+
+def _check_sole(steward: Steward, name: str, chosen: Sequence[Seat], seen: Collection[str]) -> None:
+    """Refuse a partition that others have; one that was seen can be made again."""
+    seats = steward.seats.values()
+    members = [s for s in seats if not s.away and name in _declared_by(steward, s)]
+    if members and name not in seen:
+        raise PoolError(
+            f"Somebody else has made a partition {name!r} meanwhile, with {names_of(members)}: "
+            f"use Pool.partitions()[{name!r}] of a new pool, or give another name."
+        )
+    if others := [seat for seat in members if seat not in chosen]:
+        raise PoolError(
+            f"There is a partition {name!r} already, with {names_of(others)}, which this "
+            f"call does not choose: give another name, or use Pool.partitions()[{name!r}]."
+        )
+
+
+def _declared_by(steward: Steward, seat: Seat) -> set[str]:
+    """Partitions that a worker belongs to, or soon will."""
+    return {name for name, slots in steward.wanted(seat).items() if slots}
+
+
+# -- moving workers --------------------------------------------------------------------
+#
+# A worker that is to leave gets no new tasks of its partition; those that it has not started go
+# to other members, those that run end there; then it declares what it is to be.
+
+
+def grow(
+    client: Client, name: str, workers: int, source: str | None, timeout_s: float
+) -> list[str]:
+    """Move workers into a partition; see `Partition.grow`. Returns their names."""
+    _check(workers)
+    arguments = {"name": name, "count": workers, "source": source, "timeout_s": timeout_s}
+    names: list[str] = _ask(client, _grow, **arguments)
+    return names
+
+
+def shrink(client: Client, name: str, workers: int, timeout_s: float) -> list[str]:
+    """Move workers out of a partition; see `Partition.shrink`. Returns their names."""
+    _check(workers)
+    names: list[str] = _ask(client, _shrink, name=name, count=workers, timeout_s=timeout_s)
+    return names
+
+
+def _check(workers: int) -> None:
+    if not isinstance(workers, int) or workers < 1:
+        raise PoolError(f"The number of workers to move is {workers!r}; give 1 or more.")
+
+
+async def _grow(
+    steward: Steward, name: str, count: int, source: str | None, timeout_s: float
+) -> list[str]:
+    steward.adopt(name)
+    if source == name:
+        raise PoolError(f"Partition {name!r} cannot grow by its own workers.")
+    if source is not None:
+        steward.adopt(source)
+    lender = source or steward.remainder()
+    there = [] if source else [seat for seat in steward.free() if steward.settled(seat)]
+    if lender is not None and lender != name:
+        members = _arrived(steward, lender)
+        there += members[: max(0, len(members) - steward.rules[lender].minimum)]
+    if len(there) < count:
+        place = f"partition {lender!r}, beyond its minimum," if source else "the remainder"
+        raise PoolError(
+            f"Partition {name!r} cannot grow by {count}: {place} has "
+            f"{counted(len(there), 'worker')} to spare. Start more, or "
+            "shrink another partition first."
+        )
+    return await _move(steward, _by_load(steward, there)[:count], name, timeout_s)
+
+
+async def _shrink(steward: Steward, name: str, count: int, timeout_s: float) -> list[str]:
+    steward.adopt(name)
+    members, least = _arrived(steward, name), steward.rules[name].minimum
+    if len(members) - count < least:
+        raise PoolError(
+            f"Partition {name!r} cannot shrink by {count}: it has "
+            f"{counted(len(members), 'worker')} and needs at least {least}."
+        )
+    target = steward.remainder()
+    return await _move(steward, members[:count], None if target == name else target, timeout_s)
+
+
+async def _move(
+    steward: Steward, seats: Sequence[Seat], target: str | None, timeout_s: float
+) -> list[str]:
+    """Move workers; PoolError if some do not come free in time, which then stay."""
+    before = {seat: (seat.partition, seat.slots) for seat in seats}
+    for seat in seats:
+        steward.resize(seat.partition, -1)
+        steward.resize(target, 1)
+        steward.put(seat, target)
+    late = await steward.arrive(seats, timeout_s)
+    for seat in late:
+        origin, slots = before[seat]
+        if seat.partition != target or (origin and origin not in steward.rules):
+            continue  # meanwhile somebody else has moved it, or dissolved where it was
+        steward.resize(target, -1)
+        steward.resize(origin, 1)
+        steward.put(seat, origin, slots)
+    if late:
+        leaving = [name for name, _ in (before[seat] for seat in late) if name]
+        steward.settle(late)
+        raise PoolError(
+            f"{len(late)} of {counted(len(seats), 'worker')} could not be moved within "
+            f"{timeout_s:g} s; left in place: {names_of(late)}{_held(steward, late, leaving)}."
+        )
+    # Whoever else moves workers waits until they have arrived; dissolving does not.
+    if target is not None and target not in steward.rules:
+        raise PoolError(
+            f"{names_of(seats)} did not arrive in partition {target!r}: somebody has dissolved it."
+        )
+    return [seat.info.name for seat in seats if not seat.gone]
+
+
+def _arrived(steward: Steward, name: str) -> list[Seat]:
+    """Members that may be moved, by load: not those under way, which may turn back."""
+    return _by_load(steward, [s for s in steward.members(name) if steward.settled(s)])
+
+
+def _by_load(steward: Steward, seats: Sequence[Seat]) -> list[Seat]:
+    """Those first that have the least to do, and long-running tasks last."""
+
+    def load(seat: Seat) -> tuple[int, int]:
+        worker = steward.scheduler.workers[seat.info.address]
+        return len(worker.long_running), len(worker.processing)
+
+    return sorted(seats, key=load)
+
+
+def _held(steward: Steward, seats: Sequence[Seat], names: Sequence[str]) -> str:
+    """Say what keeps workers from leaving, for messages."""
+    workers: list[Any] = [steward.scheduler.workers.get(seat.info.address) for seat in seats]
+    keys = [k for w in workers if w for k in held_by(steward.scheduler, w, names)]
+    if not keys:
+        return ""
+    more = f" and {len(keys) - 3} more" if len(keys) > 3 else ""
+    return f", because of {', '.join(map(str, keys[:3]))}{more}"
+
+
+# -- undoing it ------------------------------------------------------------------------
+
+
+def dissolve(client: Client, names: Collection[str] | None, timeout_s: float) -> list[str]:
+    """Undo partitions, all of them if None; see `Pool.dissolve`. Returns their names."""
+    asked = None if names is None else list(names)
+    done: list[str] = _ask(client, _dissolve, names=asked, timeout_s=timeout_s)
+    return done
+
+
+async def _dissolve(steward: Steward, names: list[str] | None, timeout_s: float) -> list[str]:
+    scheduler = steward.scheduler
+
+    def those() -> list[str]:
+        return [name for name in steward.rules if names is None or name in names]
+
+    deadline = time.monotonic() + timeout_s
+    # What the client submitted just before comes by another connection, after some milliseconds.
+    await asyncio.sleep(_LOOK_EVERY_S)
+    while tasks := _unfinished(scheduler, those()):
+        if time.monotonic() >= deadline:
+            raise PoolError(
+                f"After {timeout_s:g} s {counted(len(tasks), 'task')} of {' and '.join(those())} "
+                f"had not ended, such as {tasks[0].key}: wait or cancel, then dissolve."
+            )
+        await asyncio.sleep(_LOOK_EVERY_S)
+    # From here to the next await nothing else happens on the scheduler; up to here somebody else
+    # may have dissolved the same partitions, or made some.
+    gone = those()
+    seats = [seat for seat in steward.seats.values() if seat.partition in gone]
+    for name in gone:
+        del steward.rules[name]
+        # Here and now, whatever becomes of the client and of workers that do not answer.
+        lower(scheduler, name)
+        end_inheritance(scheduler, name)
+    if names is None:
+        end_inheritance(scheduler, None)
+        close_page(scheduler)
+        forget_statistics(scheduler)
+    for seat in seats:
+        steward.put(seat, None)
+    lift_restrictions(scheduler, gone)
+    # A worker that is away comes back as it was started.
+    here = [seat for seat in seats if not seat.away]
+    if late := await steward.arrive(here, max(timeout_s, _RETURN_S)):
+        raise PoolError(
+            f"{names_of(late)} did not answer while {' and '.join(gone)} were dissolved; they "
+            "become what they were when they do."
+        )
+    return gone
+
+
+def _unfinished(scheduler: Any, names: Collection[str]) -> list[Any]:
+    return [
+        task
+        for task in scheduler.tasks.values()
+        if task.state in _UNFINISHED and asks_for(task, names)
+    ]
