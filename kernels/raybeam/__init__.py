@@ -4,11 +4,13 @@ from .backend import BackendUnavailable
 from .caster import RayCaster
 from .hits import Hits, ScanReturns
 from .pattern import Pattern
+from .poses import Motion
 from .registry import available_backends
 
 __all__ = [
     "BackendUnavailable",
     "Hits",
+    "Motion",
     "Pattern",
     "RayCaster",
     "ScanReturns",

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from .hits import Hits, ScanReturns
 from .mesh import local_mesh
 from .pattern import Pattern
+from .poses import Motion, Poses
 from .rays import check_rays
 from .registry import choose
 from .scan import check_scan
@@ -109,7 +110,7 @@ class RayCaster:
     def scan(
         self,
         pattern: Pattern,
-        positions: ArrayLike,
+        positions: ArrayLike | Poses,
         rotations: ArrayLike | None = None,
         *,
         window: tuple[int, int] | None = None,
@@ -119,6 +120,7 @@ class RayCaster:
         keep_every: int = 1,
         groups: ArrayLike | None = None,
         tally: bool = False,
+        motion: Motion | None = None,
     ) -> ScanReturns:
         """Cast a pattern of rays from one pose or from many: the fastest way for a lidar.
 
@@ -130,7 +132,7 @@ class RayCaster:
             Rays in the sensor's axes, checked once; the cuda backend keeps them on the device
             and turns them there.
         positions
-            (3,) or (k, 3), metres.
+            (3,) or (k, 3), metres; or poses as `check_poses` makes them, with all that follows.
         rotations
             (3, 3) or (k, 3, 3) from the sensor's axes to the mesh's; None when they are the same.
         window
@@ -148,13 +150,14 @@ class RayCaster:
             cast together. None for one group.
         tally
             Count the hits of each triangle, those that are not kept included.
+        motion
+            How the lidar moves on within each pose, where its rays do not leave at one time.
 
         Raises
         ------
         ValueError
             If a position is not finite, a rotation is none, the poses do not suffice for the
-            rays, the window's ends are no rows, there are more than 2**32 rays, or the groups
-            do not ascend from 0.
+            rays, the window's ends are no rows, or there are more than 2**32 rays.
 
         Examples
         --------
@@ -179,5 +182,6 @@ class RayCaster:
                 keep_every=keep_every,
                 groups=groups,
                 tally=tally,
+                motion=motion,
             )
         )

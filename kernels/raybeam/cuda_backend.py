@@ -2,34 +2,28 @@
 
 from __future__ import annotations
 
+import importlib.resources
 import importlib.util
 from collections.abc import Iterator
+from functools import lru_cache
 from typing import Any, ClassVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
-from . import cuda_build
 from .backend import Backend, Found
-from .cuda_module import Kernels, options
-from .cuda_results import Packer, PinnedRoom
 from .hits import ScanReturns
-from .layout import Layout, lay_out
-from .memory import require
+from .layout import lay_out
 from .mesh import LocalMesh
 from .pattern import Pattern
+from .poses import Poses
 from .rays import Rays
 from .scan import Collector, Scan
 
+_BLOCK = 128  # threads; the kernels are bound to it
 _STACK_STEP = 32
 _MOST_INT = (1 << 31) - 1  # rays of a pose, as intersect.cu is told: more than a chunk has
-_KEEP = 1 << 30  # bytes of hits that wait on the device, at most
-# Bytes left free for a chunk of rays and for the walk's stacks, of which each resident thread has
-# one: 2048 for each of 132 multiprocessors, 64 places of 8 bytes, are 138 MB.
-_WORK = 3 << 28
-_LAYOUT_BYTES = 330  # on the host a triangle, at the peak of a build by NumPy, the mesh apart
-_TABLE_BYTES = 124  # on the device a triangle in the finished tables, the nodes apart
 
 
 class CudaBackend(Backend):
@@ -40,13 +34,15 @@ class CudaBackend(Backend):
     the call used. What outlives a call, tables and patterns, is waited for when it is made, so
     threads with streams of their own may use it. All calls switch to the caster's device and
     back, whatever device the thread is on.
+
+    The tree is NumPy's (layout.py). To build it on the device as well took as much code as the
+    walk, and spares a worker two seconds for each million triangles, once.
     """
 
     name: ClassVar[str] = "cuda"
     # Rays: some 430 MB on the device. The grid, the sums of hits and the places in a chunk's
     # arrays are far from 2**31 with it; only the number of a ray needs 64 bits.
     chunk: ClassVar[int] = 1 << 22
-    device_build: ClassVar[int] = 4096  # triangles from which the device builds the tree faster
 
     @classmethod
     def missing(cls) -> str:
@@ -78,16 +74,14 @@ class CudaBackend(Backend):
         super().__init__(mesh, threads, device)
         self._cupy = cupy = self._library()
         self._device = _device(cupy, device)
+        made = lay_out(mesh)
         with self._device:
-            tables = self._built()
             # In steps, so that scenes share what is compiled.
-            self._stack = -(-max(tables.stack, 1) // _STACK_STEP) * _STACK_STEP
-            self._kernels = Kernels(cupy, self._device.id, "intersect.cu", flags(self._stack))
-            self._keep = max(0, min(_KEEP, (self._free() - _WORK) // 4))
-            cupy.cuda.get_current_stream().synchronize()
-        self._corners, self._faces, self._frame = tables.corners, tables.faces, tables.frame
-        self._scene = (tables.nodes, tables.triangles, tables.corners, tables.faces, tables.frame)
-        self._room = PinnedRoom(cupy)
+            stack = -(-max(made.stack, 1) // _STACK_STEP) * _STACK_STEP
+            self._module = _compiled(cupy, self._device.id, flags(stack))
+            given = (made.nodes, made.triangles, made.corners, made.faces, made.frame)
+            self._scene = tuple(_sent(cupy, table) for table in given)
+        _, _, self._corners, self._faces, self._frame = self._scene
         # {pattern: its directions on the device, and its origins if it has any}
         self._patterns: WeakKeyDictionary[Pattern, tuple[Any, ...]] = WeakKeyDictionary()
 
@@ -106,112 +100,111 @@ class CudaBackend(Backend):
             table = (cp.asarray(rays.origins), stride, cp.asarray(rays.directions))
             limits = (np.float64(t * self._mesh.scale) for t in (rays.t_min, rays.t_max))
             t, place = self._cast("cast_table", n, (*table, np.int64(n), *limits))
-            ray, *hits = self._packer().add(t, place, 0, 1.0)
+            ray, *hits = self._packed(t, place, 1.0)
             u, v = cp.empty(len(ray)), cp.empty(len(ray))
             given = (self._corners, self._frame, *table, ray, place, np.int64(len(ray)))
-            self._kernels.run("weigh_table", len(ray), *given, u, v)
+            self._run("weigh_table", len(ray), *given, u, v)
             return Found(*(array.get() for array in (ray, *hits, u, v)))
 
     def scan(self, scan: Scan) -> ScanReturns:
         """See `Backend.scan`; the rays are made on the device, hits are chosen on the host."""
-        with self._device:
-            packer = self._packer()
-            for start, n, rays in self._made(scan):
-                packer.add(*self._cast("cast_pattern", n, rays), start, self._mesh.scale)
-            ray, distance, triangle = packer.returns()
         collector = Collector(scan, self._mesh.face_count)
-        collector.tally(triangle)
-        kept = collector.keep(ray, 0, len(scan))
-        collector.add(0, ray[kept], distance[kept], triangle[kept])
+        with self._device:
+            for start, n, rays in self._made(scan):
+                found = self._packed(*self._cast("cast_pattern", n, rays), self._mesh.scale)
+                ray, distance, triangle = (array.get() for array in found)
+                collector.tally(triangle)
+                kept = collector.keep(ray, start, start + n)
+                collector.add(start, ray[kept], distance[kept], triangle[kept])
         return collector.result()
-
-    # ---- the scene ----
-
-    def _built(self) -> Layout:
-        """Build the tables on the device where that is faster, and where there is memory for it.
-
-        Raises MemoryError if even the finished tables do not fit the device, or their making the
-        host.
-        """
-        cupy, mesh, there = self._cupy, self._mesh, self._free()
-        n = len(mesh.corners)
-        if n >= self.device_build and cuda_build.BYTES * n + _WORK <= there:
-            tables = cuda_build.build(cupy, self._device.id, mesh)
-            cupy.get_default_memory_pool().free_all_blocks()  # several times what is kept
-            return tables
-        need = _TABLE_BYTES * n + _WORK
-        if need > there:  # before NumPy builds for minutes
-            raise MemoryError(
-                f"The mesh needs {need / 2**20:.0f} MiB on the CUDA device and "
-                f"{there / 2**20:.0f} MiB are free: use a smaller mesh or backend 'embree'."
-            )
-        require(_LAYOUT_BYTES * n, f"The tree over {n:,} triangles")
-        made = lay_out(mesh)
-        given = (made.nodes, made.triangles, made.corners, made.faces, made.frame)
-        nodes, triangles, corners, faces, frame = (_sent(cupy, table) for table in given)
-        return Layout(nodes, triangles, corners, faces, frame, made.stack)
-
-    def _free(self) -> int:
-        """Bytes that can be had on the device."""
-        pool = self._cupy.get_default_memory_pool()
-        return int(self._cupy.cuda.runtime.memGetInfo()[0] + pool.free_bytes())
-
-    # ---- casts ----
 
     def _made(self, scan: Scan) -> Iterator[tuple[int, int, tuple[Any, ...]]]:
         """Chunks of a scan: number of the first ray, how many, and arguments for cast_pattern."""
         cp, poses, unused = self._cupy, scan.poses, np.zeros(1)
         limits = [np.float64(t * self._mesh.scale) for t in (scan.t_min, scan.t_max)]
         shifted, turned = scan.pattern.origins is not None, poses.rotations is not None
-        resident = self._resident(scan.pattern)
+        tables, rows = self._resident(scan.pattern), len(scan.pattern)
         for start, stop in scan.chunks(self.chunk):
             n = stop - start
-            tables, rows, first = resident, len(scan.pattern), (scan.first + start)
-            if tables is None:
-                row = (first + np.arange(n)) % rows
-                tables = tuple(cp.asarray(t.take(row, axis=1)) for t in _tables(scan.pattern))
-                rows, first = n, 0
             pose, skip = divmod(start, poses.rays)
             span = slice(pose, -(-stop // poses.rays))
             matrices = unused if poses.rotations is None else poses.rotations[span]
             places = [
                 cp.asarray(np.ascontiguousarray(a)) for a in (poses.positions[span], matrices)
             ]
+            motion = self._motion(poses, span)
             counts = (min(number, _MOST_INT) for number in (poses.rays - skip, poses.rays))
             flags = (np.int32(flag) for flag in (*counts, turned, shifted))
-            given = (*places, tables[0], tables[-1], np.int64(rows), np.int64(first % rows))
-            yield start, n, (*given, *flags, np.int64(n), *limits)
+            window = (np.int64(rows), np.int64((scan.first + start) % rows))
+            given = (*places, tables[0], tables[-1], *window)
+            yield start, n, (*given, *flags, *motion, np.int64(n), *limits)
 
-    def _resident(self, pattern: Pattern) -> tuple[Any, ...] | None:
-        """Directions and origins of a pattern on the device, if there is room for all of them."""
-        cupy, kept = self._cupy, self._patterns.get(pattern)
+    def _motion(self, poses: Poses, span: slice) -> tuple[Any, ...]:
+        """Arguments for cast_pattern: delays, rates of some poses, and whether there are any."""
+        cp, motion = self._cupy, poses.motion
+        if motion is None:
+            return cp.asarray(np.zeros(1)), cp.asarray(np.zeros(1)), np.int32(0)
+        rates = np.concatenate([motion.velocities[span], motion.rates[span]], axis=1)
+        return cp.asarray(motion.delays), cp.asarray(rates), np.int32(1)
+
+    def _resident(self, pattern: Pattern) -> tuple[Any, ...]:
+        """Directions and origins of a pattern on the device, (3, n) each, one row an axis."""
+        kept = self._patterns.get(pattern)
         if kept is None:
-            tables = _tables(pattern)
-            if sum(table.nbytes for table in tables) + self._keep + _WORK > self._free():
-                return None
+            given = (pattern.directions, pattern.origins)
             # Two threads may both come here: then the second copy is kept, and both are right.
-            kept = self._patterns[pattern] = tuple(_sent(cupy, table) for table in tables)
+            kept = self._patterns[pattern] = tuple(
+                _sent(self._cupy, table.T) for table in given if table is not None
+            )
         return kept
-
-    def _packer(self) -> Packer:
-        return Packer(self._cupy, self._kernels, self._faces, self._room, self._keep)
 
     def _cast(self, kernel: str, n: int, rays: tuple[Any, ...]) -> tuple[Any, Any]:
         """Local distance and place of the closest hit of each ray, on the device."""
         t, place = self._cupy.empty(n), self._cupy.empty(n, np.int32)
-        self._kernels.run(kernel, n, *self._scene, *rays, t, place)
+        self._run(kernel, n, *self._scene, *rays, t, place)
         return t, place
 
+    def _packed(self, distance: Any, place: Any, scale: float) -> tuple[Any, Any, Any]:
+        """Close up the results of a cast on the device; distances are divided by `scale`.
 
-def _tables(pattern: Pattern) -> tuple[NDArray[np.float64], ...]:
-    """Directions of a pattern and its origins, if it has any: (3, n) each, one row an axis."""
-    given = (pattern.directions, pattern.origins)
-    return tuple(table.T for table in given if table is not None)
+        Returns numbers of the rays that hit, distances, and the caller's triangles.
+        """
+        cp, n = self._cupy, len(place)
+        # Closed up by sums in ray order, not by atomics: the same bytes on every run.
+        ends = cp.cumsum(place >= 0, dtype=np.int32) if n else place
+        hits = int(ends[-1]) if n else 0
+        ray, metres, triangle = (cp.empty(hits, d) for d in (np.uint32, np.float64, np.int32))
+        given = (self._faces, distance, place, ends, np.int64(n), np.float64(scale))
+        self._run("pack", n, *given, ray, metres, triangle)
+        return ray, metres, triangle
+
+    def _run(self, kernel: str, threads: int, *arguments: Any) -> None:
+        """Launch a kernel with one thread an item; nothing happens when there are none.
+
+        A grid has one dimension, of fewer than 2**31 blocks: room for 2**38 items.
+        """
+        if threads:
+            grid = (-(-threads // _BLOCK),)
+            self._module.get_function(kernel)(grid, (_BLOCK,), arguments)
+
+
+def source() -> str:
+    """Text of intersect.cu, with its name for the compiler's messages."""
+    text = importlib.resources.files(__package__).joinpath("intersect.cu").read_text("utf-8")
+    return f'#line 1 "intersect.cu"\n{text}'
 
 
 def flags(stack: int) -> tuple[str, ...]:
     """Compiler options of intersect.cu; `stack` is the most nodes that may wait in a walk."""
-    return options(STACK=stack)
+    return "-std=c++17", "-fmad=false", f"-DSTACK={stack}"
+
+
+@lru_cache(maxsize=64)
+def _compiled(cupy: Any, device: int, flags: tuple[str, ...]) -> Any:
+    """Compile the kernels for the current device, whose number is `device`, once."""
+    module = cupy.RawModule(code=source(), options=flags)
+    module.compile()
+    return module
 
 
 def _headers() -> bool:

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from .backend import Backend, Found
 from .hits import ScanReturns
-from .memory import require
 from .mesh import LocalMesh
+from .open3d_module import load_open3d
 from .rays import Rays
 from .refine import Refiner
 from .scan import Collector, Scan
@@ -35,10 +35,6 @@ _NEAR = 2.0
 # more only where the cosine between ray and normal is below some 1e-4; then a refined distance
 # beyond a limit is not believed.
 _CLEAR = 2.0**-8
-
-# A triangle, at the peak of a build, the mesh apart: some 110 of them are Embree's own, which
-# Open3D 0.20 was seen to take.
-_BYTES = 300
 
 
 @dataclass(frozen=True)
@@ -103,7 +99,7 @@ class EmbreeBackend(Backend):
         if importlib.util.find_spec("open3d") is None:
             return "Open3D is not installed: pip install open3d-cpu (Linux x86_64) or open3d"
         try:
-            import open3d  # noqa: F401
+            load_open3d()
         except (ImportError, OSError) as error:
             return (
                 f"Open3D does not load ({error}); on Debian and Ubuntu it needs the packages "
@@ -114,12 +110,9 @@ class EmbreeBackend(Backend):
     def __init__(
         self, mesh: LocalMesh, threads: int | None = None, device: int | None = None
     ) -> None:
-        import open3d
-
         super().__init__(mesh, threads, device)
-        n = len(mesh.corners)
-        require(_BYTES * n, f"Embree's tree over {n:,} triangles")
         self._threads = threads or 0  # 0: Open3D takes every core
+        open3d = load_open3d()
         self._tensor = open3d.core.Tensor.from_numpy
         points = mesh.corners.reshape(-1, 3).astype(np.float32)
         rows = np.arange(len(points), dtype=np.uint32).reshape(-1, 3)
@@ -222,7 +215,7 @@ class EmbreeBackend(Backend):
         """
         n = unit.shape[1]
         ways: Float | None = None
-        if begin > 0 or np.abs(starts.points).max() > _NEAR:
+        if begin > 0 or max(starts.points.max(), -starts.points.min()) > _NEAR:
             points = starts.of(np.arange(n))
             entry, _ = self._mesh.clip(points, unit.T)
             near = np.abs(points).max(axis=1) <= _NEAR

@@ -104,6 +104,10 @@ struct PatternRays {
     Count rows, first;
     int left, each;
     int turned, shifted;
+    // How the lidar moves on within a pose; neither is read where `moving` is 0.
+    const double* delays;  // of each ray of a pose, seconds
+    const double* rates;   // 6 a pose: metres a second, radians a second
+    int moving;
 
     __device__ __forceinline__ static void turn(
         const double* r, double x, double y, double z, double& a, double& b, double& c)
@@ -111,6 +115,18 @@ struct PatternRays {
         a = (x * r[0] + y * r[1]) + z * r[2];
         b = (x * r[3] + y * r[4]) + z * r[5];
         c = (x * r[6] + y * r[7]) + z * r[8];
+    }
+
+    // Turn a vector on: v + delay * cross(w, v).
+    __device__ __forceinline__ static void drift(
+        const double* w, double delay, double& x, double& y, double& z)
+    {
+        const double a = x + delay * (w[1] * z - w[2] * y);
+        const double b = y + delay * (w[2] * x - w[0] * z);
+        const double c = z + delay * (w[0] * y - w[1] * x);
+        x = a;
+        y = b;
+        z = c;
     }
 
     __device__ __forceinline__ Ray load(const Scene& scene, Count i) const
@@ -130,6 +146,12 @@ struct PatternRays {
         out.dy = y;
         out.dz = z;
         if (turned) turn(r, x, y, z, out.dx, out.dy, out.dz);
+        const double* rate = rates + 6 * (Count)pose;
+        double delay = 0.0;
+        if (moving) {
+            delay = delays[pose == 0 ? each - left + ray : (ray - left) % each];
+            drift(rate + 3, delay, out.dx, out.dy, out.dz);
+        }
         double at[3];
         for (int axis = 0; axis < 3; ++axis) at[axis] = positions[3 * (Count)pose + axis];
         if (shifted) {
@@ -138,10 +160,13 @@ struct PatternRays {
                 const double a = u, b = v, c = w;
                 turn(r, a, b, c, u, v, w);
             }
+            if (moving) drift(rate + 3, delay, u, v, w);
             at[0] = u + at[0];
             at[1] = v + at[1];
             at[2] = w + at[2];
         }
+        if (moving)
+            for (int axis = 0; axis < 3; ++axis) at[axis] = at[axis] + delay * rate[axis];
         place_origin(scene, at, out);
         return out;
     }
@@ -492,6 +517,7 @@ KERNEL cast_pattern(
     const double* __restrict__ positions, const double* __restrict__ rotations,
     const double* __restrict__ directions, const double* __restrict__ origins,
     Count rows, Count first, int left, int each, int turned, int shifted,
+    const double* __restrict__ delays, const double* __restrict__ rates, int moving,
     Count count, double t_min, double t_max,
     double* __restrict__ distance, int* __restrict__ place)
 {
@@ -499,7 +525,8 @@ KERNEL cast_pattern(
     if (i >= count) return;
     const Scene scene = {nodes, triangles, corners, faces, frame};
     const PatternRays rays = {positions, rotations, directions, origins, rows,
-                              first,     left,      each,       turned,  shifted};
+                              first,     left,      each,       turned,  shifted,
+                              delays,    rates,     moving};
     Closest best(t_max);
     walk(scene, rays, i, t_min, t_max, best);
     place[i] = best.place;
@@ -527,17 +554,16 @@ KERNEL weigh_table(
 // ---- hits of a cast made smaller ----
 
 // Close up hits, in ray order: number of the ray, distance in metres, the caller's triangle.
-// `ends` are the sums of hits up to each ray, itself included; the first ray's number is `first`.
+// `ends` are the sums of hits up to each ray, itself included.
 KERNEL pack(
     const int* __restrict__ faces, const double* __restrict__ distance,
-    const int* __restrict__ place, const int* __restrict__ ends, Count count, Count first,
-    double scale, unsigned int* __restrict__ ray, double* __restrict__ metres,
-    int* __restrict__ triangle)
+    const int* __restrict__ place, const int* __restrict__ ends, Count count, double scale,
+    unsigned int* __restrict__ ray, double* __restrict__ metres, int* __restrict__ triangle)
 {
     const Count i = blockIdx.x * (Count)blockDim.x + threadIdx.x;
     if (i >= count || place[i] < 0) return;
     const int k = ends[i] - 1;
-    ray[k] = (unsigned int)(first + i);
+    ray[k] = (unsigned int)i;
     metres[k] = distance[i] / scale;
     triangle[k] = faces[place[i]];
 }

@@ -8,17 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .mesh import LocalMesh
-from .tree import WideTree, build_tree, single
+from .tree import WideTree, build_tree
 
 _WIDTH = 4  # seven float4 a node: one 128-byte line
-LEAF_SIZE = 4
-UNIT = 2.0**-24  # half the distance from 1 to the next float32
-FLOOR = 1e-35  # products of tiny edges are off by less where float32 underflows to zero
+_LEAF_SIZE = 4
+_UNIT = 2.0**-24  # half the distance from 1 to the next float32
+_FLOOR = 1e-35  # products of tiny edges are off by less where float32 underflows to zero
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Tables for the device, or on it; see the head of intersect.cu for what their columns hold.
+    """Tables for the device; see the head of intersect.cu for what their columns hold.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class Layout:
 
 def lay_out(mesh: LocalMesh) -> Layout:
     """Build the tree over a mesh and flatten both."""
-    tree = build_tree(mesh.corners, _WIDTH, LEAF_SIZE)
+    tree = build_tree(mesh.corners, _WIDTH, _LEAF_SIZE)
     corners = mesh.corners[tree.order]
     return Layout(
         _nodes(tree),
@@ -83,19 +83,13 @@ def _records(corners: NDArray[np.float64]) -> NDArray[np.float32]:
     """
     first = corners[:, 0]
     edge, other = corners[:, 1] - first, corners[:, 2] - first
-    e, g = _lengths(edge), _lengths(other)
+    e, g = np.linalg.norm(edge, axis=1), np.linalg.norm(other, axis=1)
     out = np.empty((len(corners), 3, 4), np.float32)
-    out[:, 0, :3], out[:, 1, :3], out[:, 2, :3] = single(first), single(edge), single(other)
-    out[:, 0, 3] = UNIT * g * (48 + 24 * e) + FLOOR
-    out[:, 1, 3] = UNIT * e * (56 + 24 * g) + FLOOR
-    out[:, 2, 3] = UNIT * e * g * 144 + FLOOR
+    out[:, 0, :3], out[:, 1, :3], out[:, 2, :3] = first, edge, other
+    out[:, 0, 3] = _UNIT * g * (48 + 24 * e) + _FLOOR
+    out[:, 1, 3] = _UNIT * e * (56 + 24 * g) + _FLOOR
+    out[:, 2, 3] = _UNIT * e * g * 144 + _FLOOR
     return out.reshape(-1, 12)
-
-
-def _lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    x, y, z = vectors.T
-    length: NDArray[np.float64] = np.sqrt((x * x + y * y) + z * z)  # rounds as build.cu does
-    return length
 
 
 def _stack_need(tree: WideTree) -> int:

@@ -9,14 +9,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .memory import require
 from .rays import finite_rows, real_rows, refuse_rows
 from .tree import PAD
 
 TINY = 2.0**-60  # stands for a direction component of zero, so that nothing becomes 0 * inf
 
 _BLOCK = 1 << 16  # triangles that are looked at together
-_VERTEX_BYTES, _FACE_BYTES = 48, 180  # while a mesh is checked, at most
 
 
 @dataclass(frozen=True)
@@ -133,8 +131,6 @@ def _check_faces(faces: ArrayLike, vertex_count: int) -> NDArray[np.int64]:
         )
     if len(given) >= 2**28:  # triangles' places in the tree are 31 bits, of which a leaf takes 3
         raise ValueError(f"{len(given)} triangles are too many: the limit is {2**28 - 1}.")
-    need = _VERTEX_BYTES * vertex_count + _FACE_BYTES * len(given)
-    require(need, f"A mesh of {len(given):,} triangles")
     bad = np.flatnonzero(((given < 0) | (given >= vertex_count)).any(axis=1))
     if len(bad):
         raise ValueError(

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from . import triangle as exact
 from .backend import Backend, Found
-from .memory import require
 from .mesh import TINY, LocalMesh
 from .rays import Rays
 from .tree import LEAF_BITS, PAD, build_tree
@@ -30,7 +29,6 @@ Index = NDArray[np.intp]
 
 _WIDTH = 8
 _LEAF_SIZE = 4
-_BYTES = 290  # a triangle, at the peak of a build, the mesh apart
 _BLOCK = 1 << 15  # pairs: a step's arrays take about 6 MiB; smaller ones cost more calls
 _ACROSS = 4.0  # local units: more than the diagonal of any scene
 _SLACK = 2.0**-20  # on limits of distance in float32: far more than their rounding
@@ -104,8 +102,6 @@ class NumpyBackend(Backend):
         self, mesh: LocalMesh, threads: int | None = None, device: int | None = None
     ) -> None:
         super().__init__(mesh, threads, device)
-        n = len(mesh.corners)
-        require(_BYTES * n, f"The tree over {n:,} triangles")
         tree = build_tree(mesh.corners, _WIDTH, _LEAF_SIZE)
         self._nodes = len(tree.child)
         # planes[axis]: lower planes of all nodes, then upper ones: row node + side * nodes

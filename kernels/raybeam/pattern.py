@@ -7,7 +7,7 @@ from operator import index
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .poses import Poses, check_poses
+from .poses import Motion, Poses, check_poses
 from .rays import check_origins, unit_directions
 
 
@@ -68,11 +68,12 @@ class Pattern:
     def rays(
         self,
         numbers: ArrayLike,
-        positions: ArrayLike,
+        positions: ArrayLike | Poses,
         rotations: ArrayLike | None = None,
         *,
         start: int = 0,
         rays_per_pose: int | None = None,
+        motion: Motion | None = None,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Origins and directions, in the mesh's axes, of some of the rays that a scan casts.
 
@@ -83,7 +84,7 @@ class Pattern:
         ----------
         numbers
             (m,) whole numbers: rays as `ScanReturns` numbers them, from 0 at the window's start.
-        positions, rotations, rays_per_pose
+        positions, rotations, rays_per_pose, motion
             Those given to `RayCaster.scan`.
         start
             Start of the window.
@@ -108,19 +109,22 @@ class Pattern:
                 f"There are no rays {ray.min() if len(ray) else 0} to {most} after row {start} of "
                 f"a pattern with {len(self)} rows: numbers and rows start at 0."
             )
-        return self.made(first, ray, check_poses(positions, rotations, rays_per_pose, most))
+        poses = check_poses(positions, rotations, rays_per_pose, most, motion)
+        return self.made(first, ray, poses)
 
     def made(
         self, first: int, ray: NDArray[np.int64], poses: Poses
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Make checked rays; see `rays`, of which `first` is the start.
 
-        What is in the mesh's axes is rotated, then moved: ``((x a + y b) + z c) + p``.
+        What is in the mesh's axes is rotated, then moved: ``((x a + y b) + z c) + p``; and where
+        the lidar moves on within a pose, ``v + t (w x v)`` and ``p + t u`` come after each.
         """
         row = (first + ray) % max(len(self), 1)
         pose = ray // poses.rays
-        directions = poses.turned(self._directions.take(row, axis=1), pose)
+        directions = poses.drifted(poses.turned(self._directions.take(row, axis=1), pose), ray)
         at = poses.positions if len(poses) == 1 else poses.positions.take(pose, axis=0)
         if self._origins is None:
-            return at, directions
-        return poses.turned(self._origins.take(row, axis=1), pose) + at, directions
+            return poses.moved(at, ray), directions
+        turned = poses.drifted(poses.turned(self._origins.take(row, axis=1), pose), ray)
+        return poses.moved(turned + at, ray), directions

@@ -69,7 +69,8 @@ def build(low: NDArray[np.float32], high: NDArray[np.float32]) -> BinaryTree:
     rounds: list[tuple[int, int]] = []
     count = np.ones(2 * n - 1, np.int32)
     made = n
-    while len(ids) > last(n):
+    left_over = min(_MOST, max(_ENOUGH, n // 8))
+    while len(ids) > left_over:
         first, second = _partners(low, high)
         new = np.arange(made, made + len(first), dtype=np.int32)
         rounds.append((made, made + len(first)))
@@ -83,7 +84,7 @@ def build(low: NDArray[np.float32], high: NDArray[np.float32]) -> BinaryTree:
         stay = np.ones(len(ids), np.bool_)
         stay[second] = False
         low, high, ids = low[:, stay], high[:, stay], ids[stay]
-    children, upper = crown(low, high, count[ids], ids, made)
+    children, upper = _crown(low, high, count[ids], ids, made)
     left[made:], right[made:] = children.T
     for start, stop in upper:
         both = left[start:stop], right[start:stop]
@@ -92,35 +93,17 @@ def build(low: NDArray[np.float32], high: NDArray[np.float32]) -> BinaryTree:
     return BinaryTree(all_low, all_high, left, right, (*rounds, *upper))
 
 
-def last(boxes: int) -> int:
-    """How many clusters of so many boxes are left to `crown`."""
-    return min(_MOST, max(_ENOUGH, boxes // 8))
-
-
-def crown(
+def _crown(
     low: NDArray[np.float32],
     high: NDArray[np.float32],
     count: NDArray[np.int32],
     ids: NDArray[np.int32],
     made: int,
 ) -> tuple[NDArray[np.int32], list[tuple[int, int]]]:
-    """Nodes above the last clusters, the root last.
+    """Children (m - 1, 2) of the nodes above the last m clusters, the root last, and rounds.
 
-    Parameters
-    ----------
-    low, high
-        float32 (3, m): boxes of the clusters.
-    count, ids
-        int32 (m,): boxes in each cluster, and which node it is.
-    made
-        Nodes that there are already: the next one's number.
-
-    Returns
-    -------
-    children
-        int32 (m - 1, 2): of nodes `made` and on.
-    rounds
-        As in `BinaryTree`.
+    `count` and `ids` (m,) say how many boxes are in each cluster, and which node it is; `made` is
+    the number of the next node.
     """
     levels = divide(low, high, count.astype(np.float64))
     children = [np.zeros((0, 2), np.int32)]

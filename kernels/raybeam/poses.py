@@ -15,6 +15,27 @@ _SLACK = 2e-9  # on products of a rotation's rows
 
 
 @dataclass(frozen=True, eq=False)
+class Motion:
+    """How a lidar moves on while the rays of a pose leave, one after the other.
+
+    Parameters
+    ----------
+    delays
+        float64 (m,): how long after its pose's time each of the m rays of a pose leaves, seconds.
+    velocities
+        float64 (k, 3): of each pose, metres a second along the mesh's axes.
+    rates
+        float64 (k, 3): of each pose, radians a second about the mesh's axes. A vector v becomes
+        ``v + delay * cross(rate, v)``: off by (delay * rate)^2 / 2, which is 2e-9 for 36 us at
+        100 degrees a second.
+    """
+
+    delays: NDArray[np.float64]
+    velocities: NDArray[np.float64]
+    rates: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
 class Poses:
     """Poses that have been checked.
 
@@ -26,11 +47,14 @@ class Poses:
         float64 (k, 3, 3) from the sensor's axes to the mesh's; None when those are the same.
     rays
         Rays of a pose, at least 1: ray i belongs to pose ``i // rays``.
+    motion
+        Within each pose; None where the lidar stands for all of its rays.
     """
 
     positions: NDArray[np.float64]
     rotations: NDArray[np.float64] | None
     rays: int
+    motion: Motion | None = None
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -56,19 +80,49 @@ class Poses:
         if self.rotations is None:
             return vectors.T
         # One matrix for all, or one a vector: the products and sums are the same.
-        matrices = self.rotations[0] if len(self) == 1 else self.rotations.take(pose, axis=0)
+        rows = self.rotations.reshape(-1, 9).T
+        rows = rows[:, :1] if len(self) == 1 else np.ascontiguousarray(rows).take(pose, axis=1)
         x, y, z = vectors
         out = np.empty((3, len(pose))).T
         for axis in range(3):
-            a, b, c = (matrices[..., axis, other] for other in range(3))
+            a, b, c = rows[3 * axis : 3 * axis + 3]
             out[:, axis] = (x * a + y * b) + z * c
         return out
 
+    def drifted(self, vectors: NDArray[np.float64], ray: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Turn vectors (m, 3), in the mesh's axes, on by as much as their rays are late."""
+        if self.motion is None:
+            return vectors
+        delay = self.motion.delays.take(ray % self.rays)
+        x, y, z = vectors.T
+        a, b, c = self.motion.rates.take(ray // self.rays, axis=0).T
+        out = np.empty((3, len(ray))).T
+        out[:, 0] = x + delay * (b * z - c * y)
+        out[:, 1] = y + delay * (c * x - a * z)
+        out[:, 2] = z + delay * (a * y - b * x)
+        return out
+
+    def moved(self, places: NDArray[np.float64], ray: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Move places (m, 3), or (1, 3), on by as much as their rays are late."""
+        if self.motion is None:
+            return places
+        delay = self.motion.delays.take(ray % self.rays)[:, None]
+        return places + delay * self.motion.velocities.take(ray // self.rays, axis=0)
+
 
 def check_poses(
-    positions: ArrayLike, rotations: ArrayLike | None, rays_per_pose: int | None, rays: int
+    positions: ArrayLike | Poses,
+    rotations: ArrayLike | None,
+    rays_per_pose: int | None,
+    rays: int,
+    motion: Motion | None = None,
 ) -> Poses:
-    """Poses for so many rays; see `RayCaster.scan`, which tells what is what and what is raised."""
+    """Poses for so many rays; see `RayCaster.scan`, which tells what is what and what is raised.
+
+    `Poses` in place of positions have been checked before.
+    """
+    if isinstance(positions, Poses):
+        return positions
     places = real_rows("positions", positions)
     refuse_rows("Position", places, finite_rows, "finite coordinates")
     turns = None if rotations is None else _check_rotations(rotations)
@@ -93,7 +147,21 @@ def check_poses(
         np.broadcast_to(np.ascontiguousarray(places, dtype=np.float64), (count, 3)),
         None if turns is None else np.broadcast_to(turns, (count, 3, 3)),
         each,
+        None if motion is None else _check_motion(motion, count, each),
     )
+
+
+def _check_motion(motion: Motion, poses: int, rays: int) -> Motion:
+    arrays = []
+    for name, shape in (("delays", (rays,)), ("velocities", (poses, 3)), ("rates", (poses, 3))):
+        array = np.ascontiguousarray(getattr(motion, name), dtype=np.float64)
+        if array.shape != shape or not np.isfinite(array).all():
+            raise ValueError(
+                f"Motion.{name} must be {shape} finite numbers for {poses:,} poses of {rays:,} "
+                f"rays; given: {array.shape}."
+            )
+        arrays.append(array)
+    return Motion(*arrays)
 
 
 def _check_rotations(rotations: ArrayLike) -> NDArray[np.float64]:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .hits import Part, ScanReturns, joined
 from .pattern import Pattern
-from .poses import Poses, check_poses
+from .poses import Motion, Poses, check_poses
 from .rays import Rays, check_interval
 
 _MOST_RAYS = 1 << 32  # of a scan, for their numbers in `ScanReturns` to fit
@@ -68,7 +68,7 @@ class Scan:
 
 def check_scan(
     pattern: Pattern,
-    positions: ArrayLike,
+    positions: ArrayLike | Poses,
     rotations: ArrayLike | None = None,
     *,
     window: tuple[int, int] | None = None,
@@ -78,13 +78,9 @@ def check_scan(
     keep_every: int = 1,
     groups: ArrayLike | None = None,
     tally: bool = False,
+    motion: Motion | None = None,
 ) -> Scan:
     """Check the arguments of `RayCaster.scan`, which tells what they are and what is raised."""
-    if not isinstance(pattern, Pattern):
-        raise TypeError(
-            f"pattern must be a raybeam.Pattern, not {type(pattern).__name__}: "
-            "make one of the directions, once, by Pattern(directions)."
-        )
     start, stop = (0, len(pattern)) if window is None else map(index, window)
     if not 0 <= start <= stop or (stop > start and not len(pattern)):
         raise ValueError(
@@ -103,26 +99,12 @@ def check_scan(
         pattern,
         start % max(len(pattern), 1),
         count,
-        check_poses(positions, rotations, rays_per_pose, count),
+        check_poses(positions, rotations, rays_per_pose, count, motion),
         *check_interval(t_min, t_max),
         index(keep_every),
-        np.zeros(1, np.int64) if groups is None else _check_groups(groups, count),
+        np.zeros(1, np.int64) if groups is None else np.asarray(groups, np.int64),
         tally,
     )
-
-
-def _check_groups(groups: ArrayLike, rays: int) -> NDArray[np.int64]:
-    begins = np.asarray(groups)
-    if (
-        (begins.ndim != 1 or not len(begins) or begins.dtype.kind not in "iu")
-        or (begins[0] != 0 or begins[-1] > rays)
-        or (begins[1:] < begins[:-1]).any()
-    ):
-        raise ValueError(
-            f"groups are {begins}: expected the numbers of the rays at which groups begin, "
-            f"whole, ascending from 0 and not past the window's {rays:,} rays."
-        )
-    return begins.astype(np.int64)
 
 
 class Collector:

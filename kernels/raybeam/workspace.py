@@ -9,13 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .mesh import LocalMesh
-from .poses import Poses
+from .poses import Motion, Poses
 from .scan import Scan
 
 Float = NDArray[np.float64]
 
 # Rays that are turned together: what that takes stays in a core's level 2 cache.
 _BLOCK = 1 << 14
+_FEW = 32  # rays of a pose
 
 
 class Starts:
@@ -38,7 +39,13 @@ class Starts:
         """Look up where some rays start: (len(ray), 3), or (1, 3) when one is that of all."""
         if len(self.points) == 1:
             return self.points
-        return self.points.take((ray + self.skip) // self.rays, axis=0)
+        row = ray if self.rays == 1 else (ray + self.skip) // self.rays
+        # One axis at a time: `take` along an axis copies all points first where they are
+        # transposed, which took as long as half of Embree's cast.
+        out = np.empty((3, len(row)))
+        for axis in range(3):
+            self.points[:, axis].take(row, out=out[axis], mode="clip")
+        return out.T
 
 
 class Workspace:
@@ -60,6 +67,7 @@ class Workspace:
         # both turned.
         self._given, self._turned = np.empty((2, 2, 3, size))
         self._product = np.empty(min(size, _BLOCK))
+        self._crosses = np.empty((3, min(size, _BLOCK)))  # of a lidar that moves within a pose
         self._origin: Float | None = None  # where all rows start, if at one point
 
     def start(self, n: int, starts: Starts) -> NDArray[np.float32]:
@@ -109,29 +117,49 @@ class Workspace:
         n, poses = stop - start, scan.poses
         pose, skip = divmod(start, poses.rays)
         positions = poses.positions[pose : -(-stop // poses.rays)]
-        given = _columns(scan.pattern.directions.T, scan.first + start, self._given[0, :, :n])
+        given = self._rays(scan, scan.pattern.directions.T, start, self._given[0, :, :n])
         unit = self._turn(given, poses, start, self._turned[0, :, :n], written=True)
-        if scan.pattern.origins is None:
+        shifted, motion = scan.pattern.origins is not None, poses.motion
+        if not shifted and motion is None:
             return unit, Starts(mesh.to_local(positions), poses.rays, skip)
-        given = _columns(scan.pattern.origins.T, scan.first + start, self._given[1, :, :n])
-        moved = self._turned[1, :, :n]
-        turned = self._turn(given, poses, start, moved, written=False)
+        moved = turned = self._turned[1, :, :n]
+        if scan.pattern.origins is not None:
+            given = self._rays(scan, scan.pattern.origins.T, start, self._given[1, :, :n])
+            turned = self._turn(given, poses, start, moved, written=False)
         for at, length, number, count in _blocks(start, stop, poses.rays):
             block = slice(at, at + length)
+            product = self._product[:length].reshape(count, -1)
             for axis in range(3):
                 vectors, out = (a[axis, block].reshape(count, -1) for a in (turned, moved))
-                np.add(vectors, poses.positions[number : number + count, axis, None], out=out)
+                place = poses.positions[number : number + count, axis, None]
+                np.add(vectors if shifted else 0.0, place, out=out)
+                if motion is not None:
+                    delay = _delays(motion, poses.rays, start + at, product.shape[1])
+                    speed = motion.velocities[number : number + count, axis, None]
+                    out += np.multiply(delay, speed, out=product)
                 out -= mesh.centre[axis]  # as `to_local`
                 out *= mesh.scale
         return unit, Starts(moved.T)
+
+    @staticmethod
+    def _rays(scan: Scan, table: Float, start: int, room: Float) -> Float:
+        """Rows of a pattern (3, n) that are cast; where each pose casts all of it, (3, rays).
+
+        Those of one pose stay in a core's cache, however many poses there are; but loops over few
+        rays at a time cost more than that gains.
+        """
+        alike = table.shape[1] == scan.poses.rays >= _FEW and not scan.first
+        if alike and scan.poses.rotations is not None and room.shape[1] > table.shape[1]:
+            return table
+        return _columns(table, scan.first + start, room)
 
     def _turn(self, given: Float, poses: Poses, start: int, out: Float, *, written: bool) -> Float:
         """Turn vectors (3, n) of the rays from `start` on; `written` to the rows as directions.
 
         Returns them as (3, n): `out`, or `given` where there is nothing to turn.
         """
-        n = given.shape[1]
-        if poses.rotations is None:
+        n = out.shape[1]
+        if poses.rotations is None and poses.motion is None:
             if written:
                 self.aim(given)
             return given
@@ -139,17 +167,49 @@ class Workspace:
             block = slice(at, at + length)
             # All rays of a pose are beside each other: one row of the block a pose.
             shape = (count, -1) if count > 1 else (-1,)
-            x, y, z = (row.reshape(shape) for row in given[:, block])
             product = self._product[:length].reshape(shape)
+            if given.shape[1] == n:
+                x, y, z = (row.reshape(shape) for row in given[:, block])
+            else:  # those of one pose
+                skip = (start + at) % poses.rays
+                x, y, z = given[:, skip : skip + product.shape[-1]]
             for axis in range(3):
-                a, b, c = _factors(poses.rotations[pose : pose + count, axis])
                 total = out[axis, block].reshape(shape)
+                if poses.rotations is None:
+                    total[:] = (x, y, z)[axis]
+                    continue
+                a, b, c = _factors(poses.rotations[pose : pose + count, axis])
                 np.multiply(x, a, out=total)
                 total += np.multiply(y, b, out=product)
                 total += np.multiply(z, c, out=product)
-                if written:
+            if poses.motion is not None:
+                rates = poses.motion.rates[pose : pose + count]
+                delays = _delays(poses.motion, poses.rays, start + at, product.shape[-1])
+                self._drift(out[:, block].reshape(3, *shape), rates, delays)
+            if written:
+                for axis in range(3):
                     self._rows[block, 3 + axis] = out[axis, block]
         return out
+
+    def _drift(self, vectors: Float, rates: Float, delays: Float) -> None:
+        """Turn vectors of a block on, in place; with the operations of `Poses.drifted`."""
+        x, y, z = vectors
+        crosses, product = self._crosses[:, : x.size].reshape(3, *x.shape), self._product[: x.size]
+        product = product.reshape(x.shape)
+        a, b, c = _factors(rates)
+        for cross, (p, one, q, other) in zip(
+            crosses, ((b, z, c, y), (c, x, a, z), (a, y, b, x)), strict=True
+        ):
+            np.multiply(p, one, out=cross)
+            cross -= np.multiply(q, other, out=product)
+            cross *= delays
+        vectors += crosses
+
+
+def _delays(motion: Motion, each: int, ray: int, count: int) -> Float:
+    """Delays of the rays from `ray` on that are of its pose, at most `count`."""
+    first = ray % each
+    return motion.delays[first : first + count]
 
 
 def _factors(rows: Float) -> Any:

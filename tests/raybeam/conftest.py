@@ -1,6 +1,6 @@
 """Backends under test: the list grows with what the machine has.
 
-Beside the three real ones there is "source": the .cu files compiled for the CPU.
+Beside the three real ones there is "source": intersect.cu compiled for the CPU.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from benchmarks.cuda_scenes import grid_faces
 
-from raybeam import RayCaster, available_backends, cuda_backend, cuda_build, registry
+from raybeam import RayCaster, available_backends, cuda_backend, registry
 from raybeam.cuda_backend import CudaBackend
 
 HERE = Path(__file__).parent
@@ -51,14 +51,6 @@ class Device(nullcontext):
         pass
 
 
-class Pinned:
-    """Page-locked memory."""
-
-    def __init__(self, size):
-        self.bytes = np.empty(size, np.uint8)
-        self.ptr, self.size = self.bytes.ctypes.data, size
-
-
 KINDS = {
     np.int32: ctypes.c_int, np.int64: ctypes.c_longlong, np.float64: ctypes.c_double,
 }  # fmt: skip
@@ -73,12 +65,11 @@ def pointed(argument):
 
 
 class Kernels:
-    """Stands for CuPy's RawModule: the kernels of a .cu file, run thread by thread."""
+    """Stands for CuPy's RawModule: the kernels of intersect.cu, run thread by thread."""
 
-    libraries: ClassVar[dict[str, ctypes.CDLL]] = {}  # {name of the .cu file: compiled}
+    library: ClassVar[ctypes.CDLL]
 
     def __init__(self, code, options):
-        self.library = self.libraries[code.split('"')[1]]
         for option in options:
             if option.startswith("-DSTACK="):
                 assert int(option.partition("=")[2]) <= STACK
@@ -117,25 +108,13 @@ def poisoned(shape, dtype=np.float64):
 HOST = Module(
     RawModule=Kernels,
     asarray=lambda a: np.array(a, order="C").view(Array),
-    asnumpy=np.array,
     empty=poisoned,
-    zeros=lambda shape, dtype=np.float64: np.zeros(shape, dtype).view(Array),
-    arange=lambda n, dtype: np.arange(n, dtype=dtype).view(Array),
-    minimum=np.minimum,
-    argsort=np.argsort,
     cumsum=np.cumsum,
-    get_default_memory_pool=lambda: SimpleNamespace(
-        free_bytes=lambda: 0, free_all_blocks=lambda: None
-    ),
+    get_default_memory_pool=lambda: SimpleNamespace(free_all_blocks=lambda: None),
     cuda=SimpleNamespace(
         Device=Device,
-        PinnedMemory=Pinned,
         get_current_stream=lambda: SimpleNamespace(synchronize=lambda: None),
-        runtime=SimpleNamespace(
-            getDeviceCount=lambda: 1,
-            memGetInfo=lambda: (1 << 34, 1 << 35),
-            CUDARuntimeError=CudaError,
-        ),
+        runtime=SimpleNamespace(getDeviceCount=lambda: 1, CUDARuntimeError=CudaError),
     ),
 )
 
@@ -145,7 +124,6 @@ class SourceBackend(CudaBackend):
 
     name = "source"
     chunk = 1 << 16
-    device_build = 1
 
     @classmethod
     def missing(cls):
@@ -156,17 +134,18 @@ class SourceBackend(CudaBackend):
         return HOST
 
 
-def compiled(compiler, folder, name, flags):
-    """A .cu file made a library for the CPU."""
-    library = folder / f"{name}.so"
+def compiled(compiler, folder):
+    """intersect.cu made a library for the CPU."""
+    library = folder / "intersect.so"
+    flags = cuda_backend.flags(STACK)
     with importlib.resources.as_file(
-        importlib.resources.files("raybeam") / f"{name}.cu"
+        importlib.resources.files("raybeam") / "intersect.cu"
     ) as kernels:
         command = [
             compiler, "-O2", "-Wall", "-Werror", "-Wno-unknown-pragmas",
             "-ffp-contract=off", "-shared", "-fPIC",
             *(flag for flag in flags if flag != "-fmad=false"), f'-DSOURCE="{kernels}"',
-            "-o", str(library), str(HERE / "host" / f"{name}.cpp"),
+            "-o", str(library), str(HERE / "host" / "intersect.cpp"),
         ]  # fmt: skip
         done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -175,14 +154,11 @@ def compiled(compiler, folder, name, flags):
 
 @pytest.fixture(scope="session")
 def source_backend(tmp_path_factory):
-    """`SourceBackend`, its libraries made by g++."""
+    """`SourceBackend`, its library made by g++."""
     compiler = shutil.which("g++")
     if compiler is None:
         pytest.skip("g++ is not here to compile the kernels for the CPU")
-    folder = tmp_path_factory.mktemp("source")
-    given = {"intersect": cuda_backend.flags(STACK), "build": cuda_build.flags()}
-    for name, flags in given.items():
-        Kernels.libraries[f"{name}.cu"] = compiled(compiler, folder, name, flags)
+    Kernels.library = compiled(compiler, tmp_path_factory.mktemp("source"))
     return SourceBackend
 
 

@@ -61,6 +61,19 @@ def test_import_needs_numpy_only():
     assert done.returncode == 0, done.stderr
 
 
+def test_open3d_comes_without_its_viewers_and_whole_to_whoever_imports_it():
+    """Dash and Plotly take longer to import than all that casting and writing need."""
+    pytest.importorskip("open3d")
+    code = (
+        "import sys; from raybeam.open3d_module import load_open3d; o3d = load_open3d(); "
+        "assert not {'open3d', 'dash', 'plotly'} & set(sys.modules); "
+        "import open3d; assert open3d.t.geometry is o3d.t.geometry is load_open3d().t.geometry"
+    )
+    path = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=path)
+    assert done.returncode == 0, done.stderr
+
+
 def test_threads_of_one_process_may_share_a_caster(backend, shapes):
     from concurrent.futures import ThreadPoolExecutor
 

@@ -29,11 +29,11 @@ class Event:
         pass
 
 
+@pytest.mark.slow
 def test_runs_at_toy_size(source_backend, monkeypatch, tmp_path, capsys):
     """The whole of it, with the kernels on the CPU: the rates mean nothing, the checks do."""
     host = source_backend._library()
     cuda = SimpleNamespace(**vars(host.cuda))
-    cuda.PinnedMemoryPointer = lambda block, offset: block.bytes
     cuda.Event = Event
     cuda.get_elapsed_time = lambda start, stop: 1e3 * (stop.at - start.at)
     cuda.nvrtc = SimpleNamespace(getVersion=lambda: (0, 0))
@@ -51,7 +51,6 @@ def test_runs_at_toy_size(source_backend, monkeypatch, tmp_path, capsys):
     monkeypatch.setitem(sys.modules, "cupy", fake)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: name)
     out = tmp_path / "out.json"
-    monkeypatch.setattr(cuda_limits, "CROSSOVER", (100, 1000))
     monkeypatch.setattr(cuda_kernel.cuda_warp, "available", lambda: False)
     monkeypatch.setattr(cuda_limits.transfers, "__defaults__", (1 << 12,))
     options = ["--rays", "12800", "--triangles", "500", "--repeats", "3", "--leak-rays", "3000"]
@@ -60,9 +59,8 @@ def test_runs_at_toy_size(source_backend, monkeypatch, tmp_path, capsys):
     assert [row["scene"] for row in results["scenes"]] == ["six objects", "city 5e+02"]
     assert results["leaks"] == {"rays": 3000, "escaped": 0}
     assert results["many_rays"]["same_every_time"]
-    assert [row["triangles"] > 0 for row in results["crossover"]] == [True, True]
     for row in results["scenes"]:
-        assert row["build"]["device_ms"]["median"] > 0
+        assert row["build"]["tree_ms"] > 0
         assert row["coherent"]["rays"] == row["shuffled"]["rays"] == 12800
         assert row["coherent"]["hit_share"] == row["shuffled"]["hit_share"] > 0
         assert row["differences"]["hits"] > 0

@@ -1,24 +1,19 @@
-"""The .cu files compile for every card that is supported, and spill no registers."""
+"""intersect.cu compiles for every card that is supported, and spills no registers."""
 
 from __future__ import annotations
 
-import importlib.resources
 import re
 import shutil
 import subprocess
 
 import pytest
 
-from raybeam import cuda_backend, cuda_build
-from raybeam.cuda_module import source
+from raybeam.cuda_backend import flags, source
 
 # The oldest and the newest in the fast tests.
 CARDS = [75, 120, *(pytest.param(card, marks=pytest.mark.slow) for card in (80, 86, 89, 90, 100))]
 AS_CUPY = "-ftz=true"  # what it adds of itself
-FLAGS = {
-    "intersect.cu": (*cuda_backend.flags(64), AS_CUPY),
-    "build.cu": (*cuda_build.flags(), AS_CUPY),
-}
+FLAGS = (*flags(64), AS_CUPY)
 # Of a multiprocessor's 65,536: as many threads as the walk is meant to have under way on each.
 REGISTERS = {"cast_": 65_536 // 640, "": 65_536 // 1024}
 
@@ -31,14 +26,14 @@ def nvcc():
     return found
 
 
-def report(nvcc, folder, card, file):
+def report(nvcc, folder, card):
     """Registers, stack, and bytes of spill stores and loads of each kernel, by name."""
     known = subprocess.run([nvcc, "--list-gpu-arch"], capture_output=True, text=True).stdout
     if f"compute_{card}" not in known.split():
         pytest.skip(f"this nvcc does not know sm_{card}")
-    (folder / "kernels.cu").write_text(source(file))
+    (folder / "kernels.cu").write_text(source())
     done = subprocess.run(
-        [nvcc, *FLAGS[file], f"-arch=sm_{card}", "-cubin", "-Xptxas", "-v",
+        [nvcc, *FLAGS, f"-arch=sm_{card}", "-cubin", "-Xptxas", "-v",
          "-o", str(folder / "out.cubin"), str(folder / "kernels.cu")],
         capture_output=True, text=True,
     )  # fmt: skip
@@ -53,11 +48,10 @@ def report(nvcc, folder, card, file):
     return {name: tuple(map(int, numbers)) for name, *numbers in rows}
 
 
-@pytest.mark.parametrize("file", FLAGS)
 @pytest.mark.parametrize("card", CARDS)
-def test_compiles_without_spills(nvcc, tmp_path, card, file):
-    kernels = report(nvcc, tmp_path, card, file)
-    assert len(kernels) == source(file).count("\nKERNEL ")
+def test_compiles_without_spills(nvcc, tmp_path, card):
+    kernels = report(nvcc, tmp_path, card)
+    assert len(kernels) == source().count("\nKERNEL ")
     for name, (stack, stores, loads, registers) in kernels.items():
         assert (stores, loads) == (0, 0), name
         # The nodes that wait and nothing else: what has to be looked up is not kept there.
@@ -67,14 +61,13 @@ def test_compiles_without_spills(nvcc, tmp_path, card, file):
         assert registers <= most, name
 
 
-@pytest.mark.parametrize("file", FLAGS)
 @pytest.mark.parametrize("card", CARDS)
-def test_nvrtc_compiles_as_cupy_does(card, file):
+def test_nvrtc_compiles_as_cupy_does(card):
     cupy = pytest.importorskip("cupy", reason="CuPy is not installed")
     nvrtc = cupy.cuda.nvrtc
-    program = nvrtc.createProgram(source(file), file, (), ())
+    program = nvrtc.createProgram(source(), "intersect.cu", (), ())
     try:
-        nvrtc.compileProgram(program, (*FLAGS[file], f"-arch=sm_{card}"))
+        nvrtc.compileProgram(program, (*FLAGS, f"-arch=sm_{card}"))
     except nvrtc.NVRTCError:
         log = nvrtc.getProgramLog(program)
         if "invalid value for --gpu-architecture" in log:
@@ -83,9 +76,8 @@ def test_nvrtc_compiles_as_cupy_does(card, file):
     assert nvrtc.getCUBIN(program)
 
 
-@pytest.mark.parametrize("file", FLAGS)
-def test_no_headers(file):
-    text = (importlib.resources.files("raybeam") / file).read_text("utf-8")
+def test_no_headers():
+    text = source()
     assert "#include" not in text
     assert "INFINITY" not in text
-    assert source(file).startswith(f'#line 1 "{file}"\n')
+    assert text.startswith('#line 1 "intersect.cu"\n')

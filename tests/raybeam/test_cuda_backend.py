@@ -1,0 +1,53 @@
+"""Around the walk on a device: hits closed up in order, arrays kept until they were read."""
+
+from __future__ import annotations
+
+import weakref
+from types import SimpleNamespace
+
+import numpy as np
+
+from raybeam import Pattern
+from raybeam.mesh import local_mesh
+from raybeam.scan import check_scan
+
+
+def test_hits_stay_in_ray_order(source_backend, shapes, monkeypatch):
+    """In however many casts they were found."""
+    engine = source_backend(local_mesh(*shapes["soup"]("random")))
+    pattern = Pattern(np.random.default_rng(0).normal(size=(600, 3)))
+    scan = check_scan(pattern, [1.0, 2.0, 3.0], window=(50, 550))
+    want = engine.scan(scan)
+    for chunk in (1, 7):
+        monkeypatch.setattr(source_backend, "chunk", chunk)
+        got = engine.scan(scan)
+        assert len(got) > 50
+        assert (np.diff(got.ray) > 0).all()
+        for name in ("ray", "distance", "triangle"):
+            mine, other = getattr(got, name), getattr(want, name)
+            assert mine.dtype == other.dtype
+            np.testing.assert_array_equal(mine, other)
+
+
+def test_arrays_are_kept_until_the_device_has_read_them(source_backend, shapes, monkeypatch):
+    """Some devices read the host's memory only when the stream comes to it."""
+    mesh = local_mesh(*shapes["soup"]("random", count=3000))
+    unread, read = [], []
+
+    def synchronize():
+        read.extend(given() is not None for given in unread)
+        unread.clear()
+
+    def copy(self, values):
+        unread.append(weakref.ref(values))
+        self[...] = values
+
+    cuda = source_backend._library().cuda
+    monkeypatch.setattr(type(source_backend._library().empty(1)), "set", copy)
+    stream = SimpleNamespace(synchronize=synchronize)
+    monkeypatch.setattr(cuda, "get_current_stream", lambda: stream)
+    engine = source_backend(mesh)
+    engine.scan(check_scan(Pattern(np.eye(3)), [0, 0, 0]))
+    assert len(read) > 1
+    assert all(read)
+    assert not unread
