@@ -16,8 +16,22 @@ if TYPE_CHECKING:
     from .run.store import remove_run
     from .scan import Frame
     from .scene.scene import Scene
-    from .sensor import Beams, Pose, ScanSpec, Sensor, Spin, Survey
+    from .sensor import (
+        Beams,
+        Material,
+        Mounted,
+        Noise,
+        Optics,
+        Pose,
+        Returns,
+        ScanSpec,
+        Sensor,
+        Spin,
+        Survey,
+    )
     from .sensor.models import load_sensor
+    from .sensor.trajectory import Track
+    from .sensor.trajectory_files import load_trajectory
 
 __all__ = [
     "Beams",
@@ -25,17 +39,24 @@ __all__ = [
     "Column",
     "Frame",
     "LidarpoolError",
+    "Material",
+    "Mounted",
+    "Noise",
+    "Optics",
     "Plan",
     "Planning",
     "Pose",
     "Result",
+    "Returns",
     "ScanSpec",
     "Scene",
     "Sensor",
     "Spin",
     "Survey",
+    "Track",
     "__version__",
     "load_sensor",
+    "load_trajectory",
     "read_cloud",
     "remove_run",
     "save_cloud",
@@ -56,7 +77,21 @@ _MODULES = {
     "scan": ("Frame",),
     "scene.scene": ("Scene",),
     "sensor.models": ("load_sensor",),
-    "sensor": ("Beams", "Pose", "ScanSpec", "Sensor", "Spin", "Survey"),
+    "sensor": (
+        "Beams",
+        "Material",
+        "Mounted",
+        "Noise",
+        "Optics",
+        "Pose",
+        "Returns",
+        "ScanSpec",
+        "Sensor",
+        "Spin",
+        "Survey",
+    ),
+    "sensor.trajectory": ("Track",),
+    "sensor.trajectory_files": ("load_trajectory",),
 }
 
 

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import sysconfig
+import reprlib
 import types
 from collections.abc import Mapping, Set
 from fractions import Fraction
 from functools import cached_property, partial
-from pathlib import Path, PurePath
+from pathlib import PurePath
 from typing import Any
 
 import numpy as np
@@ -116,9 +116,7 @@ class _Digest:
         elif isinstance(thing, (types.BuiltinFunctionType, np.ufunc)):
             self._mark("builtin", getattr(thing, "__module__", ""), thing.__name__)
         elif isinstance(thing, types.ModuleType):
-            self._mark("module", thing.__name__)
-            if (source := _own_source(thing)) is not None:
-                self._mark(source.read_text("utf-8"))
+            self._mark("module", thing.__name__)  # what is in it is not looked at
         else:
             self._add_object(thing)
 
@@ -185,22 +183,6 @@ def _names(code: types.CodeType) -> list[str]:
     return sorted({*code.co_names, *(name for c in inner for name in _names(c))})
 
 
-def _own_source(module: types.ModuleType) -> Path | None:
-    """File of a module that is not installed, such as one beside a script.
-
-    Which attribute of it a function uses cannot be told, so all of its text counts. Those that
-    are installed change with their version only.
-    """
-    file = Path(getattr(module, "__file__", None) or "")
-    installed = {
-        sysconfig.get_path(kind) for kind in ("stdlib", "platstdlib", "purelib", "platlib")
-    }
-    ours = module.__name__.partition(".")[0] == _OURS
-    if ours or file.suffix != ".py" or any(file.is_relative_to(folder) for folder in installed):
-        return None
-    return file
-
-
 def _is_cached(kind: type, name: str) -> bool:
     """Whether a field is one that a cached property has left: it follows from the others."""
     return isinstance(getattr(kind, name, None), cached_property)
@@ -208,13 +190,7 @@ def _is_cached(kind: type, name: str) -> bool:
 
 def _refusal(thing: Any) -> LidarpoolError:
     return LidarpoolError(
-        f"{_short(thing)} of type {type(thing).__name__} has no fingerprint, so that a run with "
-        "it could not be told from another: keep numbers, text, arrays or dataclasses in the "
+        f"{reprlib.repr(thing)} of type {type(thing).__name__} has no fingerprint, so that a run "
+        "with it could not be told from another: keep numbers, text, arrays or dataclasses in the "
         "fields of sensors and columns."
     )
-
-
-def _short(thing: Any) -> str:
-    """Short text of a thing."""
-    text = repr(thing)
-    return text if len(text) <= 60 else f"{text[:60]}…"

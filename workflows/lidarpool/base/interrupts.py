@@ -5,17 +5,13 @@ from __future__ import annotations
 import _thread
 import os
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
 from types import FrameType
-from typing import TYPE_CHECKING, NoReturn
-
-if TYPE_CHECKING:
-    from sys import UnraisableHookArgs
+from typing import NoReturn
 
 INTERRUPTED = 130  # exit code, as shells give it to whatever Ctrl-C ended
 STOPPED = "interrupted; everything was stopped"
@@ -36,49 +32,20 @@ class _Interrupt:
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
         if self.first_at is None:
-            if _AgainIfLost.is_at_work(frame):
-                return  # raised in there it would be lost, and it comes again
+            if _is_in_del(frame):  # a little later, from a thread
+                threading.Timer(_AGAIN_S, _interrupt_main_thread).start()
+                return
             self.first_at = time.monotonic()
             raise KeyboardInterrupt
         if time.monotonic() - self.first_at > _IMPATIENT_S:
             _exit(b"lidarpool: stopped at once; workers of this machine end by themselves.\n")
 
 
-class _AgainIfLost:
-    """Has an interrupt come once more that came where Python drops what is raised.
-
-    That is while an object is let go of, in its `__del__`: those of futures run often.
-    """
-
-    def __init__(
-        self, interrupt: _Interrupt, otherwise: Callable[[UnraisableHookArgs], object]
-    ) -> None:
-        self._interrupt, self.otherwise = interrupt, otherwise
-
-    def __call__(self, lost: UnraisableHookArgs) -> None:
-        if not issubclass(lost.exc_type, KeyboardInterrupt) or self._interrupt.first_at is None:
-            self.otherwise(lost)
-            return
-        self._interrupt.first_at = None
-        # From a thread, a little later: raised in here, it would be lost again.
-        threading.Thread(target=self._interrupt_again, daemon=True).start()
-
-    @classmethod
-    def is_at_work(cls, frame: FrameType | None) -> bool:
-        """Whether a signal has come while this runs: a thread may be late to leave it."""
-        while frame is not None and frame.f_code is not cls.__call__.__code__:
-            frame = frame.f_back
-        return frame is not None
-
-    def _interrupt_again(self) -> None:
-        """Interrupt the main thread until that has heard it, or another handler has come."""
-        while True:
-            time.sleep(_AGAIN_S)
-            _interrupt_main_thread()
-            time.sleep(_AGAIN_S)
-            heard = self._interrupt.first_at is not None
-            if heard or signal.getsignal(signal.SIGINT) is not self._interrupt:
-                return
+def _is_in_del(frame: FrameType | None) -> bool:
+    """Whether an object is being let go of, as futures often are: Python drops what it raises."""
+    while frame is not None and frame.f_code.co_name != "__del__":
+        frame = frame.f_back
+    return frame is not None
 
 
 def _interrupt_main_thread() -> None:
@@ -96,11 +63,7 @@ def end_on_signals() -> None:
 
 def interrupt_on_signals() -> None:
     """Turn these signals into KeyboardInterrupt; a second one ends the process at once."""
-    interrupt, otherwise = _Interrupt(), sys.unraisablehook
-    _on_signals(interrupt)
-    if isinstance(otherwise, _AgainIfLost):  # of an earlier call
-        otherwise = otherwise.otherwise
-    sys.unraisablehook = _AgainIfLost(interrupt, otherwise)
+    _on_signals(_Interrupt())
 
 
 def _on_signals(handler: Callable[[int, FrameType | None], object]) -> None:

@@ -7,19 +7,16 @@ import shlex
 from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
-from dask.utils import format_bytes
-
-from poolpart.wording import counted
 
 from ..base.errors import LidarpoolError
-from ..run.connection import TlsFiles, connected
-from ..run.job import Job, make_job
-from ..scenario.scenario import Scenario
 from . import options
-from .terminal import shown_status
+
+if TYPE_CHECKING:
+    from ..run.connection import TlsFiles
+    from ..run.job import Job
 
 
 @click.command()
@@ -48,7 +45,11 @@ def check(
       lidarpool check scenario.yaml
       lidarpool check hall.glb --no-plan --scheduler tcp://127.0.0.1:8786 --json
     """  # noqa: D301 - click wants the character, not its name
-    from .forecast import forecast  # Matplotlib is a third of the time that --help would take
+    from ..run.connection import connected
+    from ..run.job import make_job
+    from ..scenario.scenario import Scenario
+    from .forecast import forecast
+    from .terminal import shown_status
 
     read = Scenario.load(scenario)
     job = make_job(read, backend, no_plan)
@@ -72,6 +73,10 @@ def check(
 
 def told(job: Job, found: dict[str, Any]) -> Iterator[str]:
     """Tell of a forecast in lines for people."""
+    from dask.utils import format_bytes
+
+    from poolpart.wording import counted
+
     sensor, estimate, disk = job.survey.sensor, found["estimate"], found["disk"]
     turn = f"{sensor.channels:,} a firing"
     if sensor.period is not None:
@@ -82,10 +87,21 @@ def told(job: Job, found: dict[str, Any]) -> Iterator[str]:
         f"size        {' x '.join(f'{high - low:,.2f}' for _, low, high in sides)} m; "
         + ", ".join(f"{axis} {low:,.2f} to {high:,.2f}" for axis, low, high in sides)
     )
-    yield (
-        f"survey      {counted(found['scans'], 'scan')} from {counted(found['poses'], 'pose')}, "
-        f"{found['rays']:,} rays ({turn})"
-    )
+    drive = found["drive"]
+    where = "along a trajectory" if drive else f"from {counted(found['poses'], 'pose')}"
+    several = len(job.survey.carried) > 1
+    turn = f"{len(job.survey.carried)} sensors" if several else turn
+    yield f"survey      {counted(found['scans'], 'scan')} {where}, {found['rays']:,} rays ({turn})"
+    if drive:
+        yield f"way         {drive['metres']:,.2f} m in {drive['seconds']:,.3f} s"
+        for sensor in drive["sensors"]:
+            told = f"{sensor['name'] or 'sensor':<11} {counted(sensor['firings'], 'firing')}"
+            if sensor["turns"]:
+                told += (
+                    f", {sensor['turns']:,.2f} turns; in one the carrier moves "
+                    f"{sensor['metres_a_turn']:,.3f} m"
+                )
+            yield told
     if estimate:
         yield (
             f"points      about {estimate['points']:,} of {estimate['hits']:,} hits; an estimate "

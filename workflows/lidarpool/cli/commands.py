@@ -1,35 +1,40 @@
-"""The command `lidarpool`."""
+"""The command `lidarpool`.
+
+The modules of commands import what they need within functions: help and the completion of words
+at a terminal come at once, where everything that is imported for a run takes a second.
+"""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
-from dask.utils import parse_timedelta
-
-from poolpart import Pool, PoolError
-from poolpart.probe import visible_gpus
-from poolpart.wording import counted
-from raybeam import available_backends
 
 from .._version import __version__
 from ..base.errors import LidarpoolError
-from ..base.interrupts import INTERRUPTED, STOPPED, UNTOUCHED, interrupt_on_signals
-from ..report.report import versions
-from ..run.connection import TlsFiles, connected
-from ..scan import PATIENCE_S, WAIT_S
-from ..scenario.scenario import Scenario
+from ..base.interrupts import (
+    INTERRUPTED,
+    STOPPED,
+    UNTOUCHED,
+    deferred_interrupts,
+    interrupt_on_signals,
+)
+from ..base.vocabulary import PATIENCE_S, WAIT_S
 from . import options
 from .check_command import check
-from .log_file import LOG, silence_logs
+from .logs import set_logs
 from .plot_command import plot
-from .run_command import RunOptions, run_scenario
 from .scenario_commands import init, schema
 from .scene_commands import scene
 from .sensor_command import sensors
 from .view_command import view
+
+if TYPE_CHECKING:
+    from poolpart import Pool
+
+    from ..run.connection import TlsFiles
 
 PROGRAM = "lidarpool"
 
@@ -43,9 +48,6 @@ _SHOWN = (
         "--no-stay", "stay", flag_value=False, default=True, help="With --live: end with the run."
     ),
     click.option(
-        "--page", is_flag=True, help="Add a page of partitions to Dask's dashboard, and say where."
-    ),
-    click.option(
         "--only",
         type=click.Choice(["cloud"]),
         help="Write the cloud and report.json, no pictures and no page.",
@@ -55,7 +57,7 @@ _SHOWN = (
         "--verbose",
         "-v",
         is_flag=True,
-        help=f"Keep more messages in {LOG}, in the folder of --out.",
+        help="Show what Dask and other libraries log, on stderr.",
     ),
     click.option(
         "--json", "as_json", is_flag=True, help="Print the main figures as one JSON document."
@@ -65,9 +67,10 @@ _SHOWN = (
 
 def _seconds(_: click.Context, __: click.Parameter, text: str) -> float:
     """Take a time such as 90, 90s, 10m or 2h."""
+    unit = {"s": 1, "m": 60, "h": 3600}.get(text[-1:])
     try:
-        return float(parse_timedelta(text))
-    except (KeyError, ValueError) as error:
+        return float(text[:-1]) * unit if unit else float(text)
+    except ValueError as error:
         raise click.BadParameter(f"{text!r} is no time: give a number with s, m or h.") from error
 
 
@@ -99,7 +102,7 @@ def demo(out: Path, **shown: Any) -> None:
       lidarpool demo --live
       lidarpool demo --out /tmp/demo
     """  # noqa: D301 - click wants the character, not its name
-    run_scenario(Scenario(), RunOptions(out, resumable=False, **shown))
+    _run(None, out=out, resumable=False, **shown)
 
 
 @cli.command()
@@ -149,7 +152,22 @@ def run(scenario: Path, **given: Any) -> None:
         )
     if given["resume"] and given["fresh"]:
         raise click.UsageError("--resume goes on with what --fresh drops: give one of them.")
-    run_scenario(Scenario.load(scenario), RunOptions(**given))
+    _run(scenario, **given)
+
+
+def _run(path: Path | None, **given: Any) -> None:
+    from ..base.fork_server import keep_freed_memory, start_fork_server, stop_fork_server
+
+    keep_freed_memory()
+    if not given.get("scheduler"):
+        start_fork_server()  # which imports what workers need meanwhile
+    try:
+        with deferred_interrupts():  # an extension module whose import is broken off is lost
+            from ..scenario.scenario import Scenario
+            from .run_command import RunOptions, run_scenario
+        run_scenario(Scenario.load(path) if path else Scenario(), RunOptions(**given))
+    finally:
+        stop_fork_server()
 
 
 @cli.command()
@@ -162,6 +180,13 @@ def info(scheduler: str | None, files: TlsFiles) -> None:
       lidarpool info
       lidarpool info --scheduler tcp://127.0.0.1:8786
     """  # noqa: D301 - click wants the character, not its name
+    from poolpart import Pool
+    from poolpart.probe import visible_gpus
+    from raybeam import available_backends
+
+    from ..report.report import versions
+    from ..run.connection import connected
+
     pool = None
     if scheduler is not None:
         with connected(scheduler, files) as client:
@@ -178,6 +203,8 @@ def info(scheduler: str | None, files: TlsFiles) -> None:
 
 
 def _tell_workers(pool: Pool) -> None:
+    from poolpart.wording import counted
+
     hosts = {worker.host for worker in pool}
     click.echo(f"cluster: {counted(len(pool), 'worker')} on {counted(len(hosts), 'host')}")
     for worker in sorted(pool, key=lambda worker: (sorted(worker.resources), worker.name)):
@@ -193,10 +220,10 @@ def _tell_workers(pool: Pool) -> None:
 def main(arguments: list[str] | None = None) -> NoReturn:
     """Run the command and exit: 0 done, 2 for what the user can put right, 130 interrupted."""
     interrupt_on_signals()
-    silence_logs()
+    set_logs(shown=False)
     try:
         cli.main(args=arguments, prog_name=PROGRAM, standalone_mode=False)
-    except (LidarpoolError, PoolError) as error:
+    except LidarpoolError as error:
         _die(" ".join([str(error), *_notes(error)]), 2)
     except click.UsageError as error:
         _die(error.format_message(), 2)
@@ -213,6 +240,12 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     except MemoryError as error:
         advice = "not enough memory: take a smaller scene, fewer scans or a larger keep_every."
         _die(" ".join([advice, *_notes(error)]), 2)
+    except RuntimeError as error:
+        from poolpart import PoolError
+
+        if not isinstance(error, PoolError):
+            raise
+        _die(" ".join([str(error), *_notes(error)]), 2)
     sys.exit(0)
 
 

@@ -23,20 +23,21 @@ from ..base.errors import LidarpoolError
 from ..columns.cloud import CHUNK_POINTS
 from ..report.output import ROOM_BYTES
 from ..run.checks import check_backend_here, find_workers, slots_needed
-from ..run.database import FILE
 from ..run.job import Job
 from ..run.local import default_workers
 from ..run.store import RUN_FOLDER
 from ..scan import GPU, LIDAR, OTHER
+from ..scan.database import FILE
 from ..scan.driver import BATCH_RAYS
-from ..scan.rig import PATTERN_RAYS, Rig, RigPlan
+from ..scan.echoes import PATTERN_RAYS
+from ..scan.rig import Rig, RigPlan
 from ..scenario.sections import PoolSection
 from ..scene.scene import Scene
 from ..sensor import Survey
 from .run_command import NO_HITS
 
 # Measured on Linux: a process of ours with Dask and Open3D loaded, and what a triangle takes at
-# most while a caster is built (Embree 300, NumPy 320, CUDA up to 400, there on the device).
+# most while a caster is built (Embree 300, NumPy 320, CUDA 330).
 PROCESS_BYTES = 200 << 20
 TRIANGLE_BYTES = 360
 SCENE_BYTES = 80  # of a triangle, in every process that knows the scene
@@ -44,6 +45,7 @@ RAY_BYTES = 48  # of a turn, and of the pattern made of it
 PARTICLE_BYTES = 140  # of a swarm, for each corner of its path
 PART_BYTES = 2500  # its head, and its row in the database
 SCAN_BYTES = 64  # in the driver
+WAY_POSES = 1000  # that the length of a way is measured by
 SUMMARY_BYTES = 28  # of a scan, in the database
 
 # Rays that are cast at most, whole scans of them, and the least and most scans.
@@ -128,10 +130,11 @@ def forecast(
         "can_run": not reasons,
         "reasons": reasons,
         "notes": notes,
-        "objects": len(job.scene.names),
-        "triangles": len(job.scene.faces),
+        "objects": len(job.scene.all_names),
+        "triangles": job.scene.triangles,
         "bounds": (job.scene.bounds + job.scene.origin).tolist(),
         "poses": job.survey.path.stations,
+        "drive": _drive(job.survey),
         "scans": job.survey.scan_count,
         "rays": job.survey.ray_count,
         "estimate": asdict(sample) if sample else None,
@@ -143,13 +146,38 @@ def forecast(
     }
 
 
+def _drive(survey: Survey) -> dict[str, Any] | None:
+    """Tell how far a carrier that moves goes, and what each sensor does meanwhile."""
+    if not survey.path.moves:
+        return None
+    seconds = survey.duration_ns / 1e9
+    places, _ = survey.path.poses(0, np.linspace(0, survey.duration_ns, WAY_POSES))
+    metres = float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
+    sensors = []
+    for carried, steps in zip(survey.carried, survey.steps_each, strict=True):
+        firings = carried.sensor.firings(steps - 1)[1]
+        rate_hz = getattr(carried.sensor.head, "rate_hz", None)
+        turns = rate_hz and seconds * rate_hz
+        sensors.append(
+            {
+                "name": carried.name,
+                "scans": steps * survey.path.stations,
+                "firings": firings * survey.path.stations,
+                "turns": turns,
+                "metres_a_turn": turns and metres / turns,
+            }
+        )
+    return {"seconds": seconds, "metres": metres, "sensors": sensors}
+
+
 def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> Sample:
     """Estimate hits and points of a survey by casting some of its scans, all if they are few."""
     rig = Rig(RigPlan(scene, survey, backend))
-    count = np.clip(SAMPLE_RAYS * survey.scan_count // survey.ray_count, *SAMPLE_SCANS)
+    all_rays = survey.ray_count * survey.returns.subrays
+    count = np.clip(SAMPLE_RAYS * survey.scan_count // all_rays, *SAMPLE_SCANS)
     rays = hits = points = 0
     for scan in one_of_each_part(survey.scan_count, int(count)).tolist():
-        rays += survey.scan(scan).ray_count(survey.sensor)
+        rays += survey.scan(scan).ray_count
         for found in rig.cast(scan, scan + 1):
             hits += int(found.found.hits.sum())
             points += len(found)
@@ -197,7 +225,9 @@ def _look_at_folder(out: Path) -> tuple[list[str], list[str]]:
 
 def _worker_bytes(job: Job) -> int:
     """Memory of a GPU worker."""
-    rays = min((job.survey.sensor.period or 0) * job.survey.sensor.channels, PATTERN_RAYS)
+    sensors = [carried.sensor for carried in job.survey.carried]
+    each = job.survey.returns.subrays
+    rays = sum(min((s.period or 0) * s.channels * each, PATTERN_RAYS) for s in sensors)
     triangles = (SCENE_BYTES + TRIANGLE_BYTES) * len(job.scene.faces)
     return PROCESS_BYTES + triangles + RAY_BYTES * rays
 

@@ -9,8 +9,7 @@ from typing import Any
 
 import click
 
-from ..run.connection import TlsFiles
-from ..scenario.sections import BACKENDS
+from ..base.vocabulary import BACKENDS
 
 Command = Callable[..., None]
 
@@ -34,6 +33,8 @@ def scheduler(command: Command) -> Command:
 
     @wraps(command)
     def with_files(*arguments: Any, **given: Any) -> None:
+        from ..run.connection import TlsFiles
+
         files = TlsFiles(*(given.pop(f"tls_{part}") for part in ("ca", "cert", "key")))
         if any(files) and given["scheduler"] is None:
             raise click.UsageError(

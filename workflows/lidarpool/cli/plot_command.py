@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from ..base.errors import LidarpoolError
-from ..run.picture_file import PICTURE_FILE, PICTURES, Pictured
+from ..base.vocabulary import PICTURES
 
 SIDE_LEAST, SIDE_MOST = 480, 4096  # letters need some pixels; each takes 0.4 kB of memory
 SIDES_RATIO = 2  # at most, or legends do not fit
@@ -57,14 +57,16 @@ def plot(result: Path, only: tuple[str, ...], size: tuple[int, int], out: Path |
       lidarpool plot lidarpool-out
       lidarpool plot lidarpool-out --only cloud --size 2400x1500 --out figures
     """  # noqa: D301 - click wants the character, not its name
-    # Matplotlib is a second that --help can do without.
+    from ..base.fork_server import keep_freed_memory
     from ..report.pictures import picture_makers
+    from ..run.picture_file import PICTURE_FILE, Pictured
 
     if not (result / PICTURE_FILE).exists():
         raise LidarpoolError(
             f"{result} holds no {PICTURE_FILE}, which the pictures are drawn from: give the "
             "folder of a finished run (its --out)."
         )
+    keep_freed_memory()
     makers = picture_makers(Pictured.load(result / PICTURE_FILE), result / "cloud.ply", size)
     out = result if out is None else out
     try:

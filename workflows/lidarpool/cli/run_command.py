@@ -15,7 +15,8 @@ from distributed import Client
 
 from poolpart.wording import counted
 
-from ..live import shown_on_page
+from ..base.vocabulary import PATIENCE_S, WAIT_S
+from ..report.output import result_folder, write_result
 from ..report.report import summary
 from ..run.checks import check_backend_here
 from ..run.connection import TlsFiles, connected, local_client
@@ -23,14 +24,13 @@ from ..run.job import Job, make_job
 from ..run.result import Result
 from ..run.run import Run, make_result
 from ..run.store import RUN_FOLDER, RunStore, remove_run
-from ..scan import PATIENCE_S, WAIT_S
 from ..scenario.scenario import Scenario
-from .log_file import LOG, QuietWorkers, logged_to
+from .logs import set_logs
 from .terminal import shown_progress, shown_status
+from .worker_logs import WorkerLogs
 
 if TYPE_CHECKING:
-    from ..live import LiveRun
-    from ..report.page import Recipe
+    from ..live.run_page import LiveRun
 
 NO_HITS = "no ray that was cast hit anything: look at poses, ranges and units"
 
@@ -58,7 +58,6 @@ class RunOptions:
     as_json: bool = False
     live: bool = False
     stay: bool = True
-    page: bool = False
     only: str | None = None
     parts: str | None = None
     wait_s: float = WAIT_S
@@ -73,9 +72,7 @@ def run_scenario(scenario: Scenario, options: RunOptions) -> None:
     LidarpoolError
         If something is wrong or fails; notes of the error say what was kept.
     """
-    from ..report.page import make_recipe  # with Matplotlib, a third of the time of --help
-
-    recipe = make_recipe(scenario, click.get_current_context(silent=True))
+    set_logs(options.verbose)
     if options.scheduler is None:  # before the scene is read, which may take long
         check_backend_here(options.backend or scenario.pool.backend)
     job = make_job(
@@ -89,14 +86,11 @@ def run_scenario(scenario: Scenario, options: RunOptions) -> None:
         for note in scenario.advice(job.scene):
             click.echo(f"note: {note}", err=True)
     with ExitStack() as whole, _shown_live(job, options) as live:
-        result, report, log = _simulate(scenario, job, options, live, recipe, whole)
+        result, report = _simulate(scenario, job, options, live, whole)
         if options.as_json:
-            click.echo(json.dumps(summary(options.out, report, log), indent=1, allow_nan=False))
+            click.echo(json.dumps(summary(options.out, report), indent=1, allow_nan=False))
         else:
             _tell(options.out, result, job, report["files"])
-            if log and not options.quiet:
-                name = click.format_filename(options.out / LOG)
-                click.echo(f"messages of Dask and other libraries are in {name}", err=True)
         if live is not None and options.stay:
             live.stay()
 
@@ -106,17 +100,13 @@ def _simulate(
     job: Job,
     options: RunOptions,
     live: LiveRun | None,
-    recipe: Recipe,
     whole: ExitStack,
-) -> tuple[Result, dict[str, Any], Path | None]:
-    """Do what is not done yet, and write the result; returns also the report, and the log if any.
+) -> tuple[Result, dict[str, Any]]:
+    """Do what is not done yet, and write the result; returns also the report.
 
     As soon as the result is in its place, an error or interrupt that ends `whole` says so.
     """
-    from ..report.output import result_folder, write_result
-
-    log_file = options.out.absolute() / LOG  # its name is good in workers, too
-    with result_folder(options.out), logged_to(log_file, options.verbose) as log:
+    with result_folder(options.out):
         store = _store(job, options)
 
         def in_place() -> None:
@@ -140,11 +130,11 @@ def _simulate(
                     job.scene,
                     job.survey,
                     job.planning,
-                    recipe,
+                    scenario,
                     in_place,
                     only_cloud=only_cloud,
                 )
-    return result, report, log_file if log.written else None  # which is when it was closed
+    return result, report
 
 
 @contextmanager
@@ -163,7 +153,7 @@ def _shown_live(job: Job, options: RunOptions) -> Iterator[LiveRun | None]:
     if not options.live:
         yield None
         return
-    from ..live import live_run
+    from ..live.run_page import live_run
 
     with live_run(job) as live:
         yield live
@@ -191,16 +181,12 @@ def _drive(
         cluster = _local_client(scenario, options, store.job.planning is not None)
     else:
         cluster = connected(options.scheduler, options.files)
-    with (
-        cluster as client,
-        shown_progress(options.quiet) as show,
-        shown_on_page(client, options.page, show) as show_both,
-    ):
+    with cluster as client, shown_progress(options.quiet) as show:
         tell = (lambda words: None) if options.quiet else _note
+        run = Run(client, store, tell)
         if live is None:
-            return Run(client, store, tell=tell).drive(None, show_both)
-        run = Run(client, store, live.wants_pause, tell)
-        return run.drive(live.on_frame, live.with_progress(show_both, run.partitions))
+            return run.drive(None, show)
+        return run.drive(live.on_frame, live.with_progress(show, run.partitions))
 
 
 def _note(words: str) -> None:
@@ -209,7 +195,7 @@ def _note(words: str) -> None:
 
 @contextmanager
 def _local_client(scenario: Scenario, options: RunOptions, planning: bool) -> Iterator[Client]:
-    """Client of a cluster on this machine whose workers say nothing at the terminal."""
+    """Client of a cluster on this machine, whose workers share the terminal."""
     cluster = local_client(
         gpu_workers=scenario.pool.gpu,
         collectors=scenario.pool.collectors,
@@ -220,8 +206,8 @@ def _local_client(scenario: Scenario, options: RunOptions, planning: bool) -> It
     with ExitStack() as stack:
         with shown_status("starting the workers", options.quiet):
             client = stack.enter_context(cluster)
-            log = options.out.absolute() / LOG if options.verbose else None
-            client.register_plugin(QuietWorkers(log))
+            set_logs(options.verbose)
+            client.register_plugin(WorkerLogs(options.verbose))
         yield client
 
 
@@ -232,7 +218,8 @@ def _tell(out: Path, result: Result, job: Job, files: list[str]) -> None:
         click.echo(f"note: {NO_HITS}")
     click.echo(
         f"{job.survey.scan_count:,} scans, {result.rays:,} rays, {result.hits:,} hits on "
-        f"{counted(len(job.scene.names), 'object')}, {len(result.points):,} points in the cloud "
+        f"{counted(len(job.scene.all_names), 'object')}, {len(result.points):,} points in the "
+        "cloud "
         f"({result.backend}, {result.survey_seconds:.1f} s)"
     )
     if result.plan is not None:

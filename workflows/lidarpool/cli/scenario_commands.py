@@ -9,10 +9,7 @@ from pathlib import Path
 import click
 
 from ..base.errors import LidarpoolError
-from ..scenario.schema import SCHEMA_FILE, schema_text
-from ..scenario.template import SCENARIO_FILE, scenario_template
-from ..scene.meshfile import SUFFIXES
-from ..scene.transform import UNITS_M, UP_AXES
+from ..base.vocabulary import UNITS_M
 
 
 @click.command()
@@ -34,7 +31,7 @@ from ..scene.transform import UNITS_M, UP_AXES
 )
 @click.option(
     "--up-axis",
-    type=click.Choice(list(UP_AXES)),
+    type=click.Choice(["x", "y", "z"]),
     help="Axis of these files that points up; by default what they state, else z.",
 )
 def init(folder: Path, meshes: tuple[Path, ...], unit: str | None, up_axis: str | None) -> None:
@@ -48,6 +45,9 @@ def init(folder: Path, meshes: tuple[Path, ...], unit: str | None, up_axis: str 
       lidarpool init
       lidarpool init surveys/hall --mesh hall.stl --unit mm
     """  # noqa: D301 - click wants the character, not its name
+    from ..scenario.schema import SCHEMA_FILE, schema_text
+    from ..scenario.template import SCENARIO_FILE, scenario_template
+
     if not meshes and (unit or up_axis):
         raise click.UsageError("--unit and --up-axis say how to read a mesh: name it with --mesh.")
     target = folder / SCENARIO_FILE
@@ -74,6 +74,8 @@ def init(folder: Path, meshes: tuple[Path, ...], unit: str | None, up_axis: str 
 
 def _entry(path: Path, folder: Path, unit: str | None, up_axis: str | None) -> dict[str, str]:
     """Entry of `scene.files` for a mesh file, named as seen from the scenario's folder."""
+    from ..scene.meshfile import SUFFIXES
+
     if not path.is_file() or path.suffix.lower() not in SUFFIXES:
         raise LidarpoolError(
             f"{path} is no file of a mesh format that can be read; these are: {' '.join(SUFFIXES)}."
@@ -95,4 +97,6 @@ def schema() -> None:
       lidarpool schema > scenario.schema.json
       lidarpool schema | less
     """  # noqa: D301 - click wants the character, not its name
+    from ..scenario.schema import schema_text
+
     click.echo(schema_text(), nl=False)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
-from poolpart.wording import counted
-
-from ..scene.scene import Scene
 from .options import Command
+
+if TYPE_CHECKING:
+    from ..scene.scene import Scene
 
 
 @click.group(name="scene")
@@ -65,7 +66,9 @@ def terrain(out: Path, triangles: int, seed: int, side: float) -> None:
 
 
 def _write(out: Path, make: Callable[[], Scene]) -> None:
-    from ..scene.scene_file import check_target, write_scene  # trimesh would slow down --help
+    from poolpart.wording import counted
+
+    from ..scene.scene_file import check_target, write_scene
 
     check_target(out)
     made = make()

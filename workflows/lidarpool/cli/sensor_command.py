@@ -5,9 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import click
-import numpy as np
-
-from ..sensor.models import load_sensor, model_names, read_model
 
 
 @click.command()
@@ -26,6 +23,8 @@ def sensors(model: str | None, out: Path | None) -> None:
       lidarpool sensors
       lidarpool sensors velodyne/vlp16 --out vlp16.png
     """  # noqa: D301 - click wants the character, not its name
+    from ..sensor.models import load_sensor, model_names, read_model
+
     if model is None:
         heads = ("model", "channels", "field of view", "range", "turns a second", "points a second")
         rows = [heads, *map(_figures, model_names())]
@@ -34,7 +33,7 @@ def sensors(model: str | None, out: Path | None) -> None:
             cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
             click.echo("  ".join(cells).rstrip())
         return
-    from ..render.beam_picture import draw_beams  # Matplotlib is a second without which lists do
+    from ..render.beam_picture import draw_beams  # with Matplotlib, which lists do without
 
     target = out or Path("-".join(Path(model).with_suffix("").parts[-2:]) + ".png")
     if target.suffix.lower() != ".png":
@@ -49,6 +48,10 @@ def sensors(model: str | None, out: Path | None) -> None:
 
 def _figures(name: str) -> tuple[str, ...]:
     """Name of a model, channels, field of view, range, rates, points a second."""
+    import numpy as np
+
+    from ..sensor.models import load_sensor, read_model
+
     model = read_model(name)
     low, high = model.range_m or (0.0, float("inf"))
     rates = dict.fromkeys(model.rates_hz or (model.rate_hz,))

@@ -100,11 +100,8 @@ class _Pace:
 
 def _standing(progress: Progress) -> str:
     """Why no more scans come; empty where they do."""
-    if progress.paused:
-        return "paused from the live page"
-    if progress.waits_for:
-        return f"waits for slots of {progress.waits_for}, which other runs hold"
-    return ""
+    slots = progress.waits_for
+    return f"waits for slots of {slots}, which other runs hold" if slots else ""
 
 
 class PlainLines:
@@ -130,7 +127,7 @@ class PlainLines:
             self._standing = standing
             words = standing or "goes on"
             _tell(self.stream, f"run  {words}, {progress.collected:,} scans are done")
-        due = now >= self._next and not progress.paused
+        due = now >= self._next
         if due:
             least, most = PLAIN_EVERY_S
             self._next = now + min(max(least, now / 10), most)

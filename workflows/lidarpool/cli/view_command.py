@@ -18,14 +18,13 @@ import click
 )
 @click.option("--no-browser", is_flag=True, help="Only say where the page is.")
 def view(result: Path, port: int, no_browser: bool) -> None:
-    """Show a result, what there is of an unfinished run, or a cloud in the browser.
+    """Show a result or a cloud in the browser.
 
     \b
     Examples:
       lidarpool view lidarpool-out
       lidarpool view lidarpool-out/cloud.ply --no-browser
     """  # noqa: D301 - click wants the character, not its name
-    # viser and matplotlib come with it, a second that --help can do without.
-    from ..live import view_result
+    from ..live.result_page import view_result
 
     view_result(result, port=port, browser=not no_browser)

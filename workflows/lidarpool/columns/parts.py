@@ -10,28 +10,21 @@ local origin, so that rounding once is rounding for good.
 from __future__ import annotations
 
 import io
-import lzma
-import struct
 import zipfile
-import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from tokenize import TokenError
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.choice import one_of_each_part
 from ..base.errors import LidarpoolError
 from .cloud import CHUNK_POINTS, Cloud
 from .storage import Storage
 from .table import AXES, SCAN, Column
 
 SUFFIX = ".npz"
-_UNREADABLE = (
-    ArithmeticError, EOFError, LookupError, MemoryError, RuntimeError, TypeError, ValueError,
-    lzma.LZMAError, struct.error, TokenError, zipfile.BadZipFile, zlib.error,
-)  # fmt: skip
 _DATE = (1980, 1, 1, 0, 0, 0)  # the same columns give the same bytes
 
 
@@ -133,7 +126,7 @@ def unpack(data: bytes) -> PartColumns:
             or any(array.shape != (len(part),) for array in part.columns.values())
         ):
             raise ValueError("its arrays do not fit together")
-    except (*_UNREADABLE, OSError) as error:
+    except Exception as error:  # zipfile, zlib, lzma and NumPy have a dozen kinds
         raise LidarpoolError(f"it is damaged ({error})") from error
     return part
 
@@ -182,7 +175,7 @@ def read_tally(storage: Storage, name: str) -> tuple[NDArray[np.int32], NDArray[
     try:
         with zipfile.ZipFile(storage.path(name)) as archive:
             return _read_array(archive, ".triangles.npy"), _read_array(archive, ".hits.npy")
-    except (*_UNREADABLE, OSError) as error:
+    except Exception as error:  # as above
         raise LidarpoolError(
             f"The part {storage.path(name)} cannot be used ({error}). Drop the run, and start it "
             "anew."
@@ -281,37 +274,18 @@ class StoredCloud:
         if held:
             yield Cloud.joined(held)
 
-    def sample(
-        self, choose: Callable[[int, int], NDArray[np.integer]], most: int, parts: int = 256
-    ) -> tuple[Cloud, int]:
-        """Read at most so many points, evenly chosen, of at most so many parts.
-
-        Parameters
-        ----------
-        choose
-            ``choose(count, most)`` gives at most `most` row numbers of `count`, in order.
-        most
-            Points.
-        parts
-            Parts that are opened: what it takes does not grow with the survey.
-
-        Returns
-        -------
-        cloud, count
-            The points, and how many the whole cloud has.
-        """
+    def sample(self, most: int, parts: int) -> Cloud:
+        """Read at most so many points, evenly chosen, of at most so many parts."""
         filled = [i for i, rows in enumerate(self.rows) if rows]
-        opened = [filled[i] for i in choose(len(filled), parts)] if filled else []
+        opened = [filled[i] for i in one_of_each_part(len(filled), parts)]
         total = sum(self.rows[i] for i in opened)
-        picked = choose(total, most) if total else np.zeros(0, np.int64)
+        picked = one_of_each_part(total, most)
         clouds, before = [], 0
         for i in opened:
             inside = picked[(picked >= before) & (picked < before + self.rows[i])] - before
             before += self.rows[i]
             clouds.append(self.cloud_of(self.part(self.names[i]), inside))
-        if not clouds:
-            return self.load(), 0
-        return Cloud.joined(clouds), len(self)
+        return Cloud.joined(clouds) if clouds else self.load()
 
     def load(self) -> Cloud:
         """Read the whole cloud into memory."""

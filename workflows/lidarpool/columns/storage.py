@@ -122,7 +122,7 @@ class Storage:
                 temporary.unlink(missing_ok=True)
             raise
         if self.durable:
-            flush_folder(folder)
+            flush(folder)
 
     def read(self, name: str) -> bytes:
         """Read a file.
@@ -199,10 +199,8 @@ def _as_os_error() -> Iterator[None]:
         raise OSError(f"{type(error).__name__}: {error}") from error
 
 
-def flush_folder(path: Path) -> None:
-    """Wait until the names in a folder are on the disk."""
-    if os.name == "nt":
-        return  # has no handle of a folder to flush
+def flush(path: Path) -> None:
+    """Wait until a file, or the names in a folder, are on the disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)

@@ -18,6 +18,7 @@ from ..base.words import did_you_mean
 
 Kind = Literal["number", "label"]  # a colour scale, or one colour for each value
 
+COORDINATES = ("world", "sensor")  # that points may be in
 _OPEN3D = ("positions", "normals", "colors")  # which writes the files
 
 
@@ -132,10 +133,45 @@ OPTIONAL = (
         "elevation", "float32", "deg", "angle above the sensor's xy plane", "elevation", "sensor"
     ),
     Column("range", "float32", "m", "distance from the beam's origin", "range", "sensor"),
-    Column("intensity", "float32", "", "cosine of the angle of incidence, 0 to 1", "intensity"),
-    Column("return_number", "uint8", "", "which return of its ray, from 1", "return_number"),
-    Column("returns", "uint8", "", "how many returns its ray has", "returns"),
-    Column("class", "uint8", "", "semantic class; 0 is none", "semantic_class", kind="label"),
+    Column(
+        "intensity",
+        "float32",
+        "",
+        "energy received; 1 is a white surface 10 m away at right angles in clear air",
+        "intensity",
+    ),
+    Column(
+        "reflectivity",
+        "float32",
+        "",
+        "intensity without the loss by distance and air: reflectance times cosine of incidence",
+        "reflectivity",
+    ),
+    Column(
+        "return_number",
+        "uint8",
+        "",
+        "which reported return of its pulse, from 1",
+        "return_number",
+        kind="label",
+    ),
+    Column(
+        "returns",
+        "uint8",
+        "",
+        "how many returns of its pulse are reported",
+        "returns",
+        kind="label",
+    ),
+    Column(
+        "class",
+        "uint16",
+        "",
+        "semantic class of the material; 0 if none is stated",
+        "semantic_class",
+        kind="label",
+    ),
+    Column("sensor", "uint8", "", "sensor of the carrier, from 0", "sensor_number", kind="label"),
     Column("triangle", "int32", "", "triangle of the scene that was hit", "triangle"),
 )
 

@@ -12,11 +12,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from raybeam.open3d_module import load_open3d
+
 from ..base.choice import one_of_each_part
 from ..base.errors import LidarpoolError
 from ..base.interrupts import deferred_interrupts
 from ..columns.cloud import Cloud, CloudLike
-from ..columns.storage import flush_folder
+from ..columns.storage import flush
 from ..columns.table import AXES as POSITION
 from ..columns.table import TABLE, Column, check_names
 from .ply_format import AXES, as_held, header, layout, row_type
@@ -64,7 +66,7 @@ def save_cloud(path: str | Path, cloud: CloudLike, *, precision_m: float = 0.01)
         try:
             size = _write(temporary, path, cloud, real)
             temporary.replace(path)
-            flush_folder(path.parent)
+            flush(path.parent)
         finally:
             temporary.unlink(missing_ok=True)
     except OSError as error:
@@ -205,9 +207,7 @@ def _write_open3d(path: Path, cloud: _Held) -> None:
     # It takes a second, and read_cloud needs none of it. Interrupted in its extension module, it
     # would pass for one that cannot be loaded, and cannot be loaded again.
     with deferred_interrupts():
-        import open3d
-
-    o3d: Any = open3d  # its stubs do not know which arguments its functions take
+        o3d = load_open3d()
     points = o3d.t.geometry.PointCloud()
     points.point.positions = o3d.core.Tensor(np.ascontiguousarray(cloud.positions))
     for name, values in cloud.columns.items():

@@ -18,6 +18,8 @@ MOST_COLOURS = 1 << 16  # of labels
 
 _SPREAD = (0.5, 99.5)  # percentiles between which the colours of numbers are spread
 _GREY = 0.5
+_SKEWED = 0.1  # a median this low in its range: the scale is logarithmic
+_TIMES = (("s", 1e9), ("ms", 1e6), ("µs", 1e3))  # that nanoseconds are told in
 _LEGEND = '<div style="font-size:0.75em;padding:0.25em 0.8em">'
 
 
@@ -27,7 +29,8 @@ def colours_of(
     """Colours (n, 3) of the values (n,) of a column, and a legend.
 
     Labels have a colour each. Those of more values than a legend can tell, and without names,
-    are on a scale like numbers. What is NaN is grey.
+    are on a scale like numbers. Numbers most of which are small among large ones, as intensities
+    are, have a logarithmic scale. What is NaN is grey.
 
     Parameters
     ----------
@@ -37,23 +40,39 @@ def colours_of(
     spread = _SPREAD
     if column.kind == "label" and values.dtype.kind in "iu":
         values = values.astype(np.int64)
-        found = np.unique(values)
+        found, counts = np.unique(values, return_counts=True)
         if names or len(found) <= MOST_ENTRIES:
             count = max(len(names), int(found.max(initial=0)) + 1)
             palette = as_bytes(object_colours(min(count, MOST_COLOURS)))
+            if len(found) > MOST_ENTRIES:
+                found = found[np.argsort(-counts, kind="stable")]  # those of most points are named
             words = [
                 names[value] if 0 <= value < len(names) else f"{column.name} {value}"
                 for value in found.tolist()
             ]
             return palette[values % len(palette)], _key(words, palette[found % len(palette)])
         spread = (0, 100)
-    known = np.isfinite(values)
-    low, high = np.percentile(values[known], spread) if known.any() else (0.0, 1.0)
-    scaled = (values.astype(np.float64) - low) * (255 / (high - low if high > low else 1.0))
+    known, numbers, unit = np.isfinite(values), values.astype(np.float64), column.unit
+    middle, low, high = 0.5, 0.0, 1.0
+    if known.any():
+        low, middle, high = np.percentile(numbers[known], [spread[0], 50, spread[1]])
+    if unit == "ns":
+        span = high - low
+        unit, size = next((entry for entry in _TIMES if span >= 0.1 * entry[1]), ("ns", 1.0))
+        numbers = numbers / size
+        low, middle, high = low / size, middle / size, high / size
+    logarithmic = bool(low > 0 and middle - low < _SKEWED * (high - low))
+    if logarithmic:
+        numbers = np.log(np.clip(numbers, low, high))
+    ends = np.log([low, high]) if logarithmic else (low, high)
+    scaled = (numbers - ends[0]) * (255 / (ends[1] - ends[0] if high > low else 1.0))
     colours = TURBO[np.clip(np.where(known, scaled, 0), 0, 255).astype(np.uint8)]
     colours[~known] = _GREY
-    title = f"{column.name}, {column.unit}" if column.unit else column.name
+    title = f"{column.name}, {unit}" if unit else column.name
     title += f": {column.meaning}" if column.meaning else ""
+    if logarithmic:
+        marks = [f"{at:.2g}" for at in (low, (low * high) ** 0.5, high)]
+        return as_bytes(colours), colour_bar(title, marks)
     # As many digits as a bar of this span needs, and never -0.
     digits = int(np.clip(np.ceil(1 - np.log10(high - low)), 0, 6)) if high > low else 2
     marks = [f"{round(at, digits) + 0.0:,.{digits}f}" for at in (low, (low + high) / 2, high)]

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.choice import one_of_each_part
 from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud
 from ..columns.parts import read_part
@@ -42,7 +41,7 @@ class LivePoints:
         self._lock = threading.Lock()
         self._random = np.random.default_rng(0)
         self._share = 1.0  # of the points of a part that are taken
-        self._counts = np.zeros(len(store.job.scene.faces), np.int64)
+        self._counts = np.zeros(store.job.scene.triangles, np.int64)
         self.hits = 0  # of the parts that were read
         self.version = 0  # counts up when there is something else to show
         self.cloud: Cloud | None = None
@@ -90,11 +89,12 @@ class LivePoints:
         """Take an even choice of all points, and all hits; the parts may be removed after that."""
         with self._lock:
             self._waiting = []
-            self.cloud, _ = result.points.sample(one_of_each_part, self._most, PARTS_NOTED)
+            self.cloud = result.points.sample(self._most, PARTS_NOTED)
             self._counts, self.hits = result.hit_counts, result.hits
             self.version += 1
 
     def hit_counts(self) -> NDArray[np.float64]:
         """Hits of each triangle, (f,), scaled up to all hits where not all parts were read."""
         with self._lock:
-            return np.asarray(self._counts * (self._store.db.hits / max(self.hits, 1)))
+            counts = self._counts[: len(self._store.job.scene.faces)]
+            return np.asarray(counts * (self._store.db.hits / max(self.hits, 1)))

@@ -1,9 +1,10 @@
-"""The live page of a result, or of what there is of one: the command `view`."""
+"""The live page of a result: the command `view`."""
 
 from __future__ import annotations
 
 import time
 from bisect import bisect_left, bisect_right
+from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -17,11 +18,11 @@ from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud
 from ..columns.table import TABLE, Column
 from ..export.ply_format import AXES, layout
-from ..run.database import FILE
-from ..run.picture_file import PICTURE_FILE, Pictured
-from ..run.store import RUN_FOLDER, committed_points
+from ..run.picture_file import PICTURE_FILE, Pictured, SensorWay
+from ..run.store import RUN_FOLDER
+from ..scan.database import FILE
 from .page import LivePage, live_page, open_browser, redrawn
-from .view import View, bounds_of
+from .view import View, bounds_of, described, places_of
 
 CLOUD = "cloud.ply"
 VIEW_POINTS = 500_000  # in the browser at a time
@@ -96,26 +97,6 @@ def _table(row: np.dtype[np.void]) -> tuple[Column, ...]:
     return (*known, *rest)
 
 
-class UnfinishedRun:
-    """The points that a run has committed so far, in parts; as `ResultFile`.
-
-    Which scans are shown cannot be chosen.
-    """
-
-    scans = (0, 0)
-
-    def __init__(self, folder: Path) -> None:
-        self._points = committed_points(folder)
-        self.table = self._points.table
-
-    def __len__(self) -> int:
-        return len(self._points)
-
-    def choose(self, first: int, last: int, most: int) -> tuple[Cloud, int]:
-        """Choose at most so many points evenly; see `ResultFile.choose`."""
-        return self._points.sample(one_of_each_part, most)
-
-
 class ResultView:
     """A result on a page.
 
@@ -136,7 +117,7 @@ class ResultView:
     def __init__(
         self,
         page: LivePage,
-        file: ResultFile | UnfinishedRun,
+        file: ResultFile,
         pictured: Pictured | None = None,
         note: str = "",
         most: int = VIEW_POINTS,
@@ -146,17 +127,18 @@ class ResultView:
         self._scans: Any = None
         if file.scans[0] < file.scans[1]:
             self._scans = page.gui.add_multi_slider("scans", *file.scans, 1, file.scans)
-        poses: NDArray[np.float64] = np.empty((0, 3))
+        sensors: Sequence[SensorWay] = ()
         if pictured is None:
             origin, bounds = _around(file)
             scene = None
         else:
             scene, origin = pictured.scene, pictured.scene.origin
-            poses = pictured.poses - origin
-            bounds = bounds_of(scene, poses, pictured.planning)
-        self._origin = origin
+            sensors = pictured.sensors
+            bounds = bounds_of(scene, places_of(sensors), pictured.planning)
+        self._origin, self._sensors = origin, sensors
         self._choose(*file.scans)
-        self._view = View(page, scene, poses, file.table, origin, bounds)
+        lasts = 0.0 if pictured is None else pictured.duration_ns
+        self._view = View(page, scene, sensors, file.table, origin, bounds, lasts)
 
     def draw(self) -> float:
         """Draw what has changed; returns the share of a core that this may take."""
@@ -164,14 +146,14 @@ class ResultView:
         if scans != self._chosen:
             self._choose(*scans)
         pictured = self._pictured
-        names: tuple[str, ...] = ()
         if pictured is not None:
-            self._view.draw_scene(lambda: pictured.hit_counts, 0)
+            faces = len(pictured.scene.faces)
+            self._view.draw_scene(lambda: pictured.hit_counts[:faces], 0)
             self._view.draw_rays(pictured.sample_rays, 0)
             if pictured.plan is not None:
                 self._view.draw_path(pictured.plan.path, pictured.planning)
-            names = pictured.scene.names
-        self._view.draw_cloud(self._cloud, scans, names)
+        self._view.draw_time()
+        self._view.draw_cloud(self._cloud, scans)
         return BUSY_SHARE
 
     def _choose(self, first: int, last: int) -> None:
@@ -182,11 +164,12 @@ class ResultView:
         if self._origin.any():
             away = ", ".join(f"{metres:.0f}" for metres in self._origin)
             lines.append(f"relative to {away} m")
+        lines += [described(self._sensors)] if self._sensors else []
         lines += [escape(self._note)] if self._note else []
         self._facts.content = f'<div style="padding:0 0.8em">{"<br>".join(lines)}</div>'
 
 
-def _around(file: ResultFile | UnfinishedRun) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _around(file: ResultFile) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Whole metres near the points of a file, (3,), and the box (2, 3) around them from there."""
     positions = file.choose(*file.scans, 100_000)[0].positions
     if not len(positions):
@@ -203,7 +186,7 @@ def view_result(path: Path, *, port: int, browser: bool = True) -> None:
     Parameters
     ----------
     path
-        Folder of a result or of an unfinished run, or a cloud.
+        Folder of a result, or a cloud.
     port
         Port to listen on, or the next that is free.
     browser
@@ -230,17 +213,19 @@ def view_result(path: Path, *, port: int, browser: bool = True) -> None:
             return
 
 
-def open_result(path: Path) -> tuple[ResultFile | UnfinishedRun, Pictured | None, str]:
-    """Open a cloud or the folder of a run; with the scene if there is one, and a note."""
+def open_result(path: Path) -> tuple[ResultFile, Pictured | None, str]:
+    """Open a cloud or the folder of a result; with the scene if there is one, and a note."""
     if not path.is_dir():
         return ResultFile(path), None, ""
     if (path / CLOUD).exists():
         return ResultFile(path / CLOUD), *_pictured_in(path)
     if (path / RUN_FOLDER / FILE).exists():
-        note = "The run is not finished; this is what there is of its cloud."
-        return UnfinishedRun(path / RUN_FOLDER), None, note
+        raise LidarpoolError(
+            f"{path} holds an unfinished run: continue it with lidarpool run --resume, where "
+            "--live shows what there is."
+        )
     raise LidarpoolError(
-        f"{path} holds no {CLOUD}: give the folder of a run (its --out), or a cloud."
+        f"{path} holds no {CLOUD}: give the folder of a result (its --out), or a cloud."
     )
 
 

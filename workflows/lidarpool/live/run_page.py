@@ -13,7 +13,6 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from html import escape
 from threading import Event
-from typing import Any
 
 import click
 import numpy as np
@@ -24,16 +23,16 @@ from poolpart import Partition
 from ..columns.table import SCAN
 from ..plan import best
 from ..run.job import Job
-from ..run.picture_file import sensor_places
+from ..run.picture_file import sensor_ways
 from ..run.progress import STAGES, Progress, Show, in_words, is_sure, time_in_words
 from ..run.result import Result
 from ..run.store import RunStore
 from ..scan import Frame
 from .live_points import LivePoints
 from .page import PORT, LivePage, live_page, open_browser, redrawn
-from .view import View, bounds_of
+from .view import View, bounds_of, described, places_of
 
-DRAW_EVERY_S = 0.5
+DRAW_EVERY_S = 0.2
 BUSY_SHARE, IDLE_SHARE = 0.06, 0.7  # of a core, while the run goes on and when it is over
 ASK_EVERY_S = 2.0  # how busy the partitions are
 FRAMES_SHOWN = 40  # whose rays are shown
@@ -54,16 +53,17 @@ class LiveRun:
 
     def __init__(self, page: LivePage, job: Job) -> None:
         self.page, self._job = page, job
-        self.paused, self.stopped = Event(), Event()  # what somebody at the page wants
+        self.stopped = Event()  # by somebody at the page; --resume goes on
         self._text = page.gui.add_html("")
-        self._pause = page.gui.add_button("Pause")
         self._stop = page.gui.add_button("Stop", color="red")
-        self._pause.on_click(self._on_pause)
         self._stop.on_click(lambda _: self.stopped.set())
-        poses = sensor_places(job.survey)
-        bounds = bounds_of(job.scene, poses, job.planning)
+        sensors = sensor_ways(job.survey)
+        bounds = bounds_of(job.scene, places_of(sensors), job.planning)
         columns = (SCAN, *job.survey.stored_columns)
-        self._view = View(page, job.scene, poses, columns, job.scene.origin, bounds)
+        origin, lasts = job.scene.origin, job.survey.duration_ns
+        self._view = View(page, job.scene, sensors, columns, origin, bounds, lasts)
+        self._described = described(sensors)
+        self._shown = -1  # the last scan of which the page was told when it was
         self._store: RunStore | None = None
         self._points: LivePoints | None = None
         self._progress: Progress | None = None
@@ -121,17 +121,12 @@ class LiveRun:
         if self.stopped.is_set():
             raise KeyboardInterrupt
 
-    def wants_pause(self) -> bool:
-        """Whether the run is to stand still."""
-        return self.paused.is_set() and not self.stopped.is_set()
-
     def finish(self, result: Result) -> None:
         """Say that the run is over, and show all of it; its parts may be removed after that."""
         if self._points is not None:
             self._points.finish(result)
         self._rays = result.sample_rays
         self._busy, self._over = {}, True
-        self._pause.disabled = True
         self._stop.label = "Close"
 
     def stay(self) -> None:
@@ -143,26 +138,20 @@ class LiveRun:
 
     # -- the page's side -----------------------------------------------------------------
 
-    def _on_pause(self, _: Any) -> None:
-        if self.paused.is_set():
-            self.paused.clear()
-        else:
-            self.paused.set()
-        self._pause.label = "Go on" if self.paused.is_set() else "Pause"
-
     def draw(self) -> float:
         """Draw what is new; returns the share of a core that this may take."""
         share = IDLE_SHARE if self._over else BUSY_SHARE
         if not self.page.get_clients():  # whoever comes later has it drawn then
             return share
-        points, view, names = self._points, self._view, self._job.scene.names
+        points, view = self._points, self._view
         self._text.content = self._panel()
+        view.draw_time()
         if points is None:
             view.draw_scene(lambda: np.zeros(len(self._job.scene.faces)), 0)
             return share
         points.gather()
         if points.cloud is not None:
-            view.draw_cloud(points.cloud, points.version, names)
+            view.draw_cloud(points.cloud, points.version)
         # It is large, and looks another only when there are a tenth more hits.
         grown = round(math.log1p(points.hits) / math.log(1.1))
         view.draw_scene(points.hit_counts, (grown, self._over))
@@ -172,8 +161,9 @@ class LiveRun:
 
     def _draw_frames(self) -> None:
         frames = list(self._frames)
-        if frames:
-            self._view.place_sensor(frames[-1].pose.position)
+        if frames and frames[-1].scan != self._shown:
+            self._shown = frames[-1].scan
+            self._view.set_time(self._job.survey.begins_ns(self._shown))
         if self._rays is not None:
             self._view.draw_rays(self._rays, "all")
         elif frames:
@@ -201,6 +191,7 @@ class LiveRun:
             for label, count, total in STAGES
             if getattr(progress, total)
         ]
+        lines.append(self._described)
         shown = len(points.cloud) if points is not None and points.cloud is not None else 0
         some = "" if shown == progress.points else f", {shown:,} of them displayed"
         lines.append(f"<b>{progress.points:,} points</b>{some}")
@@ -214,8 +205,6 @@ class LiveRun:
             return "done"
         if self.stopped.is_set():
             return "stopping"
-        if self.paused.is_set():
-            return "paused" if progress.paused else "pausing"
         if progress.waits_for:
             return f"waiting for slots of {escape(progress.waits_for)}"
         return "running" if self._first is not None else "starting"

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from trimesh.exchange.gltf import export_glb
 
 from raybeam import RayCaster
+from raybeam.open3d_module import load_open3d
 
 from ..render.intensity import density_colours, density_range, hit_density
 from ..scene.scene import Scene
@@ -108,8 +109,7 @@ class Surface:
 
 def _simplified(scene: Scene, most: int) -> tuple[Scene, NDArray[np.integer]]:
     """Give a scene of fewer triangles, and for each triangle of this one the nearest there."""
-    import open3d  # takes a second, and most scenes do without
-
+    open3d = load_open3d()
     mesh = open3d.geometry.TriangleMesh(
         open3d.utility.Vector3dVector(scene.vertices.copy()),
         open3d.utility.Vector3iVector(scene.faces.copy()),

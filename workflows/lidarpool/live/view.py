@@ -3,22 +3,28 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Hashable, Sequence
+from html import escape
 from typing import Any
 
 import numpy as np
 import trimesh
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from ..columns.cloud import Cloud
 from ..columns.table import AXES, Column, Z
 from ..plan import Planning
+from ..render.theme import object_colours
+from ..run.picture_file import SensorWay
 from ..scene.scene import Scene
-from .colouring import colours_of
+from ..sensor.trajectory import quaternions_of
+from .colouring import as_bytes, colours_of
 from .page import LivePage
 from .surface import MeshNode, Surface
 
 MOST_POSES = 1000  # that have a ball
+MOST_LABELS = 20  # of actors
 MOST_RAYS = 150  # more of them hide what they hit
 
 _RED, _PALE = (224, 24, 45), (232, 140, 150)
@@ -26,9 +32,11 @@ _PATH, _DISC = (20, 150, 90), (120, 130, 150)
 # As shares of the scene's diagonal. Points can be seen where there are few, and told apart where
 # there are many.
 _BALL, _POSE, _END = 0.009, 0.0054, 0.008
+_MOVES = 0.4  # of that: what moves through a large scene is looked at from near
 _POINT, _POINT_OF_MANY = 0.0035, 0.6
 # Where a scene is cut that has a roof: so far up from the sensors, as a share of the way to it.
 _CUT = 0.5
+_PLAY_S = (6.0, 60.0)  # that a survey takes which is played, however short or long it is
 
 
 class View:
@@ -43,26 +51,31 @@ class View:
         Where they are shown.
     scene
         The scene; None where there is only a cloud.
-    poses
-        (p, 3) where the sensor is in the course of time, metres.
+    sensors
+        Where they are in the course of time.
     table
         The columns of the cloud.
     origin
         World position of the local origin, (3,), metres.
     bounds
         Box (2, 3) of what there is to see, metres.
+    duration_ns
+        How long the survey lasts.
     """
 
     def __init__(
         self,
         page: LivePage,
         scene: Scene | None,
-        poses: NDArray[np.float64],
+        sensors: Sequence[SensorWay],
         table: Sequence[Column],
         origin: NDArray[np.float64],
         bounds: NDArray[np.float64],
+        duration_ns: float = 0.0,
     ) -> None:
-        self._page, self._scene, self._poses = page, scene, poses
+        self._page, self._scene, self._sensors = page, scene, sensors
+        self._poses = places_of(sensors)
+        self._actors = () if scene is None else scene.actors
         self._origin, self._ground = origin, float(bounds[0, 2])
         self._size_m = float(np.linalg.norm(bounds[1] - bounds[0])) or 1.0
         self._columns = {c.name: c for c in (Z, *(c for c in table if c not in AXES))}
@@ -71,13 +84,17 @@ class View:
         self._mesh = MeshNode(page, "/scene")
         self._cloud: Any = None  # viser shows no cloud without points
         self._lines: dict[str, Any] = {}  # {name: node}; nor no lines
-        self._sensor: Any = None
+        self._markers: list[Any] = []  # of the sensors, once it is told when it is
+        self._bodies: list[Any] = []  # of the actors
+        self._time: Any = None  # slider, where anything moves
+        self._playing = False
+        self._moved_at = 0.0  # when the time was last moved on by playing
         page.frame_scene(bounds)
-        self._add_controls(bounds)
-        if len(poses):
-            self._add_poses()
+        self._add_controls(bounds, duration_ns / 1e9)
+        self._add_poses()
+        self._add_actors()
 
-    def _add_controls(self, bounds: NDArray[np.float64]) -> None:
+    def _add_controls(self, bounds: NDArray[np.float64], duration_s: float) -> None:
         gui = self._page.gui
         low, high = (bounds[:, 2] + self._origin[2]).tolist()
         step = 10.0 ** math.floor(math.log10(max(high - low, 1e-3) / 50))
@@ -86,6 +103,11 @@ class View:
             round(step * (math.floor(high / step) + 1), 6),
         )
         self._cut: Any = gui.add_slider("cut above, m", first, self._top, step, self._top)
+        if duration_s > 0 and (self._actors or any(way.moves for way in self._sensors)):
+            step = 10.0 ** math.floor(math.log10(duration_s / 200))
+            self._time = gui.add_slider("time, s", 0.0, duration_s, step, 0.0)
+            self._play = gui.add_button("Play")
+            self._play.on_click(lambda _: self._start_or_stop())
         with gui.add_folder("cloud"):
             self._show_cloud = gui.add_checkbox("show", initial_value=True)
             self._colour = gui.add_dropdown("colour", tuple(self._columns))
@@ -109,7 +131,7 @@ class View:
         self._drawn[name] = state
         return changed
 
-    def draw_cloud(self, cloud: Cloud, version: Hashable, names: Sequence[str] = ()) -> None:
+    def draw_cloud(self, cloud: Cloud, version: Hashable) -> None:
         """Show these points.
 
         Parameters
@@ -118,8 +140,6 @@ class View:
             The points, world coordinates.
         version
             Another value where they are others than before.
-        names
-            Of the objects.
         """
         cut, shown = self.cut, self._show_cloud.value
         colour, size = self._colour.value, self._point_size.value
@@ -132,9 +152,12 @@ class View:
             return
         column = self._columns[colour]
         values = cloud.positions[:, 2] if column is Z else cloud[column.name]
-        colours, self._cloud_legend.content = colours_of(
-            values, column, names if column.name == "object" else ()
-        )
+        names: tuple[str, ...] = ()
+        if column.name == "object" and self._scene is not None:
+            names = self._scene.all_names
+        elif column.name == "sensor":
+            names = tuple(way.name for way in self._sensors)
+        colours, self._cloud_legend.content = colours_of(values, column, names)
         positions = (cloud.positions - self._origin).astype(np.float32)
         if cut is not None:
             below = positions[:, 2] <= cut
@@ -207,18 +230,81 @@ class View:
                 name, lines, _PALE, thickness=1.0, thickness_units="screen"
             )
 
-    def place_sensor(self, position: ArrayLike) -> None:
-        """Show the sensor at a position, (3,) metres, local."""
-        if self._sensor is None:
-            self._sensor = self._page.scene.add_icosphere(
-                "/sensor", _BALL * self._size_m, _RED, cast_shadow=False
+    def _start_or_stop(self) -> None:
+        self._playing, self._moved_at = not self._playing, time.monotonic()
+        self._play.label = "Pause" if self._playing else "Play"
+
+    def set_time(self, time_ns: float) -> None:
+        """Show sensors and actors as they are at a time, unless somebody plays another."""
+        if self._time is None:
+            self._place(time_ns)
+        elif not self._playing:
+            self._time.value = time_ns / 1e9
+
+    def draw_time(self) -> None:
+        """Show sensors and actors where they are at the time that is chosen or played."""
+        if self._time is None:
+            return
+        if self._playing:
+            now = time.monotonic()
+            speed = self._time.max / float(np.clip(self._time.max, *_PLAY_S))
+            at = self._time.value + (now - self._moved_at) * speed
+            self._moved_at, self._time.value = now, at % self._time.max
+        self._place(self._time.value * 1e9)
+
+    def _place(self, time_ns: float) -> None:
+        if not self._changed("time", time_ns):
+            return
+        scene = self._page.scene
+        for number, way in enumerate(self._sensors[len(self._markers) :], len(self._markers)):
+            name = f"/sensors/{number}"
+            radius = _BALL * self._size_m * (_MOVES if way.moves else 1.0)
+            self._markers.append(scene.add_icosphere(name, radius, _RED, cast_shadow=False))
+            scene.add_label(f"{name}/label", way.name or "sensor", anchor="bottom-left")
+        with self._page.atomic():
+            for marker, way in zip(self._markers, self._sensors, strict=True):
+                marker.position = way.at(time_ns)
+            for body, actor in zip(self._bodies, self._actors, strict=True):
+                positions, rotations = actor.trajectory.poses(0, np.array([time_ns]))
+                body.position = positions[0]
+                if rotations is not None:
+                    body.wxyz = np.roll(quaternions_of(rotations)[0], 1)
+
+    def _add_actors(self) -> None:
+        colours = as_bytes(object_colours(len(self._actors)))
+        for number, actor in enumerate(self._actors):
+            name = f"/actors/{number}"
+            self._bodies.append(
+                self._page.scene.add_mesh_simple(
+                    name,
+                    actor.mesh.vertices,
+                    actor.mesh.faces,
+                    color=tuple(colours[number].tolist()),
+                    flat_shading=True,
+                    side="double",
+                    cast_shadow=False,
+                    receive_shadow=False,
+                )
             )
-            self._page.scene.add_label("/sensor/label", "sensor", anchor="bottom-left")
-        self._sensor.position = np.asarray(position, np.float64)
+            if number < MOST_LABELS:
+                top = (0.0, 0.0, float(actor.mesh.vertices[:, 2].max()))
+                self._page.scene.add_label(
+                    f"{name}/label", actor.name, position=top, anchor="bottom-left"
+                )
 
     def _add_poses(self) -> None:
-        count = min(len(self._poses), MOST_POSES)
-        some = self._poses[np.linspace(0, len(self._poses) - 1, count).astype(np.int64)]
+        """Show the ways of sensors that move as lines, and where the others stand as balls."""
+        for number, way in enumerate(self._sensors):
+            if way.moves and len(way.positions) > 1:
+                line = np.stack([way.positions[:-1], way.positions[1:]], axis=1)
+                self._page.scene.add_line_segments(
+                    f"/ways/{number}", line, _RED, thickness=3.0, thickness_units="screen"
+                )
+        standing = places_of([way for way in self._sensors if not way.moves])
+        if not len(standing):
+            return
+        count = min(len(standing), MOST_POSES)
+        some = standing[np.linspace(0, len(standing) - 1, count).astype(np.int64)]
         ball = trimesh.creation.icosphere(subdivisions=2, radius=_POSE * self._size_m)
         self._page.scene.add_batched_meshes_simple(
             "/poses",
@@ -265,6 +351,17 @@ class View:
                 receive_shadow=False,
                 position=(x, y, self._ground + height / 2),
             )
+
+
+def places_of(sensors: Sequence[SensorWay]) -> NDArray[np.float64]:
+    """All places of sensors, (p, 3) metres, local."""
+    return np.concatenate([np.empty((0, 3)), *(way.positions for way in sensors)])
+
+
+def described(sensors: Sequence[SensorWay]) -> str:
+    """Tell what the sensors are, by their names where they have one, as HTML."""
+    words = (f"{way.name}: {way.model}" if way.name else way.model for way in sensors)
+    return "<br>".join(map(escape, words))
 
 
 def bounds_of(

@@ -3,13 +3,12 @@
 from .plan import Plan, best
 from .planning import Planning
 from .tangents import shortest_path_length
-from .trial import Trial, TrialCancelledError, run_trial
+from .trial import Trial, run_trial
 
 __all__ = [
     "Plan",
     "Planning",
     "Trial",
-    "TrialCancelledError",
     "best",
     "run_trial",
     "shortest_path_length",

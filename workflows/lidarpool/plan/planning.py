@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import reprlib
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from numbers import Integral
 from typing import Any
@@ -66,25 +68,32 @@ class Planning:
         for name in ("trials", "particles", "iterations", "waypoints"):
             _check_count(name, getattr(self, name), least=1)
         _check_count("seed", self.seed, least=0)
-        start, target = (_point(name, getattr(self, name)) for name in ("start", "target"))
+        start, target = _point("start", self.start), _point("target", self.target)
         if start == target:
             raise LidarpoolError(
                 f"start and target of the path are both {start}: there is nothing to plan. "
                 "Move one of them."
             )
-        centres, radii = _discs(self.centres, self.radii)
+        centres = _checked(
+            "centres",
+            self.centres,
+            lambda n: n.size == 0 or (n.ndim == 2 and n.shape[1] == 2),
+            "finite numbers of shape (m, 2)",
+        ).reshape(-1, 2)
+        radii = _checked(
+            "radii",
+            self.radii,
+            lambda n: n.shape in ((), (len(centres),)) and bool((n > 0).all()),
+            "finite numbers above 0, one for each disc or one for all",
+        )
+        radii = np.broadcast_to(radii, len(centres)).copy()
+        for array in (centres, radii):
+            array.setflags(write=False)
         _check_outside({"start": start, "target": target}, centres, radii)
         for name, value in (
             ("start", start), ("target", target), ("centres", centres), ("radii", radii)
         ):  # fmt: skip
             object.__setattr__(self, name, value)
-
-    def __repr__(self) -> str:
-        return (
-            f"Planning({self.start} to {self.target} around {len(self.radii)} discs, "
-            f"{self.trials} trials of {self.particles} particles x {self.iterations} iterations, "
-            f"seed {self.seed})"
-        )
 
 
 def _check_count(name: str, value: Any, least: int) -> None:
@@ -95,45 +104,18 @@ def _check_count(name: str, value: Any, least: int) -> None:
 
 
 def _point(name: str, value: ArrayLike) -> tuple[float, float]:
-    numbers = _floats(name, value)
-    if numbers.shape != (2,):
-        raise LidarpoolError(f"planning: {name} is {value!r}; it must be two finite numbers, x, y.")
-    return float(numbers[0]), float(numbers[1])
+    x, y = _checked(name, value, lambda n: n.shape == (2,), "two finite numbers").tolist()
+    return x, y
 
 
-def _discs(centres: ArrayLike, radii: ArrayLike) -> tuple[Floats, Floats]:
-    where = _floats("centres", centres)
-    where = where.reshape(0, 2) if where.size == 0 else where
-    if where.ndim != 2 or where.shape[1] != 2:
-        raise LidarpoolError(
-            f"planning: centres have shape {where.shape}; one x and y for each disc is expected, "
-            "(m, 2)."
-        )
-    widths = _floats("radii", radii)
-    if widths.shape not in ((), (len(where),)):
-        raise LidarpoolError(
-            f"planning: {widths.size} radii for {len(where)} discs; give one for each, or one "
-            "number for all."
-        )
-    widths = np.broadcast_to(widths, (len(where),)).copy()
-    if (widths <= 0).any():
-        raise LidarpoolError(
-            f"planning: the radius of disc {int(np.argmax(widths <= 0))} is {widths.min():g}; "
-            "it must be above 0. Leave the disc out if there is nothing to go around."
-        )
-    for array in (where, widths):
-        array.setflags(write=False)
-    return where, widths
-
-
-def _floats(name: str, value: ArrayLike) -> Floats:
-    """Return `value` as a new float64 array; an error where it is no array of finite numbers."""
+def _checked(name: str, value: ArrayLike, fits: Callable[[Floats], bool], what: str) -> Floats:
+    """`value` as a new array of finite numbers that fits; an error that says what it must be."""
     try:
         numbers = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
-        raise LidarpoolError(f"planning: {name} is {value!r}; it must be numbers.") from None
-    if not np.isfinite(numbers).all():
-        raise LidarpoolError(f"planning: {name} holds a number that is not finite: {value!r}.")
+        numbers = np.array(np.nan)
+    if not (np.isfinite(numbers).all() and fits(numbers)):
+        raise LidarpoolError(f"planning: {name} is {reprlib.repr(value)}; it must be {what}.")
     return numbers
 
 

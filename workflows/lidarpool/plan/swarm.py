@@ -72,19 +72,16 @@ class Swarm:
         self._jump_by_group = self._jump.reshape(rows, self.groups, -1)
         self._best_cost_by_group = self._best_cost.reshape(self.groups, -1)
 
-    def step(self, leader_costs: Singles) -> None:
-        """Evaluate all particles, remember what is best, and jump.
-
-        Writes to `leader_costs`, (groups,), the lowest cost each group has met so far.
-        """
-        self._remember(self.paths.evaluate(), leader_costs)
+    def step(self) -> None:
+        """Evaluate all particles, remember what is best, and jump."""
+        self._remember(self.paths.evaluate())
         self._move()
 
     def best(self) -> Singles:
         """Corners of the best path so far: (waypoints, 2)."""
         return self._best[:, self._best_cost.argmin()].reshape(-1, 2)
 
-    def _remember(self, cost: Singles, leader_costs: Singles) -> None:
+    def _remember(self, cost: Singles) -> None:
         np.less(cost, self._best_cost, out=self._better)  # 1.0 or 0.0
         np.minimum(cost, self._best_cost, out=self._best_cost)
         # A product and a sum take half the time of a masked copy. The sum is what `_move` wrote
@@ -95,7 +92,6 @@ class Swarm:
         np.add(leaders, self._group_starts, out=leaders)
         # Without mode="clip", take with out= goes through a copy.
         self._best.take(leaders, axis=1, out=self._leaders, mode="clip")
-        self._best_cost.take(leaders, out=leader_costs, mode="clip")
 
     def _move(self) -> None:
         np.subtract(self._leaders[..., None], self._best_by_group, out=self._jump_by_group)

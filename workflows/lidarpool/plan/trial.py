@@ -3,25 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..base.errors import LidarpoolError
 from .axes import PathAxes
 from .cost import PathCost
 from .geometry import Floats, clearance, path_length, segment_distances
 from .planning import Planning
 from .randoms import Randoms
 from .swarm import Swarm
-
-_ITERATIONS_PER_LOOK = 8  # at whether the trial is cancelled: about every millisecond
-
-
-class TrialCancelledError(LidarpoolError):
-    """A trial was told to stop before its end; there is no result."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,9 +33,6 @@ class Trial:
         Corners of the path between its two ends, in metres: (k, 2).
     collision_free
         Whether the path enters no disc, by the exact check.
-    history
-        Lowest cost met so far, in metres, at each iteration: (iterations,). It is the length
-        of a path where that is free, and above any sensible length where it is not.
     seconds
         Time that the trial took.
     """
@@ -54,7 +42,6 @@ class Trial:
     length: float
     waypoints: Floats
     collision_free: bool
-    history: NDArray[np.float32]
     seconds: float = field(compare=False)
 
 
@@ -64,7 +51,7 @@ def trial_seed(planning: Planning, trial: int) -> int:
     return int(sequence.generate_state(1, np.uint64)[0])
 
 
-def run_trial(planning: Planning, trial: int, cancelled: Callable[[], bool] | None = None) -> Trial:
+def run_trial(planning: Planning, trial: int) -> Trial:
     """Search for a path with one particle swarm.
 
     A pure function on one thread: the result depends on `planning` and `trial` alone, not on
@@ -76,23 +63,13 @@ def run_trial(planning: Planning, trial: int, cancelled: Callable[[], bool] | No
         The problem.
     trial
         Number of the trial, from 0.
-    cancelled
-        Asked about every millisecond, if given; the trial ends when it says True.
-
-    Raises
-    ------
-    TrialCancelledError
-        If `cancelled` said so.
     """
     begun = time.perf_counter()
     seed = trial_seed(planning, trial)
     axes = PathAxes(planning.start, planning.target)
     swarm = prepare_swarm(planning, axes, seed)
-    lowest = np.empty((planning.iterations, swarm.groups), np.float32)
-    for iteration in range(planning.iterations):
-        if cancelled is not None and iteration % _ITERATIONS_PER_LOOK == 0 and cancelled():
-            raise TrialCancelledError(f"Trial {trial} was cancelled at iteration {iteration}.")
-        swarm.step(lowest[iteration])
+    for _ in range(planning.iterations):
+        swarm.step()
     waypoints = axes.to_plane(swarm.best().astype(np.float64))
     path = with_ends(planning, waypoints)
     return Trial(
@@ -101,7 +78,6 @@ def run_trial(planning: Planning, trial: int, cancelled: Callable[[], bool] | No
         length=path_length(path),
         waypoints=waypoints,
         collision_free=clearance(path, planning.centres, planning.radii) >= 0,
-        history=lowest.min(axis=1) * np.float32(axes.unit_m),
         seconds=time.perf_counter() - begun,
     )
 

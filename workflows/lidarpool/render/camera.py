@@ -29,8 +29,7 @@ class Camera:
         """Return unit directions (n, 3) through pixel coordinates (n, 2)."""
         plane = (np.asarray(pixels, dtype=np.float64) - self.centre) / self.focal
         rays = plane[:, :1] * self.axes[0] - plane[:, 1:] * self.axes[1] + self.axes[2]
-        rays /= np.sqrt((rays * rays).sum(axis=1, keepdims=True))
-        return rays
+        return rays / np.sqrt(np.einsum("ij,ij->i", rays, rays))[:, None]
 
     def project(self, points: ArrayLike) -> tuple[Floats, Floats]:
         """Pixel coordinates (n, 2) and distances from the eye (n,) of points (n, 3).
@@ -41,7 +40,7 @@ class Camera:
         side, up, ahead = (offset @ self.axes.T).T
         ahead = np.where(ahead > 1e-9 * np.abs(offset).max(initial=0.0), ahead, np.nan)
         pixels = np.stack([side / ahead, -up / ahead], axis=1) * self.focal + self.centre
-        return pixels, np.sqrt((offset * offset).sum(axis=1))
+        return pixels, np.sqrt(np.einsum("ij,ij->i", offset, offset))
 
     def look_up(self, image: NDArray[Any], pixels: ArrayLike, outside: float) -> NDArray[Any]:
         """Values (n,) of an image at pixel coordinates (n, 2); `outside` beside it, or for NaN."""

@@ -88,7 +88,8 @@ def alike(position: Reals, normal: Reals, spot: Reals, facing: Reals, tolerance:
 
 def plane_tolerance(camera: Camera, position: Reals, stride: int) -> Reals:
     """How far in metres points of one surface, `stride` pixels apart, may be from its plane."""
-    distance = np.linalg.norm(position - camera.eye.astype(np.float32), axis=-1)
+    offset = position - camera.eye.astype(np.float32)
+    distance = np.sqrt(dot(offset, offset))
     return (3 * stride * camera.footprint(distance)).astype(np.float32)
 
 
@@ -125,7 +126,7 @@ def make_light_map(
     there = np.isfinite(position[..., 0])
     at, facing = position[there].astype(np.float64), normal[there].astype(np.float64)
     # Rays start half a pixel off the surface, so that it does not shade itself.
-    at += 0.5 * camera.footprint(np.linalg.norm(at - camera.eye, axis=1))[:, None] * facing
+    at += 0.5 * camera.footprint(np.sqrt(dot(at - camera.eye, at - camera.eye)))[:, None] * facing
     # Neighbours turn the lights differently, and are averaged: so there are four times as many.
     row, column = np.nonzero(there)
     number = row % 2 + 2 * (column % 2)

@@ -15,6 +15,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import ListedColormap, LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from ..base.errors import LidarpoolError
@@ -26,6 +27,9 @@ Floats = NDArray[np.float64]
 DPI = 200
 FONT = "DejaVu Sans"  # comes with matplotlib
 MANY_POSES = 40  # more than this are drawn as small dots
+PATH_PIECES = 200  # of which the way of a sensor is drawn
+MOST_NAMES = 8  # of actors beside what they name
+NAME_ABOVE, NAME_ROOM = 26.0, (150.0, 22.0)  # pixels of a picture 1600 wide
 LEGEND_ROWS = 30
 LEGEND_LETTERS = 18
 # Of the numbers along the axes, in pixels of a picture 1600 wide.
@@ -58,6 +62,7 @@ class Page:
         axes.add_collection(LineCollection(grid, colors=theme.LINE, linewidths=0.6 * self.unit))
         self._label_axes(axes, shot)
         self._sensors(axes, shot)
+        self._actors(axes, shot)
         return axes
 
     def _label_axes(self, axes: Axes, shot: Shot) -> None:
@@ -100,6 +105,14 @@ class Page:
 
     def _sensors(self, axes: Axes, shot: Shot) -> None:
         """Mark the sensors, hollow where something hides them, each on a stem."""
+        for path in shot.paths:
+            some = path[np.linspace(0, len(path) - 1, min(len(path), PATH_PIECES)).astype(int)]
+            pixels, _ = shot.camera.project(some)
+            axes.plot(
+                *pixels.T, color=theme.SENSOR, lw=0.9 * self.unit, alpha=0.35, zorder=4,
+                solid_capstyle="round",
+            )  # fmt: skip
+            self.lines(axes, shot, np.stack([some[:-1], some[1:]], axis=1), 1.8, 0.9)
         poses = shot.sensors
         many = len(poses) > MANY_POSES
         pixels, seen = shot.visible(poses)
@@ -112,6 +125,29 @@ class Page:
                 facecolors=face, edgecolors=edge, linewidths=(0.2 if many else 0.7) * self.unit,
                 zorder=5,
             )  # fmt: skip
+
+    def _actors(self, axes: Axes, shot: Shot) -> None:
+        """Name the actors, if they are few, each above its place."""
+        if not 0 < shot.actors <= MOST_NAMES:
+            return
+        boxes, taken = shot.scene.object_bounds[-shot.actors :], np.empty((0, 2))
+        tops = np.column_stack([boxes[:, :, :2].mean(axis=1), boxes[:, 1, 2]])
+        halo = [withStroke(linewidth=1.6 * self.unit, foreground=theme.PAGE)]
+        names = shot.scene.names[-shot.actors :]
+        for pixel, name in zip(shot.camera.project(tops)[0], names, strict=True):
+            place = pixel - (0, NAME_ABOVE * self.unit)
+            while (np.abs(taken - place) < np.array(NAME_ROOM) * self.unit).all(axis=1).any():
+                place = place - (0, NAME_ROOM[1] * self.unit)
+            taken = np.vstack([taken, place])
+            axes.plot(
+                *np.stack([pixel, place]).T, color=theme.INK, lw=0.7 * self.unit, zorder=6,
+                path_effects=halo,
+            )  # fmt: skip
+            text = axes.text(
+                float(place[0]), float(place[1]), shortened(name), ha="center", va="bottom",
+                color=theme.INK, family=FONT, fontsize=6.6 * self.unit, path_effects=halo, zorder=7,
+            )  # fmt: skip
+            text.set_parse_math(False)  # names come from files
 
     def lines(self, axes: Axes, shot: Shot, segments: Floats, width: float, alpha: float) -> None:
         """Draw the parts of segments (n, 2, 3) that nothing hides, in the sensors' colour."""

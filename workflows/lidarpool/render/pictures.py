@@ -37,9 +37,13 @@ def draw_scene(path: Path, shot: Shot) -> None:
     colours = _object_colours(scene)
     page = Page(shot.camera.size)
     page.show(shot, shot.paint(colours[scene.face_object]))
-    page.legend(list(zip(without_common_prefix(scene.names), colours, strict=True)))
+    entries = list(zip(without_common_prefix(scene.names), colours, strict=True))
+    first = len(entries) - shot.actors  # actors are first in the legend: they are what happens
+    page.legend(entries[first:] + entries[:first])
     page.title(
-        "Scene", f"{counted(len(scene.names), 'object')} · {counted(len(scene.faces), 'triangle')}"
+        "Scene",
+        f"{counted(len(scene.names), 'object')} · {counted(len(scene.faces), 'triangle')} · "
+        f"{shot.when}",
     )
     page.save(path)
 
@@ -65,7 +69,7 @@ def draw_intensity(
     page.lines(axes, shot, sample_rays[some].astype(np.float64), 0.45, 0.5)
     page.colour_bar(TURBO, LogNorm(low, high), "hits per square metre")
     hits = counted(int(hit_counts.sum()), "hit")
-    page.title("Ray intensity", f"{hits} · {_positions(shot)} · grey: hit by no ray")
+    page.title("Ray intensity", f"{hits} · {shot.when} · grey: hit by no ray")
     page.save(path)
 
 
@@ -90,12 +94,8 @@ def draw_cloud(path: Path, shot: Shot, positions: Floats, count: int) -> None:
         )
         page.colour_bar(TURBO, Normalize(low, high), "height z (m)")
     page.show(shot, image)
-    page.title("Point cloud", f"{counted(count, 'point')} · {_positions(shot)}")
+    page.title("Point cloud", f"{counted(count, 'point')} · {shot.when}")
     page.save(path)
-
-
-def _positions(shot: Shot) -> str:
-    return counted(len(shot.sensors), "sensor position")
 
 
 def _object_colours(scene: Scene) -> Floats:
@@ -128,24 +128,38 @@ def with_points(
     shown = np.zeros(len(points), np.bool_)
     # A point at a silhouette may fall into the pixel beside the one that shows its surface.
     for beside in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)):
-        depth = shot.camera.look_up(shot.depth, pixels + beside, np.inf)
-        shown |= np.abs(distance - depth) <= slack
+        left = np.flatnonzero(~shown)
+        depth = shot.camera.look_up(shot.depth, pixels[left] + beside, np.inf)
+        shown[left] = np.abs(distance[left] - depth) <= slack[left]
     order = np.flatnonzero(shown)
     order = order[np.argsort(-distance[order])]
-    light = shot.camera.look_up(shot.whole.light.reshape(shot.depth.shape), pixels[order], 1.0)
-    shaded = np.round(255 * colours[order] * (0.5 + 0.5 * light)[:, None].clip(0, 1))
+    pixels = pixels[order]
+    light = shot.camera.look_up(shot.whole.light.reshape(shot.depth.shape), pixels, 1.0)
+    shaded = _packed(colours[order] * (0.5 + 0.5 * light)[:, None].clip(0, 1))
     # Discs are drawn at twice the resolution and averaged down, so that their edges are smooth.
     width, height = shot.camera.size
-    fine = np.round(255 * image).astype(np.uint8).repeat(2, axis=0).repeat(2, axis=1)
     radius = max(min(320 / np.sqrt(len(points) + 1), 5.2) * width / 1600, 1.5)
     reach = int(radius)
+    margin = reach + 2  # for discs of points beside the edge
+    wide = 2 * (width + margin)
+    fine = np.zeros((2 * (height + margin), wide), np.uint32)
+    inner = fine[margin : margin + 2 * height, margin : margin + 2 * width]
+    inner[:] = _packed(image).repeat(2, axis=0).repeat(2, axis=1)
     disc = [
-        (dx, dy)
+        dy * wide + dx
         for dy in range(-reach, reach + 1)
         for dx in range(-reach, reach + 1)
         if dx * dx + dy * dy <= radius * radius
     ]
-    cells = (np.floor(2 * pixels[order])[:, None] + disc).astype(np.int64)
-    column, row = np.clip(cells, 0, (2 * width - 1, 2 * height - 1)).T
-    fine[row.T, column.T] = shaded[:, None]  # the last, which is nearest, stays
-    return fine.reshape(height, 2, width, 2, 3).mean(axis=(1, 3), dtype=np.float32) / 255
+    column, row = (2 * pixels.T).astype(np.int64) + margin
+    # Of several colours for one place the last, which is nearest, stays.
+    fine.ravel()[(row * wide + column)[:, None] + disc] = shaded[:, None]
+    out = np.ascontiguousarray(inner).view(np.uint8).reshape(height, 2, width, 2, 4)[..., :3]
+    return out.mean(axis=(1, 3), dtype=np.float32) / 255
+
+
+def _packed(colours: NDArray[np.floating]) -> NDArray[np.uint32]:
+    """Colours (..., 3) in 0 to 1 as one number each, with a byte for each part."""
+    parts = np.zeros((*colours.shape[:-1], 4), np.uint8)
+    parts[..., :3] = np.round(255 * colours)
+    return parts.view(np.uint32)[..., 0]

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from poolpart.wording import counted
 
 from ..scene.scene import Scene
 from . import theme
@@ -52,6 +54,9 @@ class Shot:
 
     scene: Scene
     sensors: Floats  # (p, 3) metres, local coordinates
+    paths: tuple[Floats, ...]  # of sensors that move, (k, 3) each
+    actors: int  # the last objects of the scene, which are named in the pictures
+    when: str  # what is drawn, for a caption: how many sensors there are, and at what time
     stage: Stage
     camera: Camera
     whole: Samples  # through the middle of each pixel
@@ -124,7 +129,14 @@ class Shot:
 
 
 def take_shot(
-    scene: Scene, poses: ArrayLike, *, size: tuple[int, int] = SIZE, backend: str = "auto"
+    scene: Scene,
+    poses: ArrayLike,
+    *,
+    paths: Sequence[Floats] = (),
+    actors: int = 0,
+    when: str = "",
+    size: tuple[int, int] = SIZE,
+    backend: str = "auto",
 ) -> Shot:
     """Look at a scene from a place that shows it well.
 
@@ -137,16 +149,23 @@ def take_shot(
         What to show.
     poses
         (p, 3) sensor positions, world coordinates.
+    paths
+        Ways of sensors that move, (k, 3) each, local coordinates.
+    actors
+        How many of the last objects are actors.
+    when
+        How many sensors there are, and at what time they are shown; by default how many.
     size
         Width and height of the picture in pixels.
     backend
         Ray caster, see `raybeam.RayCaster`.
     """
     sensors = np.asarray(poses, dtype=np.float64).reshape(-1, 3) - scene.origin
-    stage = _stage(scene, sensors)
+    everywhere = np.concatenate([sensors, *paths])
+    stage = _stage(scene, everywhere)
     surface = Surface.of(scene, backend)
     camera, reach = _camera(stage, size, 33.0), np.inf
-    cutaway = plan_cutaway(surface, sensors, camera.eye)
+    cutaway = plan_cutaway(surface, everywhere, camera.eye)
     if cutaway is not None:
         # From higher up more of the floor is seen between what stands on it.
         camera, reach = _camera(stage, size, 42.0), 0.15 * stage.size
@@ -187,7 +206,8 @@ def take_shot(
             pixels[there], samples.position[there], samples.normal[there],
             samples.triangle[there] == GROUND,
         )  # fmt: skip
-    return Shot(scene, sensors, stage, camera, whole, edges, finer)
+    when = when or counted(len(sensors), "sensor position")
+    return Shot(scene, sensors, tuple(paths), actors, when, stage, camera, whole, edges, finer)
 
 
 def _stage(scene: Scene, sensors: Floats) -> Stage:

@@ -16,15 +16,16 @@ from typing import Any
 
 from ..base.errors import LidarpoolError
 from ..base.interrupts import deferred_interrupts
+from ..base.vocabulary import PICTURES
+from ..columns.storage import flush
 from ..export.ply import save_cloud
 from ..plan import Planning
-from ..run.picture_file import PICTURE_FILE, PICTURES, Pictured
+from ..run.picture_file import PICTURE_FILE, Pictured
 from ..run.result import Result
+from ..scenario.scenario import Scenario
 from ..scene.scene import Scene
 from ..sensor import Survey
 from .cloud_numbers import CountedCloud
-from .page import Recipe, write_page
-from .pictures import picture_makers
 from .report import make_report
 
 ROOM_BYTES = 32 << 20  # what pictures and report may take
@@ -78,7 +79,7 @@ def write_result(
     scene: Scene,
     survey: Survey,
     planning: Planning | None,
-    recipe: Recipe | None = None,
+    scenario: Scenario | None = None,
     then: Callable[[], object] = lambda: None,
     only_cloud: bool = False,
 ) -> dict[str, Any]:
@@ -96,9 +97,13 @@ def write_result(
         If a file cannot be written.
     """
     staged = folder / f"{_WRITING}{secrets.token_hex(4)}"
-    counted = CountedCloud(result.points, survey, scene.origin, len(scene.names))
+    counted = CountedCloud(result.points, len(scene.all_names))
     makers: dict[str, Callable[[Path], object]] = {}
     if not only_cloud:
+        # Matplotlib is as much to import as all that a cloud takes.
+        from .page.page import write_page
+        from .pictures import picture_makers
+
         shown = Pictured.of(result, scene, survey, planning)
         # The cloud is drawn from its file, as by `lidarpool plot`, so that both draw the same.
         drawn = picture_makers(shown, staged / CLOUD)
@@ -107,16 +112,15 @@ def write_result(
     try:
         staged.mkdir()
         save_cloud(staged / CLOUD, counted, precision_m=survey.precision_m)
-        numbers = counted.numbers()
-        report = make_report(result, scene, survey, planning, files, numbers)
+        report = make_report(result, scene, survey, planning, files, counted)
         for name, make in makers.items():
             make(staged / name)
         if not only_cloud:
-            write_page(staged / PAGE, report, result, numbers, planning, recipe)
+            write_page(staged / PAGE, report, result, counted, scenario)
         text = json.dumps(report, indent=1, allow_nan=False) + "\n"
         (staged / REPORT).write_text(text, encoding="utf-8")
         for name in files:
-            _flush(staged / name)
+            flush(staged / name)
         with deferred_interrupts():
             _publish(staged, folder, files)
             then()
@@ -140,13 +144,13 @@ def _publish(staged: Path, folder: Path, files: Collection[str]) -> None:
     """
     for name in (REPORT, PAGE):
         (folder / name).unlink(missing_ok=True)
-    _flush(folder)
+    flush(folder)
     for name in FILES:
         if name in files:
             (staged / name).replace(folder / name)
         else:  # a path of an earlier run would pass for this one's
             (folder / name).unlink(missing_ok=True)
-    _flush(folder)
+    flush(folder)
 
 
 def _lock(folder: Path) -> int:
@@ -159,12 +163,3 @@ def _lock(folder: Path) -> int:
             os.close(handle)
             raise
     return handle
-
-
-def _flush(path: Path) -> None:
-    """Wait until the file or folder is on the disk."""
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

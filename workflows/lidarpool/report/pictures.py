@@ -6,6 +6,8 @@ from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
+import numpy as np
+
 from ..export.ply import read_positions
 from ..render.pictures import MOST_POINTS, draw_cloud, draw_intensity, draw_scene
 from ..render.shot import SIZE, Shot, take_shot
@@ -32,7 +34,18 @@ def picture_makers(
 
     @cache
     def shot() -> Shot:
-        return take_shot(shown.scene, shown.poses, size=size)
+        middle, scene = shown.duration_ns / 2, shown.scene
+        moving = [way for way in shown.sensors if way.moves]
+        # Of sensors that move a marker is where they are halfway, and a line the rest.
+        places = [w.at(middle)[None] if w.moves else w.positions for w in shown.sensors]
+        return take_shot(
+            scene.solid(middle),
+            np.concatenate([np.empty((0, 3)), *places]) + scene.origin,
+            paths=[way.positions for way in moving],
+            actors=len(scene.actors),
+            when=shown.when,
+            size=size,
+        )
 
     makers: dict[str, Callable[[Path], object]] = {
         "scene": lambda path: draw_scene(path, shot()),

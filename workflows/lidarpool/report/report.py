@@ -20,7 +20,7 @@ from ..run.trials import TRIAL
 from ..scan import COLLECT, GENERATE, INTERSECT, SORT
 from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
-from .cloud_numbers import CloudNumbers
+from .cloud_numbers import CountedCloud
 
 _ORDER = (GENERATE, INTERSECT, SORT, COLLECT, TRIAL)  # in which stages are listed
 
@@ -53,7 +53,7 @@ def make_report(
     survey: Survey,
     planning: Planning | None,
     files: Sequence[str],
-    numbers: CloudNumbers,
+    cloud: CountedCloud,
 ) -> dict[str, Any]:
     """Report of a run, ready for JSON.
 
@@ -70,9 +70,9 @@ def make_report(
         "hits": result.hits,
         "points": len(result.points),
         "points_by_object": {
-            name: int(count) for name, count in zip(scene.names, numbers.by_object, strict=True)
+            name: int(count) for name, count in zip(scene.all_names, cloud.by_object, strict=True)
         },
-        "columns": _columns(result, numbers),
+        "columns": _columns(cloud),
         "seconds": {
             "total": round(result.seconds, 3),
             "survey": round(result.survey_seconds, 3),
@@ -91,13 +91,13 @@ def make_report(
     }
 
 
-def summary(folder: Path, report: dict[str, Any], log: Path | None) -> dict[str, Any]:
+def summary(folder: Path, report: dict[str, Any]) -> dict[str, Any]:
     """Return what `--json` prints: main figures of a report, and where the files are.
 
     Parameters
     ----------
-    folder, log
-        Where the files are, and the messages of libraries; None for none.
+    folder
+        Where the files are.
     report
         See `make_report`.
     """
@@ -105,7 +105,6 @@ def summary(folder: Path, report: dict[str, Any], log: Path | None) -> dict[str,
     return {
         "folder": str(folder),
         "files": {name: str(folder / name) for name in report["files"]},
-        "log": str(log) if log else None,
         **{name: report[name] for name in _FIGURES},
         "planning": planning and {name: planning[name] for name in _PLANNING},
     }
@@ -113,18 +112,26 @@ def summary(folder: Path, report: dict[str, Any], log: Path | None) -> dict[str,
 
 def _parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
     return {
-        "objects": len(scene.names),
-        "triangles": len(scene.faces),
+        "objects": len(scene.all_names),
+        "triangles": scene.triangles,
         "origin": scene.origin.tolist(),
         "sensor": _sensor(survey.sensor),
+        "sensors": {m.name: _sensor(m.sensor) for m in survey.sensors if m.name},
+        "actors": [actor.name for actor in scene.actors],
         "poses": survey.path.stations,
-        "steps": survey.steps,
+        "trajectory_s": survey.duration_ns / 1e9 if survey.path.moves else None,
+        "steps": survey.steps_each[0],
+        "coordinates": survey.coordinates,
         "keep_every": survey.keep_every,
         "precision_m": survey.precision_m,
+        "materials": len(survey.materials),
+        "returns": asdict(survey.returns),
+        "noise": asdict(survey.noise),
+        "visibility_km": survey.visibility_km,
     }
 
 
-def _columns(result: Result, numbers: CloudNumbers) -> list[dict[str, Any]]:
+def _columns(cloud: CountedCloud) -> list[dict[str, Any]]:
     """Describe the columns of the cloud beside x, y and z."""
     return [
         {
@@ -137,8 +144,8 @@ def _columns(result: Result, numbers: CloudNumbers) -> list[dict[str, Any]]:
             "lowest": low,
             "highest": high,
         }
-        for column in result.points.table
-        for low, high in [numbers.limits.get(column.name, (0, 0))]
+        for column in cloud.table
+        for low, high in [cloud.limits.get(column.name, (0, 0))]
     ]
 
 
@@ -151,7 +158,7 @@ def _sensor(sensor: Sensor) -> dict[str, Any]:
         if not name.startswith("_") and isinstance(value, (int, float, str))
     }
     return {
-        "kind": sensor.name or type(sensor).__name__,
+        "kind": sensor.model,
         "channels": sensor.channels,
         "elevation_deg": [round(float(elevations.min()), 6), round(float(elevations.max()), 6)],
         "head": {"kind": type(sensor.head).__name__, **head},

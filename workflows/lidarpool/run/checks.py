@@ -37,6 +37,9 @@ def slots_needed(collectors: int, planning: bool) -> dict[str, int]:
 def check_precision(scene: Scene, survey: Survey) -> None:
     """Check that the scene spans few enough cells of the cloud's precision to be numbered."""
     reach = float(np.abs(scene.vertices).max(initial=0.0))
+    for actor in scene.actors:
+        ways, _ = actor.trajectory.poses(0, np.linspace(0, survey.duration_ns, 100))
+        reach = max(reach, float(np.abs(ways).max() + np.abs(actor.mesh.vertices).max()))
     if reach / survey.precision_m >= 2**31 - 1:
         raise LidarpoolError(
             f"precision_m {survey.precision_m} is too fine for a scene that reaches {reach:.0f} m "

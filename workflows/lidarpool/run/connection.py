@@ -8,14 +8,26 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
+import dask
 from distributed import Client, Security
 from distributed.comm import connect
 
+from poolpart.internals import forked_workers
+
 from ..base.errors import LidarpoolError
+from ..base.fork_server import start_fork_server
 from ..base.interrupts import children_spared, deferred_interrupts
 from .local import local_cluster
 
 CONNECT_TIMEOUT_S = 10
+
+# What Dask watches many times a second in each process, for a dashboard that a cluster of one run
+# does not have: idle, a worker took 3 % of a core, and now takes a fifth of that.
+_QUIET = {
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.tick.interval": "1s",
+    "distributed.admin.system-monitor.interval": "5s",
+}
 
 
 class TlsFiles(NamedTuple):
@@ -59,11 +71,15 @@ def local_client(
     stack = ExitStack()
     try:
         with deferred_interrupts(), children_spared():
+            stack.enter_context(dask.config.set(_QUIET))
+            if start_fork_server():
+                stack.enter_context(forked_workers())
             cluster = local_cluster(
                 gpu_workers=gpu_workers,
                 lidar_slots=2 + collectors,
                 other_workers=other_workers if planning or other_workers else 0,
                 security=tls,
+                dashboard_port=None,  # nobody is told of it, and Bokeh takes half a second
             )
             stack.callback(cluster.close)
             client = stack.enter_context(Client(cluster, set_as_default=False))

@@ -26,15 +26,20 @@ def identity_of(job: Job) -> dict[str, str]:
         "numpy": version("numpy"),
         "open3d": _open3d_version(),
         "scene": fingerprint(
-            scene.vertices, scene.faces, scene.face_object, scene.origin, scene.names
+            scene.vertices, scene.faces, scene.face_object, scene.origin, scene.names, scene.actors
         ),
         "survey": fingerprint(
-            survey.sensor,
+            survey.carried,
             survey.path,
-            survey.steps,
+            survey.steps_each,
+            survey.coordinates,
             survey.keep_every,
             survey.precision_m,
             survey.columns,
+            survey.materials,
+            survey.returns,
+            survey.noise,
+            survey.visibility_km,
         ),
         "planning": "" if job.planning is None else fingerprint(job.planning),
     }

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..base.errors import LidarpoolError
+from ..base.vocabulary import PATIENCE_S, WAIT_S
 from ..plan import Planning
-from ..scan.watch import PATIENCE_S, WAIT_S
 from ..scenario.scenario import Scenario
 from ..scene.scene import Scene
 from ..sensor import Survey
+from ..sensor.materials import MaterialTable
 from .checks import check_precision
 
 
@@ -36,7 +37,8 @@ class Job:
     Raises
     ------
     LidarpoolError
-        If a number is below 1, or the survey's precision too fine for the scene.
+        If a number is below 1, the survey's precision too fine for the scene, a material one
+        of no object, or an object without a material where others have one.
     """
 
     scene: Scene
@@ -49,6 +51,9 @@ class Job:
     patience_s: float = PATIENCE_S
 
     def __post_init__(self) -> None:
+        MaterialTable.of(self.survey.materials, self.scene.all_names)  # that they fit
+        for actor in self.scene.actors:
+            actor.check(self.survey.duration_ns)
         check_precision(self.scene, self.survey)
         limits = {"queue_capacity": 1, "collectors": 1, "wait_s": 0, "patience_s": 0}
         for name, least in limits.items():

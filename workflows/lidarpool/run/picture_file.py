@@ -4,26 +4,61 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from poolpart.wording import counted
+
 from ..base.errors import LidarpoolError
 from ..plan import Plan, Planning
+from ..scene.actors import Actor
+from ..scene.mesh import Mesh
 from ..scene.scene import Scene
-from ..sensor import Survey
+from ..sensor import Survey, Track
+from ..sensor.trajectory import quaternions_of
 from .result import Result
 
 PICTURE_FILE = "pictures.npz"
-PICTURES = ("scene", "intensity", "cloud", "path")  # that are drawn
 
-PLACES_MOST = 200  # of a sensor that moves
-_FORMAT = 1
+PLACES_MOST = 1000  # of a sensor or an actor that moves
+_FORMAT = 2
+_ACTOR = ("vertices", "faces", "times", "positions", "quaternions")
 _PLAN_NUMBERS = ("length", "shortest_possible", "clearance", "trial", "trials")
+
+
+@dataclass(frozen=True, eq=False)
+class SensorWay:
+    """Where a sensor is in the course of time.
+
+    Parameters
+    ----------
+    times_ns
+        float64 (k,), ascending, nanoseconds since the survey's start.
+    positions
+        float64 (k, 3): where it is then, metres, local coordinates.
+    moves
+        Whether it moves from each place to the next; else it stands there until its time.
+    name, model
+        What it is called, "" where there is one; and what it is.
+    """
+
+    times_ns: NDArray[np.float64]
+    positions: NDArray[np.float64]
+    moves: bool = False
+    name: str = ""
+    model: str = ""
+
+    def at(self, time_ns: float) -> NDArray[np.float64]:
+        """Where it is at a time, (3,)."""
+        if self.moves:
+            return np.array([np.interp(time_ns, self.times_ns, x) for x in self.positions.T])
+        last = int(np.searchsorted(self.times_ns, time_ns, "right")) - 1
+        return np.asarray(self.positions[max(last, 0)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,11 +68,11 @@ class Pictured:
     Parameters
     ----------
     scene
-        What was scanned.
-    poses
-        float64 (p, 3): where the sensor stood, metres, world coordinates.
+        What was scanned; trajectories of its actors are a thousand poses at most.
+    sensors
+        Where they were.
     hit_counts
-        int64 (f,): hits of each triangle.
+        int64 (f,): hits of each triangle, those of actors after the others.
     sample_rays
         float32 (k, 2, 3): ends of some rays, metres, local coordinates.
     planning, plan
@@ -45,30 +80,48 @@ class Pictured:
     trials
         What the best path was chosen from, float64 (w, 2) each: corners of the paths between the
         two ends, metres, local coordinates.
+    duration_ns
+        How long the survey lasted, by its own clock.
     """
 
     scene: Scene
-    poses: NDArray[np.float64]
+    sensors: Sequence[SensorWay]
     hit_counts: NDArray[np.int64]
     sample_rays: NDArray[np.float32]
     planning: Planning | None
     plan: Plan | None
     trials: Sequence[NDArray[np.float64]]
+    duration_ns: float = 0.0
 
     @classmethod
     def of(
         cls, result: Result, scene: Scene, survey: Survey, planning: Planning | None
     ) -> Pictured:
         """Return what the pictures of a result show."""
+        actors = tuple(_sampled(actor, survey.duration_ns) for actor in scene.actors)
         return cls(
-            scene,
-            sensor_places(survey) + scene.origin,
+            replace(scene, actors=actors),
+            sensor_ways(survey),
             result.hit_counts,
             result.sample_rays,
             planning if result.plan is not None else None,
             result.plan if planning is not None else None,
             [trial.waypoints for trial in result.trials],
+            survey.duration_ns,
         )
+
+    @property
+    def when(self) -> str:
+        """Say how many sensors there are, and at what time pictures show what moves: halfway."""
+        sensors, actors = len(self.sensors), len(self.scene.actors)
+        if any(way.moves for way in self.sensors):
+            words = f"{counted(sensors, 'sensor')} on {'its' if sensors == 1 else 'their'} way"
+        else:
+            words = counted(sum(len(w.positions) for w in self.sensors), "sensor position")
+            if not actors:
+                return words
+        words += f" and {counted(actors, 'actor')}" if actors else ""
+        return f"{words}, at {self.duration_ns / 2e9:.3g} s of {self.duration_ns / 1e9:.3g} s"
 
     def save(self, path: Path) -> None:
         """Write it as a NumPy archive; the same content gives the same bytes.
@@ -78,18 +131,33 @@ class Pictured:
         OSError
             If it cannot be written.
         """
+        names = {
+            "objects": self.scene.names,
+            "actors": [actor.name for actor in self.scene.actors],
+            "sensors": [[way.name, way.model, way.moves] for way in self.sensors],
+        }
         arrays: dict[str, Any] = {
             "format": _FORMAT,
             "vertices": self.scene.vertices,
             "faces": self.scene.faces,
             "face_object": self.scene.face_object,
             # Strings of NumPy are all as long as the longest, and lose zeros at their end.
-            "names": np.frombuffer(json.dumps(self.scene.names).encode(), np.uint8),
+            "names": np.frombuffer(json.dumps(names).encode(), np.uint8),
             "origin": self.scene.origin,
-            "poses": self.poses,
+            "duration_ns": self.duration_ns,
             "hit_counts": self.hit_counts,
             "sample_rays": self.sample_rays,
         }
+        for number, way in enumerate(self.sensors):
+            arrays |= {f"sensor{number}_times": way.times_ns, f"sensor{number}": way.positions}
+        for number, actor in enumerate(self.scene.actors):
+            track = actor.trajectory
+            if not isinstance(track, Track):
+                raise TypeError(f"the trajectory of actor {actor.name!r} is not sampled")
+            mesh = actor.mesh
+            made = (mesh.vertices, mesh.faces, track.times_s, track.positions, track.quaternions)
+            values = zip(_ACTOR, made, strict=True)
+            arrays |= {f"actor{number}_{part}": value for part, value in values}
         if self.planning is not None and self.plan is not None:
             arrays |= {
                 "ends": [self.planning.start, self.planning.target],
@@ -130,29 +198,54 @@ class Pictured:
     def _from_arrays(cls, arrays: Mapping[str, Any]) -> Pictured:
         if (made := int(arrays["format"])) != _FORMAT:
             raise ValueError(f"it is of format {made}, not {_FORMAT}")
+        names = json.loads(arrays["names"].tobytes())
+        actors = []
+        for number, name in enumerate(names["actors"]):
+            vertices, faces, *track = (arrays[f"actor{number}_{part}"] for part in _ACTOR)
+            actors.append(Actor(Mesh(name, vertices, faces), Track(*track)))
         scene = Scene(
             arrays["vertices"],
             arrays["faces"],
             arrays["face_object"],
-            tuple(map(str, json.loads(arrays["names"].tobytes()))),
+            tuple(map(str, names["objects"])),
             arrays["origin"],
+            tuple(actors),
         )
+        sensors = [
+            SensorWay(arrays[f"sensor{k}_times"], arrays[f"sensor{k}"], moves, name, model)
+            for k, (name, model, moves) in enumerate(names["sensors"])
+        ]
         counts = arrays["hit_counts"]
-        if counts.shape != (len(scene.faces),):
-            raise ValueError(f"hit_counts of {counts.shape} for {len(scene.faces)} triangles")
+        if counts.shape != (scene.triangles,):
+            raise ValueError(f"hit_counts of {counts.shape} for {scene.triangles} triangles")
+        rays, duration = arrays["sample_rays"], float(arrays["duration_ns"])
         if "path" not in arrays:
-            return cls(scene, arrays["poses"], counts, arrays["sample_rays"], None, None, ())
+            return cls(scene, sensors, counts, rays, None, None, (), duration)
         start, target = arrays["ends"]
         planning = Planning(start, target, arrays["centres"], arrays["radii"])
         numbers = {name: arrays[name].item() for name in _PLAN_NUMBERS}
         plan, trials = Plan(path=arrays["path"], **numbers), tuple(arrays["waypoints"])
-        return cls(scene, arrays["poses"], counts, arrays["sample_rays"], planning, plan, trials)
+        return cls(scene, sensors, counts, rays, planning, plan, trials, duration)
 
 
-def sensor_places(survey: Survey) -> NDArray[np.float64]:
-    """Where the sensor was, (p, 3): at each station, or now and then on its way."""
-    path = survey.path
-    if not path.moves:
-        return np.array([path.pose(station).position for station in range(path.stations)])
-    scans = np.unique(np.linspace(0, survey.scan_count - 1, PLACES_MOST).astype(int))
-    return np.array([survey.pose(scan).position for scan in scans.tolist()])
+def sensor_ways(survey: Survey) -> list[SensorWay]:
+    """Where each sensor was: at each station, or now and then on its way."""
+    path, ways, first = survey.path, [], 0
+    for carried, steps in zip(survey.carried, survey.steps_each, strict=True):
+        end = first + steps * path.stations
+        some: Iterable[int] = range(first, end, steps)  # the first at each station
+        if path.moves:
+            some = np.unique(np.linspace(first, end - 1, PLACES_MOST).astype(int)).tolist()
+        times = np.array([survey.begins_ns(scan) for scan in some])
+        places = np.array([survey.pose(scan).position for scan in some])
+        ways.append(SensorWay(times, places, path.moves, carried.name, carried.sensor.model))
+        first = end
+    return ways
+
+
+def _sampled(actor: Actor, duration_ns: float) -> Actor:
+    """Return an actor with poses of a survey, whatever its trajectory is."""
+    times = np.linspace(0, max(duration_ns, 1.0), PLACES_MOST)
+    positions, rotations = actor.trajectory.poses(0, times)
+    turns = np.eye(3)[None].repeat(len(times), axis=0) if rotations is None else rotations
+    return replace(actor, trajectory=Track(times / 1e9, positions, quaternions_of(turns)))

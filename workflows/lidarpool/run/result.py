@@ -70,7 +70,7 @@ class Result:
 
     @cached_property
     def hit_counts(self) -> NDArray[np.int64]:
-        """Rays that hit each triangle of the scene, (f,), read when first asked for."""
+        """Rays that hit each triangle of scene and actors, (f,), read when first asked for."""
         return self._hit_counts()
 
     @cached_property

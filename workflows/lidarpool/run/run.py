@@ -30,7 +30,6 @@ from ..scan import (
     Frame,
     RigPlan,
     SurveyDriver,
-    SurveyOptions,
     Watch,
 )
 from .checks import find_workers
@@ -47,7 +46,6 @@ _CLUSTER_LOST = (OSError, CommClosedError, FutureCancelledError, PipeClosed, Pip
 PROGRESS_EVERY_S = 0.1
 SAVE_EVERY_S = 1.0  # how many frames were handed out
 LOST_S = 0.5  # for a client to notice that its scheduler is gone
-PAUSED_S = 0.1  # from one look at a paused run to the next
 LONGEST_PAUSE_S = 0.05  # while nothing moves
 
 
@@ -60,8 +58,6 @@ class Run:
         Client of the cluster.
     store
         Where parts and receipts go, and what an earlier run has left there.
-    wants_pause
-        Asked over and over; while it says yes, what is under way arrives and no more is begun.
     tell
         Called, every few seconds, with what the run waits for.
 
@@ -75,13 +71,11 @@ class Run:
         self,
         client: Client,
         store: RunStore,
-        wants_pause: Callable[[], bool] = lambda: False,
         tell: Callable[[str], None] = lambda words: None,
     ) -> None:
         job = store.job
         self.client, self.job, self.store = client, job, store
-        self._wants_pause, self._tell = wants_pause, tell
-        self._stood = False  # whether it stood still, paused, at the last look
+        self._tell = tell
         # For when it is lost; a client that was never connected is refused in a moment.
         self.address: str = getattr(client.scheduler, "address", "")
         try:
@@ -178,7 +172,9 @@ class Run:
             self.store.points_of_scan,
             take,
             lambda parts: self.store.on_parts(parts) if self.store.on_parts else None,
-            SurveyOptions(job.queue_capacity, job.collectors, job.patience_s),
+            queue_capacity=job.queue_capacity,
+            collectors=job.collectors,
+            patience_s=job.patience_s,
         )
 
     def _call(self, callback: Callable[[T], None], argument: T) -> None:
@@ -210,7 +206,6 @@ class Run:
         told = saved = float("-inf")
         while len(times) < len(pumps):
             moved = False
-            still = self._look_at_pause(pumps)
             for pump in pumps:
                 if not pump.finished:
                     moved |= pump.step()
@@ -226,32 +221,12 @@ class Run:
             watch.look(now)
             if on_progress and (now - told >= PROGRESS_EVERY_S or len(times) == len(pumps)):
                 told = now
-                self._call(on_progress, self._progress(survey, trials, now - started, still))
-            if still:
-                time.sleep(PAUSED_S)
-            else:
-                pause_s = 0.0 if moved else min(max(0.001, 2 * pause_s), LONGEST_PAUSE_S)
-                (time.sleep if survey.finished else survey.wait)(pause_s)
+                self._call(on_progress, self._progress(survey, trials, now - started))
+            pause_s = 0.0 if moved else min(max(0.001, 2 * pause_s), LONGEST_PAUSE_S)
+            (time.sleep if survey.finished else survey.wait)(pause_s)
         return times
 
-    def _look_at_pause(self, pumps: Sequence[SurveyDriver | TrialPump]) -> bool:
-        """Ask whether the run is to pause; returns whether it stands still.
-
-        It is stepped all the while: a worker that dies is noticed, and a lost cluster. As nothing
-        is under way when it stands still, there is nothing that could take too long.
-        """
-        wanted = self._wants_pause()
-        for pump in pumps:
-            pump.paused = wanted
-        still = wanted and all(pump.idle for pump in pumps)
-        if still and not self._stood:
-            self.store.db.save_frames()
-        self._stood = still
-        return still
-
-    def _progress(
-        self, survey: SurveyDriver, trials: TrialPump | None, seconds: float, paused: bool
-    ) -> Progress:
+    def _progress(self, survey: SurveyDriver, trials: TrialPump | None, seconds: float) -> Progress:
         return replace(
             self.store.progress(),
             generated=survey.generated,
@@ -259,7 +234,6 @@ class Run:
             trials_done=len(trials.trials) if trials else 0,
             seconds=seconds,
             replayed=survey.offered_again,
-            paused=paused,
             waits_for=survey.waits_for,
         )
 

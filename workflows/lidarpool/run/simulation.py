@@ -8,9 +8,9 @@ from pathlib import Path
 
 from distributed import Client
 
+from ..base.vocabulary import PATIENCE_S, WAIT_S
 from ..plan import Planning
 from ..scan import Frame
-from ..scan.watch import PATIENCE_S, WAIT_S
 from ..scene.scene import Scene
 from ..sensor import Survey
 from .checks import check_backend_here

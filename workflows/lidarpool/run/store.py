@@ -5,12 +5,10 @@ from __future__ import annotations
 import json
 import secrets
 import shutil
-import sqlite3
 import tempfile
 import weakref
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager, suppress
-from dataclasses import asdict, replace
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +18,9 @@ from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud
 from ..columns.parts import SUFFIX, StoredCloud, read_part, read_tally
 from ..columns.storage import Storage
-from ..columns.table import TABLE, Column
+from ..scan.database import FILE, RunDatabase, parts_place
 from ..scan.messages import Receipt, samples_of_scan, summary_type
 from .checks import AUTO_TAKES
-from .database import FILE, RunDatabase, parts_place
 from .identity import difference, identity_of
 from .job import Job
 from .progress import Progress
@@ -120,11 +117,7 @@ class RunStore:
         self.folder.mkdir(exist_ok=True)
         db = RunDatabase(path, count, durable=self.lasting)
         place = "" if parts is None else f"{Storage.at(parts).url}/run-{secrets.token_hex(4)}"
-        survey = self.job.survey
-        table = [asdict(replace(column, source="")) for column in survey.stored_columns]
-        cloud = {"precision_m": survey.precision_m, "columns": table}
-        cloud["origin"] = self.job.scene.origin.tolist()
-        db.set(identity=json.dumps(here), parts=place, cloud=json.dumps(cloud))
+        db.set(identity=json.dumps(here), parts=place)
         return db
 
     def _go_on(self, here: dict[str, str], resume: bool, sizes: dict[str, int]) -> None:
@@ -212,10 +205,16 @@ class RunStore:
             seconds=0.0,
         )
 
+    @property
+    def _cloud_origin(self) -> NDArray[np.float64]:
+        """Of the points' coordinates: that of the scene, or none in a sensor's."""
+        world = self.job.survey.coordinates == "world"
+        return self.job.scene.origin if world else np.zeros(3)
+
     def points(self) -> StoredCloud:
         """Points that are committed so far."""
         parts = self.db.ordered
-        survey, scene = self.job.survey, self.job.scene
+        survey = self.job.survey
         return StoredCloud(
             self.storage,
             [part.name for part in parts],
@@ -223,7 +222,7 @@ class RunStore:
             survey.stored_columns,
             self.db.cells,
             survey.precision_m,
-            scene.origin,
+            self._cloud_origin,
             keeper=self,
         )
 
@@ -237,8 +236,8 @@ class RunStore:
         return self.points().cloud_of(columns, rows)
 
     def hit_counts(self) -> NDArray[np.int64]:
-        """Hits of each triangle, (f,)."""
-        counts = np.zeros(len(self.job.scene.faces), np.int64)
+        """Hits of each triangle of the scene, (f,), those of actors after the others."""
+        counts = np.zeros(self.job.scene.triangles, np.int64)
         for part in self.db.ordered:
             triangles, hits = read_tally(self.storage, part.name)
             counts[triangles] += hits
@@ -292,34 +291,6 @@ class RunStore:
             elif (self.folder / FILE).exists():
                 error.add_note(f"{self.kept} are kept in {self.folder}: continue with {_RESUME}.")
             raise
-
-
-def committed_points(folder: Path) -> StoredCloud:
-    """Points that an unfinished run has committed, to be looked at without its scenario.
-
-    Raises
-    ------
-    LidarpoolError
-        If its database cannot be read; as long as the run goes on, it is locked.
-    """
-    try:
-        with closing(sqlite3.connect(folder / FILE, timeout=1.0)) as sql:
-            meta = dict(sql.execute("SELECT name, value FROM meta"))
-            parts = sql.execute("SELECT name, rows FROM parts ORDER BY first").fetchall()
-        told = json.loads(meta["cloud"])
-        return StoredCloud(
-            _storage(folder, meta["parts"]),
-            [name for name, _ in parts],
-            [rows for _, rows in parts],
-            [TABLE.get(column["name"]) or Column(**column) for column in told["columns"]],
-            None,
-            told["precision_m"],
-            np.array(told["origin"]),
-        )
-    except (sqlite3.Error, KeyError, TypeError, ValueError) as error:
-        raise LidarpoolError(
-            f"The run in {folder} cannot be looked at ({error}). While it goes on, --live shows it."
-        ) from error
 
 
 def _storage(folder: Path, place: str, *, durable: bool = True) -> Storage:

@@ -52,7 +52,6 @@ class TrialPump:
         self._running: dict[Future, int] = {}  # {future: number of the trial}
         self._rounds: Counter[int] = Counter()  # {number: how often it was submitted}
         self._looked_at = time.monotonic()
-        self.paused = False  # whether no more trials are started
         # One waits behind each that runs: no slot idles, and a dying worker takes few along.
         self._most = 2 * max(1, partition.slots)
 
@@ -60,11 +59,6 @@ class TrialPump:
     def finished(self) -> bool:
         """Whether all trials have ended."""
         return len(self.trials) == self.planning.trials
-
-    @property
-    def idle(self) -> bool:
-        """Whether no trial is under way."""
-        return not self._running
 
     def step(self) -> bool:
         """Take results and submit more; returns whether there was anything to do.
@@ -87,7 +81,7 @@ class TrialPump:
                 trial, record = found[future.key]
                 self.trials.append(trial)
                 self.book.add(record)
-        room = 0 if self.paused else min(self._most - len(self._running), len(self._waiting))
+        room = min(self._most - len(self._running), len(self._waiting))
         for _ in range(room):
             self._submit(self._waiting.popleft())
         return bool(done or found or room > 0)

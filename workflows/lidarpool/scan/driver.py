@@ -15,8 +15,7 @@ import uuid
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from distributed import Client
@@ -33,7 +32,6 @@ from poolpart import (
     trace,
 )
 
-from .._version import __version__
 from ..base.errors import LidarpoolError
 from ..base.task_book import TaskBook
 from ..columns.cloud import Cloud
@@ -41,13 +39,13 @@ from ..columns.parts import SUFFIX
 from ..columns.storage import Storage
 from .batches import Batch, Batches, Place
 from .cast import intersect
+from .database import RunDatabase
 from .failures import raise_if_failed, rig_is_missing, was_killed, words_on_memory
 from .long_stages import LongStages, Work
 from .messages import Frame, Receipt, samples_of_scan, summary_type
 from .names import COLLECT, GENERATE, GPU, INTERSECT, LIDAR, SORT
 from .rig import RigPlan
 from .stages import collect, generate, sort_frames
-from .watch import PATIENCE_S
 from .workers import CastingWorkers
 
 BATCH_SECONDS = 0.2  # casting time that makes a batch worth its overhead
@@ -65,47 +63,6 @@ LAST_WORDS_S = 3.0  # for the stages to end after everything was committed
 PUT_S = 30.0  # for a pipe that is never full
 
 
-class Book(Protocol):
-    """What is committed: `lidarpool.run.database.RunDatabase`."""
-
-    frames: int
-    scans_done: int
-
-    def missing(self, first: int, stop: int) -> list[tuple[int, int]]:
-        """Return the scans of a range that are not committed, as half-open ranges."""
-
-    def commit(self, receipts: Sequence[Receipt]) -> list[Receipt]:
-        """Enter parts in one transaction; returns those that were new."""
-
-    def part_of(self, scan: int) -> Receipt:
-        """Part that holds a scan which is committed."""
-
-    def unframed(self) -> list[Receipt]:
-        """Parts that hold scans which were not handed out as frames, in order."""
-
-    def forget_summaries(self, part: Receipt) -> None:
-        """Drop the summaries of a part from memory: all of them were handed out."""
-
-
-@dataclass(frozen=True)
-class SurveyOptions:
-    """How a survey is run.
-
-    Parameters
-    ----------
-    queue_capacity
-        Items that stage 1 may be ahead.
-    collectors
-        Number of tasks of stage 4.
-    patience_s
-        How long to wait for workers that are gone, seconds.
-    """
-
-    queue_capacity: int = 10
-    collectors: int = 2
-    patience_s: float = PATIENCE_S
-
-
 class SurveyDriver:
     """Runs one survey on the partitions of a cluster.
 
@@ -117,7 +74,7 @@ class SurveyDriver:
         The GPU and LIDAR partitions, by name.
     plan
         Scene, survey and backend.
-    book
+    db
         What is committed; scans that are in it are not made again.
     storage
         Where parts go.
@@ -127,8 +84,12 @@ class SurveyDriver:
         Called with each frame, in scan order, in the driver's thread.
     on_parts
         Called with parts that were committed.
-    options
-        How it is run.
+    queue_capacity
+        Items that stage 1 may be ahead.
+    collectors
+        Number of tasks of stage 4.
+    patience_s
+        How long to wait for workers that are gone, seconds.
     """
 
     def __init__(
@@ -136,18 +97,21 @@ class SurveyDriver:
         client: Client,
         partitions: dict[str, Partition],
         plan: RigPlan,
-        book: Book,
+        db: RunDatabase,
         storage: Storage,
         read: Callable[[int], Cloud],
         on_frame: Callable[[Frame], None],
         on_parts: Callable[[list[Receipt]], None],
-        options: SurveyOptions,
+        *,
+        queue_capacity: int,
+        collectors: int,
+        patience_s: float,
     ) -> None:
         self.client, self.survey, self.run_id = client, plan.survey, uuid.uuid4().hex[:8]
         self._gpu, self._lidar = partitions[GPU], partitions[LIDAR]
-        self._db, self._storage = book, storage
+        self._db, self._storage = db, storage
         self._read, self._on_frame, self._on_parts = read, on_frame, on_parts
-        self._options = options
+        self._collectors = collectors
         self.book = TaskBook()
         self.batches = Batches()
         self.workers = CastingWorkers(client, self._gpu, self.run_id, plan)
@@ -155,7 +119,6 @@ class SurveyDriver:
         self.cast = 0  # scans that stage 2 has finished
         self.offered_again = 0
         self.duplicates_dropped = 0
-        self.paused = False  # whether no more scans are taken; what is under way arrives
         self._offers: dict[int, Batch] = {}  # {number of an offer: its batch}
         self._offer_count = 0
         self._seconds: deque[float] = deque(maxlen=64)  # that batches took to be cast
@@ -166,7 +129,7 @@ class SurveyDriver:
         self._summary = summary_type(samples_of_scan(self.survey.scan_count))
         self._sorter = -1  # number of the attempt that is heard
         self._sorted_at = time.monotonic()  # when the last frames came
-        self._scans = self._pipe("scans", options.queue_capacity)
+        self._scans = self._pipe("scans", queue_capacity)
         self._receipts = self._pipe("receipts", 64)
         self._frames = self._pipe("frames", 64)
         self._inlets: dict[str, Pipe] = {}  # {name of a stage 3 or 4: its pipe}
@@ -174,10 +137,10 @@ class SurveyDriver:
             GENERATE: self._generate,
             SORT: self._sort,
         }
-        for number in range(options.collectors):
+        for number in range(collectors):
             commands[f"{COLLECT}-{number}"] = self._collector(f"{COLLECT}-{number}")
         self.stages = LongStages(
-            client, self._lidar, self.run_id, commands, self._stage_died, options.patience_s
+            client, self._lidar, self.run_id, commands, self._stage_died, patience_s
         )
         self._inbox: dict[str, list[Any]] = {}  # {name of a pipe: what has come by it}
         self._closed_at: float | None = None  # when all was committed and the pipes were closed
@@ -192,13 +155,7 @@ class SurveyDriver:
 
     def _generate(self, number: int) -> Work:
         fields = self._fields(GENERATE, number)
-        return generate, (
-            fields,
-            __version__,
-            self.survey,
-            self._scans,
-            self.generated,
-        )
+        return generate, (fields, self.survey, self._scans, self.generated)
 
     def _sort(self, number: int) -> Work:
         """Start a sorter with a pipe of its own, and everything that was not handed out in it."""
@@ -208,7 +165,7 @@ class SurveyDriver:
         self._have_sorted(self._db.unframed())
         fields = self._fields(SORT, number)
         size = self._summary.itemsize
-        return sort_frames, (fields, __version__, size, self._db.frames, inlet, self._frames)
+        return sort_frames, (fields, size, self._db.frames, inlet, self._frames)
 
     def _collector(self, name: str) -> Callable[[int], Work]:
         def command(number: int) -> Work:
@@ -216,7 +173,6 @@ class SurveyDriver:
             fields = self._fields(COLLECT, number)
             return collect, (
                 fields,
-                __version__,
                 self._storage,
                 self._probe,
                 inlet,
@@ -272,19 +228,6 @@ class SurveyDriver:
         """Whether every scan is committed and was handed out."""
         count = self.survey.scan_count
         return self._db.scans_done == count and self._db.frames == count
-
-    @property
-    def idle(self) -> bool:
-        """Whether no scan is under way."""
-        return not self.batches and self._db.frames >= self._next_missing
-
-    @property
-    def _next_missing(self) -> int:
-        """First scan that is not committed, as far as can be framed."""
-        missing = self._db.missing(
-            self._db.frames, min(self._db.frames + 1, self.survey.scan_count)
-        )
-        return self._db.frames if missing else self._db.frames + 1
 
     @property
     def finished(self) -> bool:
@@ -363,8 +306,7 @@ class SurveyDriver:
         else:
             self.workers.check()
         self.stages.look(self._db.scans_done + self._db.frames)
-        unframed = self._db.scans_done and self._next_missing > self._db.frames
-        if unframed and time.monotonic() - self._sorted_at > STALL_S and SORT in self._inlets:
+        if time.monotonic() - self._sorted_at > STALL_S:
             self._sorted_at = time.monotonic()
             self._have_sorted(self._db.unframed())
 
@@ -373,13 +315,13 @@ class SurveyDriver:
     @property
     def _most(self) -> int:
         """Batches that may be under way."""
-        collecting = COLLECTING * self._options.collectors
+        collecting = COLLECTING * self._collectors
         return AHEAD * self.workers.slot_count + collecting + 2
 
     @property
     def _room(self) -> int:
         """Batches that may be taken now."""
-        if self.paused or self._condemned or self.batches.span >= SPAN * self._most:
+        if self._condemned or self.batches.span >= SPAN * self._most:
             return 0
         return self._most - len(self.batches)
 
@@ -700,7 +642,7 @@ class SurveyDriver:
         frame = Frame(
             scan,
             self.survey.pose(scan),
-            self.survey.scan(scan).ray_count(self.survey.sensor),
+            self.survey.scan(scan).ray_count,
             int(summary["hits"]),
             int(summary["points"]),
             samples[~np.isnan(samples[:, 0])],

@@ -6,17 +6,11 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 
 from distributed import Client, Future, KilledWorker
-from distributed.scheduler import NoValidWorkerError
 
 from poolpart import WorkerLeft
 
 from ..base.errors import LidarpoolError
 from .rig import RigMissing
-
-
-class OtherVersion(RuntimeError):  # noqa: N818 - reads as what happened
-    """A worker has another version of lidarpool than the driver; it does nothing for this run."""
-
 
 ASK_S = 10.0  # for an error's text, which the scheduler has
 
@@ -34,7 +28,7 @@ def naming_scans(first: int, last: int | None = None) -> Iterator[None]:
     """
     try:
         yield
-    except (WorkerLeft, OtherVersion):
+    except WorkerLeft:
         raise
     except Exception as error:
         span = f"scan {first}" if last in (None, first) else f"scans {first} to {last}"
@@ -56,19 +50,10 @@ def raise_if_failed(future: Future, what: str) -> None:
     if future.status == "error":
         error = future.exception(timeout=ASK_S)
         error.__traceback__ = future.traceback(timeout=ASK_S)
-        raise LidarpoolError(f"{what} failed: {_words(error)}") from error
+        words = str(error) or type(error).__name__  # some of Dask's have no words
+        raise LidarpoolError(f"{what} failed: {words}") from error
     if future.status == "cancelled":  # "lost" passes: a worker died and the task runs again
         raise LidarpoolError(f"{what} was cancelled from outside this run.")
-
-
-def _words(error: BaseException) -> str:
-    """Text of an error of Dask's or of a task's, in a line."""
-    if isinstance(error, NoValidWorkerError):  # its own text is a list of all restrictions
-        return (
-            f"no worker of {' and '.join(error.resource_restrictions or ['its kind'])} came within "
-            f"{error.timeout:g} s, the cluster's no-workers-timeout; start some."
-        )
-    return str(error) or type(error).__name__  # some of Dask's have no words
 
 
 def words_on_memory(client: Client, workers: Collection[str]) -> str:

@@ -10,10 +10,10 @@ from typing import Any
 
 from distributed import Client, Future, Lock
 
-from poolpart import Partition, Slots, look_at_slots
+from poolpart import Partition, Whereabouts, look_for_tasks
 
 from ..base.errors import LidarpoolError
-from .failures import OtherVersion, raise_if_failed, was_killed, words_on_memory
+from .failures import raise_if_failed, was_killed, words_on_memory
 
 LOOK_EVERY_S = 0.5
 SETTLE_S = 2.0  # for a task that was just submitted to start
@@ -74,7 +74,6 @@ class LongStages:
         self._tasks: dict[str, _Task] = {}
         self._submitted = 0
         self._looked_at = 0.0
-        self._refused: set[str] = set()  # addresses of workers of another version
         self._enough_at = time.monotonic()  # slots, free or not
         self._waited_from: float | None = None  # for slots that others held
         self.waiting = False  # for slots that others hold, to start with
@@ -124,8 +123,8 @@ class LongStages:
         self.client.run_on_scheduler(_forget_lock, name=self._lock_name)
 
     def _start_all(self) -> None:
-        slots = self._slots()
-        free = {address: count for address, count in slots.free.items() if count > 0}
+        seen = self._look()
+        free = {address: count for address, count in seen.free.items() if count > 0}
         now, needed = time.monotonic(), len(self._commands)
         if sum(free.values()) >= needed:
             self.waiting = False
@@ -139,24 +138,23 @@ class LongStages:
             # Another run may look as soon as the lock is free: the tasks must be known by then.
             deadline = now + SETTLE_S
             keys = {task.future.key for task in self._tasks.values()}
-            while self._slots().known < keys and time.monotonic() < deadline:
+            while self._look().tasks.keys() < keys and time.monotonic() < deadline:
                 time.sleep(0.005)
             return
-        self.waiting = slots.total >= needed
+        self.waiting = seen.slots >= needed
         if self.waiting:
             self._waited_from = self._waited_from or now
             self._enough_at = now
         elif now - self._enough_at > self._patience_s:
             raise LidarpoolError(
-                f"Partition {self.partition.name!r} has had {slots.total} of the {needed} slots "
+                f"Partition {self.partition.name!r} has had {seen.slots} of the {needed} slots "
                 f"needed for {self._patience_s:.0f} s: start another worker with "
                 f'--resources "{self.partition.name}=1" and run it again.'
             )
 
-    def _slots(self) -> Slots:
+    def _look(self) -> Whereabouts:
         keys = [task.future.key for task in self._tasks.values()]
-        slots = look_at_slots(self.client, self.partition.name, keys)
-        return slots.without(self._refused)
+        return look_for_tasks(self.client, self.partition.name, keys)
 
     def look(self, progress: int) -> None:
         """See, once in a while, to stages that died or wait behind another.
@@ -179,8 +177,8 @@ class LongStages:
             self.start()
             return
         self._check()
-        slots = self._slots()
-        free = dict(slots.free)
+        seen = self._look()
+        free = dict(seen.free)
         for name, task in list(self._tasks.items()):
             if task.future.status == "finished":
                 continue
@@ -188,7 +186,7 @@ class LongStages:
             # A worker that is silent may wake up: its stages are left to it while there is no
             # other place for them.
             if task.dead_since is None and (
-                self._has_died(task, slots) or (task.worker in slots.silent and room)
+                self._has_died(task, seen) or (task.worker in seen.silent and room)
             ):
                 task.dead_since = now
                 self._on_death(name)
@@ -197,35 +195,26 @@ class LongStages:
                     self._restart(name, task, free, progress)
                 else:
                     self._wait_for_slot(name, now - task.dead_since)
-            elif room and self._is_behind_another(task, slots, now):
+            elif room and self._is_behind_another(task, seen, now):
                 free[task.worker] += 1
                 self._on_death(name)
                 self._submit(name, free)
 
     def _check(self) -> None:
         for name, task in self._tasks.items():
-            if task.future.status != "error" or was_killed(task.future):
-                if task.future.status == "cancelled":
-                    raise_if_failed(task.future, f"stage {name}")
-                continue
-            error = task.future.exception(timeout=10)
-            if isinstance(error, OtherVersion):
-                self._refused.add(task.worker)
-                self.notes.append(f"{error}: it was given nothing to do")
-            else:
+            if task.future.status != "error" or not was_killed(task.future):
                 raise_if_failed(task.future, f"stage {name}")
 
-    def _has_died(self, task: _Task, slots: Slots) -> bool:
+    def _has_died(self, task: _Task, seen: Whereabouts) -> bool:
         if task.future.status == "error":
             return True
-        return task.worker not in slots.present
+        return task.worker not in seen.members
 
-    def _is_behind_another(self, task: _Task, slots: Slots, now: float) -> bool:
+    def _is_behind_another(self, task: _Task, seen: Whereabouts, now: float) -> bool:
         """Whether a task is behind another on a worker that has more than its slots hold."""
         settled = now - task.since > SETTLE_S
-        return (
-            settled and task.future.key not in slots.running and slots.free.get(task.worker, 0) < 0
-        )
+        behind = not seen.runs_for_long(task.future.key) and seen.free.get(task.worker, 0) < 0
+        return settled and behind
 
     def _wait_for_slot(self, name: str, seconds: float) -> None:
         """LidarpoolError when a stage has had no slot for long.

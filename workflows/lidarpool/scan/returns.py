@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 from raybeam import Pattern, ScanReturns
 
 from ..sensor import ScanSpec
+from ..sensor.materials import at_right_angles
+from .echoes import Echoes
+from .motion import Poses, into_axes
 
 if TYPE_CHECKING:
     from .rig import Rig
@@ -32,8 +35,8 @@ class BatchReturns:
         What was cast: rays numbered from 0 at the first firing.
     pattern, start
         What was cast from, and the number of its ray 0 within the pattern.
-    positions, rotations, rays_per_pose
-        Poses that it was cast from, as `RayCaster.scan` takes them.
+    poses
+        That it was cast from.
     """
 
     def __init__(
@@ -43,14 +46,17 @@ class BatchReturns:
         found: ScanReturns,
         pattern: Pattern,
         start: int,
-        positions: NDArray[np.float64],
-        rotations: NDArray[np.float64] | None,
-        rays_per_pose: int | None,
+        poses: Poses,
     ) -> None:
-        self.sensor, self.scene, self.survey = rig.survey.sensor, rig.scene, rig.survey
+        self.scene, self.survey = rig.scene, rig.survey
+        self.carried = rig.survey.carried[specs[0].sensor]
+        self.sensor = self.carried.sensor
         self.specs, self.found = specs, found
+        self.echoes = found if isinstance(found, Echoes) else None
+        self._surfaces = rig.surfaces
+        self._by_head = rig.by_head[specs[0].sensor]
         self._pattern, self._start = pattern, start
-        self._poses = positions, rotations, rays_per_pose
+        self._poses = poses
 
     def __len__(self) -> int:
         return len(self.found.ray)
@@ -91,6 +97,11 @@ class BatchReturns:
         """Number of the firing, from the beginning of the station."""
         return self.specs[0].firings[0] + self.found.ray // np.int64(self.sensor.channels)
 
+    @property
+    def sensor_number(self) -> NDArray[np.uint8]:
+        """Number of the sensor."""
+        return np.full(len(self), self.specs[0].sensor, np.uint8)
+
     @cached_property
     def time(self) -> NDArray[np.int64]:
         """When the ray was fired, nanoseconds since the survey's start."""
@@ -101,14 +112,7 @@ class BatchReturns:
 
     @cached_property
     def _rays(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        positions, rotations, rays_per_pose = self._poses
-        return self._pattern.rays(
-            self.found.ray,
-            positions,
-            rotations,
-            start=self._start,
-            rays_per_pose=rays_per_pose,
-        )
+        return self._poses.rays(self._pattern, self.found.ray, self._start)
 
     @property
     def origins(self) -> NDArray[np.float64]:
@@ -122,20 +126,21 @@ class BatchReturns:
 
     @property
     def range(self) -> NDArray[np.float64]:
-        """Distance from where the ray left, metres."""
-        return self.found.distance
+        """Distance from where the ray left, metres, with noise."""
+        return self.found.distance if self.echoes is None else self.echoes.reported
 
     @cached_property
     def positions(self) -> NDArray[np.float64]:
         """Where the rays ended, metres, the scene's local coordinates: (n, 3)."""
         origins, directions = self._rays
-        out = directions * self.found.distance[:, None]
+        out = directions * self.range[:, None]
         return np.add(out, origins, out=out)
 
     @cached_property
     def cells(self) -> NDArray[np.int32]:
         """Positions as whole multiples of the survey's precision: (3, n)."""
-        scaled = self.positions / self.survey.precision_m
+        world = self.survey.coordinates == "world"
+        scaled = (self.positions if world else self.sensor_positions) / self.survey.precision_m
         cells = np.empty((3, len(self)), np.int32)
         cells[:] = np.rint(scaled, out=scaled).T
         return cells
@@ -156,9 +161,36 @@ class BatchReturns:
         return self.cells[2]
 
     @cached_property
+    def _rows(self) -> NDArray[np.int64]:
+        """Of the pattern."""
+        return (self._start + self.found.ray.astype(np.int64)) % len(self._pattern)
+
+    @cached_property
     def _sensor_directions(self) -> NDArray[np.float64]:
-        rows = (self._start + self.found.ray.astype(np.int64)) % len(self._pattern)
-        return self._pattern.directions[rows]
+        return self._to_sensor(self._pattern.directions[self._rows])
+
+    @cached_property
+    def sensor_positions(self) -> NDArray[np.float64]:
+        """Where the rays ended in the axes of the sensor when they were fired, metres: (n, 3)."""
+        origins = self._pattern.origins
+        ends = self._pattern.directions[self._rows] * self.range[:, None]
+        if origins is not None:
+            ends += origins[self._rows]
+        if not self._by_head:
+            ends -= self.carried.mount.position
+        elif self.sensor.centre is not None:
+            ends += self.sensor.centre
+        return self._to_sensor(ends)
+
+    def _to_sensor(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Turn vectors (n, 3) in the axes of the carrier, or the head, to those of the sensor."""
+        if self._by_head:
+            firings, which = np.unique(self.firing, return_inverse=True)
+            heads = self.sensor.heads(firings)
+            assert heads is not None  # or the rig would not cast by head
+            return into_axes(vectors, heads.transpose(0, 2, 1)[which])
+        mount = self.carried.mount.rotation
+        return turned(vectors, None if mount is None else mount.T)
 
     @cached_property
     def azimuth(self) -> NDArray[np.float64]:
@@ -181,27 +213,57 @@ class BatchReturns:
     @cached_property
     def object(self) -> NDArray[np.int32]:
         """Object of the scene."""
-        return self.scene.face_object[self.found.triangle]
+        return self._surfaces.objects(self.found.triangle)
+
+    @cached_property
+    def cosine(self) -> NDArray[np.float64]:
+        """Cosine of the angle between the ray and the normal of its triangle, 0 to 1."""
+        return np.abs(
+            self._surfaces.along_normal(self.found.triangle, self.directions, self._times)
+        )
+
+    @property
+    def _times(self) -> NDArray[np.int64]:
+        """Of the rays, where there are actors."""
+        return self.time if self.scene.actors else np.zeros(len(self), np.int64)
 
     @cached_property
     def intensity(self) -> NDArray[np.float64]:
-        """Cosine of the angle of incidence."""
-        a, b, c = self.scene.vertices[self.scene.faces[self.found.triangle]].transpose(1, 0, 2)
-        normals = np.cross(b - a, c - a)
-        lengths = np.linalg.norm(normals, axis=1)
-        return np.abs((normals * self.directions).sum(axis=1)) / lengths
+        """Energy that came back, see `Surfaces.energy`."""
+        if self.echoes is not None:
+            return self.echoes.energy
+        extinction = self.survey.extinction(self.sensor)
+        return self._surfaces.energy(
+            self.found.triangle, self.cosine, self.found.distance, extinction
+        )
+
+    @property
+    def reflectivity(self) -> NDArray[np.float64]:
+        """Intensity without the loss by distance and air."""
+        lost = at_right_angles(self.found.distance, self.survey.extinction(self.sensor))
+        return np.asarray(self.intensity / lost)
 
     @property
     def return_number(self) -> NDArray[np.uint8]:
-        """Which return of its ray: a ray has one."""
-        return np.ones(len(self), np.uint8)
+        """Which reported return of its pulse."""
+        return np.ones(len(self), np.uint8) if self.echoes is None else self.echoes.number
 
     @property
     def returns(self) -> NDArray[np.uint8]:
-        """How many returns its ray has."""
-        return np.ones(len(self), np.uint8)
+        """How many returns of its pulse are reported."""
+        return np.ones(len(self), np.uint8) if self.echoes is None else self.echoes.returns
 
     @property
-    def semantic_class(self) -> NDArray[np.uint8]:
-        """Class of what was hit; scenes do not state one yet."""
-        return np.zeros(len(self), np.uint8)
+    def semantic_class(self) -> NDArray[np.uint16]:
+        """Class of the material."""
+        return self._surfaces.materials.semantic_class[self.object]
+
+
+def turned(
+    vectors: NDArray[np.float64], rotation: NDArray[np.float64] | None
+) -> NDArray[np.float64]:
+    """Turn vectors (n, 3) by a matrix; in one order of rounding, unlike BLAS, however many."""
+    if rotation is None:
+        return vectors
+    x, y, z = vectors.T
+    return np.stack([(x * a + y * b) + z * c for a, b, c in rotation], axis=1)

@@ -12,20 +12,23 @@ import pickle
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cloudpickle
 import numpy as np
 from distributed import get_worker
 
 from poolpart import own_device, trace
-from raybeam import Pattern, RayCaster
+from raybeam import Pattern, ScanReturns
 
 from ..scene.scene import Scene
 from ..sensor import ScanSpec, Survey
-from .returns import BatchReturns
+from .echoes import PATTERN_RAYS, EchoCaster
+from .motion import Clock, Poses, poses_of_firings
+from .returns import BatchReturns, turned
+from .surfaces import Surfaces
+from .world import World
 
-PATTERN_RAYS = 20_000_000  # kept for a whole period of the head; 24 bytes each
 UNUSED_S = 600.0  # a rig that no run has used for so long goes when another is made
 
 
@@ -69,32 +72,44 @@ class Rig:
     ) -> None:
         self.scene, self.survey = plan.scene, plan.survey
         self.used_at = time.monotonic()
-        self._caster = RayCaster(
-            plan.scene.vertices,
-            plan.scene.faces,
-            backend=plan.backend,
-            threads=threads,
-            device=device,
-        )
-        sensor = plan.survey.sensor
-        self._whole: Pattern | None = None  # one period of the head
-        if sensor.period is not None and sensor.period * sensor.channels <= PATTERN_RAYS:
-            self._whole = self._pattern(0, sensor.period)
+        self._caster = World(plan.scene, plan.backend, threads, device)
+        self.surfaces = Surfaces(plan.scene, tuple(plan.survey.materials))
+        self._echoes: EchoCaster | None = None  # where plain casting will do
+        if EchoCaster.needed(plan.survey, self.surfaces):
+            self._echoes = EchoCaster(self._caster, plan.scene, plan.survey, self.surfaces)
+        self._whole: list[Pattern | None] = []  # one period of each sensor's head
+        self.by_head: list[bool] = []  # whether poses of each sensor are those of its head
+        for number, sensor in enumerate(carried.sensor for carried in plan.survey.carried):
+            heads = sensor.heads(np.zeros(1, np.int64)) is not None
+            self.by_head.append(plan.survey.path.moves and heads)
+            period = 1 if self.by_head[-1] else sensor.period or 0
+            fits = 0 < period * sensor.channels <= PATTERN_RAYS
+            self._whole.append(self._pattern(number, 0, period) if fits else None)
+            if self._echoes is not None and self._whole[-1] is not None:
+                self._echoes.divide(sensor, self._whole[-1])
 
-    def _pattern(self, first: int, stop: int) -> Pattern:
+    def _pattern(self, number: int, first: int, stop: int) -> Pattern:
+        """Rays of a sensor in the axes of its carrier; or of one firing in those of its head."""
         firings = np.arange(first, stop, dtype=np.int64)
-        sensor = self.survey.sensor
-        origins = sensor.origins(firings)
-        return Pattern(
-            sensor.directions(firings).reshape(-1, 3),
-            None if origins is None else origins.reshape(-1, 3),
-        )
+        carried = self.survey.carried[number]
+        if self.by_head[number]:
+            sensor = carried.sensor
+            return Pattern(sensor.ahead, sensor.beams.origin if sensor.centre is None else None)
+        directions = carried.sensor.directions(firings).reshape(-1, 3)
+        origins = carried.sensor.origins(firings)
+        origins = None if origins is None else origins.reshape(-1, 3)
+        directions = turned(directions, carried.mount.rotation)
+        origins = None if origins is None else turned(origins, carried.mount.rotation)
+        if any(carried.mount.position):
+            origins = np.add(np.zeros(3) if origins is None else origins, carried.mount.position)
+        return Pattern(directions, origins)
 
     def cast(self, first: int, stop: int) -> Iterator[BatchReturns]:
         """Cast scans `first` to `stop`: the returns of each run of them from one station."""
         run: list[ScanSpec] = []
         for spec in map(self.survey.scan, range(first, stop)):
-            if run and (spec.station, spec.firings[0]) != (run[-1].station, run[-1].firings[1]):
+            here = (spec.sensor, spec.station, spec.firings[0])
+            if run and here != (run[-1].sensor, run[-1].station, run[-1].firings[1]):
                 yield self._cast(run)
                 run = []
             run.append(spec)
@@ -102,33 +117,34 @@ class Rig:
             yield self._cast(run)
 
     def _cast(self, specs: list[ScanSpec]) -> BatchReturns:
-        sensor, path = self.survey.sensor, self.survey.path
+        number, path = specs[0].sensor, self.survey.path
+        sensor, whole = self.survey.carried[number].sensor, self._whole[number]
         first, stop = specs[0].firings[0], specs[-1].firings[1]
-        channels, rays_per_pose = sensor.channels, None
+        channels = sensor.channels
         if path.moves:
-            times = sensor.times_ns(np.arange(first, stop, dtype=np.int64)).min(axis=1)
-            positions, rotations = path.poses(specs[0].station, times.astype(np.float64))
-            rays_per_pose = channels
+            carried = self.survey.carried[number]
+            poses = poses_of_firings(carried, path, specs[0].station, first, stop)
         else:
             pose = path.pose(specs[0].station)
-            positions, rotations = np.array(pose.position), pose.rotation
-        if self._whole is not None:
-            pattern, start = self._whole, first % sensor.period * channels  # type: ignore[operator]
+            poses = Poses(np.array(pose.position), pose.rotation)
+        if self.scene.actors:
+            begins = sensor.begins_ns(np.arange(first, stop, dtype=np.int64)) + specs[0].start_ns
+            poses = replace(poses, clock=Clock(begins, sensor.beams.time_ns))
+        if whole is not None:
+            pattern, start = whole, first * channels % len(whole)
         else:
-            pattern, start = self._pattern(first, stop), 0
-        found = self._caster.scan(
-            pattern,
-            positions,
-            rotations,
-            window=(start, start + (stop - first) * channels),
-            rays_per_pose=rays_per_pose,
-            t_min=sensor.min_range_m,
-            t_max=sensor.max_range_m,
-            keep_every=self.survey.keep_every,
-            groups=np.array([spec.firings[0] - first for spec in specs]) * channels,
-            tally=True,
-        )
-        return BatchReturns(self, specs, found, pattern, start, positions, rotations, rays_per_pose)
+            pattern, start = self._pattern(number, first, stop), 0
+        window = (start, start + (stop - first) * channels)
+        groups = np.array([spec.firings[0] - first for spec in specs]) * channels
+        if self._echoes is not None:
+            found: ScanReturns = self._echoes.scan(
+                sensor, specs[0].scan, pattern, poses, window, groups
+            )
+        else:
+            found = self._caster.returns(
+                sensor, self.survey.keep_every, pattern, poses, window, groups
+            )
+        return BatchReturns(self, specs, found, pattern, start, poses)
 
 
 class RigMissing(RuntimeError):  # noqa: N818 - reads as what happened

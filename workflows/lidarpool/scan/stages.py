@@ -25,38 +25,20 @@ from poolpart import (
     trace,
 )
 
-from .._version import __version__
 from ..columns.parts import pack
 from ..columns.storage import Storage
 from ..sensor import Survey
 from .cast import CastBatch
-from .failures import OtherVersion, naming_scans
+from .failures import naming_scans
 from .messages import Receipt
 from .names import COLLECT, GENERATE, LIDAR, SORT
 
 FETCH_PATIENCE_S = 2.0  # for a sign of life of the worker that has a batch
 
 
-def check_version(wanted: str) -> None:
-    """Refuse to work for a driver of another version; runs on a worker.
-
-    Raises
-    ------
-    OtherVersion
-        Naming the worker and both versions.
-    """
-    if __version__ != wanted:
-        worker = get_worker()
-        raise OtherVersion(
-            f"the worker {worker.name} at {worker.address} has lidarpool {__version__}, the run "
-            f"{wanted}"
-        )
-
-
 @telling_departure()
 def generate(
     fields: dict[str, Any],
-    version: str,
     survey: Survey,
     outlet: Pipe,
     first: int = 0,
@@ -66,7 +48,6 @@ def generate(
     An item is a range of scans, all of which the survey says the same of everywhere.
     """
     secede()
-    check_version(version)
     recorder = Recorder(GENERATE, LIDAR)
     sent = first
     trace("generate.start", **fields, scans=[])
@@ -89,7 +70,7 @@ def generate(
 
 @telling_departure()
 def sort_frames(
-    fields: dict[str, Any], version: str, size: int, following: int, inlet: Pipe, outlet: Pipe
+    fields: dict[str, Any], size: int, following: int, inlet: Pipe, outlet: Pipe
 ) -> TaskRecord:
     """Stage 3: put the summaries of scans into scan order.
 
@@ -97,8 +78,6 @@ def sort_frames(
     ----------
     fields
         What tells this start of the task from others, for traces and the driver.
-    version
-        Of the driver.
     size
         Bytes of a summary.
     following
@@ -107,14 +86,13 @@ def sort_frames(
         From the driver lists of {first: a scan, data: summaries from there on}, and to it one such.
     """
     secede()
-    check_version(version)
     recorder = Recorder(SORT, LIDAR)
     waiting: dict[int, bytes] = {}  # {first scan: summaries of consecutive scans}
     begin = following
     try:
         trace("sort.start", **fields, scans=[])
         while True:
-            for item in chain.from_iterable(inlet.get_all(alone=True)):
+            for item in chain.from_iterable(inlet.get_all()):
                 first, data = item["first"], item["data"]
                 trace("sort.get", **fields, scans=_scans(first, data, size))
                 if first + len(data) // size > following:
@@ -139,7 +117,6 @@ def sort_frames(
 @telling_departure()
 def collect(
     fields: dict[str, Any],
-    version: str,
     storage: Storage,
     probe: tuple[str, bytes],
     inlet: Pipe,
@@ -149,7 +126,7 @@ def collect(
 
     Parameters
     ----------
-    fields, version
+    fields
         As of `sort_frames`.
     storage, probe
         Where parts go, and a file there with its content. A worker that does not see it holds its
@@ -161,7 +138,6 @@ def collect(
         {failed: reason} where the storage takes nothing, {hidden: worker} where it is not seen.
     """
     secede()
-    check_version(version)
     recorder = Recorder(COLLECT, LIDAR)
     scans = 0
     try:
@@ -170,7 +146,7 @@ def collect(
         if not seen:
             outlet.put({"hidden": str(get_worker().name)})
         while True:
-            for item in chain.from_iterable(inlet.get_all(alone=True)):
+            for item in chain.from_iterable(inlet.get_all()):
                 answer = _collected(fields, storage if seen else None, item)
                 if "receipt" in answer:
                     scans += item["stop"] - item["first"]

@@ -10,11 +10,10 @@ from distributed import Client
 from poolpart import worker_identities
 
 from ..base.errors import LidarpoolError
+from ..base.vocabulary import PATIENCE_S
 
 WATCH_EVERY_S = 1.0
 TELL_EVERY_S = 5.0  # what is waited for
-WAIT_S = 10.0  # for partitions that are empty when a run begins
-PATIENCE_S = 60.0  # for those that become empty; a nanny needs a few seconds
 
 
 class Watch:
@@ -50,7 +49,6 @@ class Watch:
         # {partition: when workers were last there}
         self._seen = dict.fromkeys([*names, *self.lasting], self._looked)
         self._paused: set[str] = set()  # partitions that have only such
-        self._pauses: dict[str, float] = {}  # {partition: when all were last seen paused}
 
     def forget(self, names: Iterable[str]) -> None:
         """Look after these partitions no more: nothing is left to do there."""
@@ -63,39 +61,25 @@ class Watch:
             return
         self._looked = now
         self._paused = set()
-        working: set[str] = set()
         for worker in worker_identities(self.client).values():
             for name in self._seen.keys() & worker["resources"].keys():
                 if worker["status"] == "running" or name in self.lasting:
                     self._seen[name] = now
-                    working.add(name)
                 else:
                     self._paused.add(name)
-        for name in self._paused - working:
-            self._pauses[name] = now
         self._say(now)
         for name, seen in self._seen.items():
             if now - seen > self.patience_s:
                 raise LidarpoolError(self._error(name))
 
     def _say(self, now: float) -> None:
-        """Tell what is waited for; also of workers that pause again and again."""
-        waiting = [name for name, seen in self._seen.items() if now - seen > 2 * WATCH_EVERY_S]
-        pausing = [n for n, at in self._pauses.items() if now - at < 2 * TELL_EVERY_S]
-        if not (waiting or pausing) or now - self._told < TELL_EVERY_S:
-            return
-        self._told = now
-        for name in waiting:
-            if name not in pausing:
-                left = self.patience_s - (now - self._seen[name])
-                self._tell(
-                    f"waiting for workers of partition {name}, for another {max(0.0, left):.0f} s"
-                )
-        for name in pausing:
-            self._tell(
-                f"the workers of partition {name} pause: their memory is nearly full "
-                "(give them a larger --memory-limit)"
-            )
+        """Tell what is waited for."""
+        waiting = {name: seen for name, seen in self._seen.items() if now - seen > TELL_EVERY_S}
+        if waiting and now - self._told >= TELL_EVERY_S:
+            self._told = now
+            for name, seen in waiting.items():
+                left = max(0.0, self.patience_s - (now - seen))
+                self._tell(f"waiting for workers of partition {name}, for another {left:.0f} s")
 
     def _error(self, name: str) -> str:
         start = f'start some with --resources "{name}=1" and run it again.'

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,22 +15,30 @@ from pydantic import Field, PrivateAttr, Strict, ValidationError, model_validato
 from ..base.errors import LidarpoolError
 from ..base.words import did_you_mean
 from ..plan import Planning
+from ..scene.actors import Actor, box, one_mesh
 from ..scene.floor import floor_under
 from ..scene.mesh import Mesh
 from ..scene.meshfile import SUFFIXES, UNITLESS, load_meshes
 from ..scene.scene import Scene
 from ..scene.shapes import seed_objects
-from ..sensor import Pose, Survey
+from ..sensor import Material, Mounted, Noise, Pose, Returns, Survey
+from ..sensor.survey import SENSORS_MOST, STEPS_MOST
+from .moving import ActorSection, CarriedSection, MountSection, TrajectoryEntry
 from .sections import (
     CloudSection,
     Ground,
+    MaterialSection,
     MeshFile,
+    NoiseSection,
     PlanningSection,
     PoolSection,
     PoseEntry,
+    ReturnsSection,
     SceneSection,
     Section,
     SensorSection,
+    Text,
+    WeatherSection,
     may_be_empty,
     scene_in_short,
 )
@@ -54,7 +63,7 @@ class Scenario(Section):
 
     Parameters
     ----------
-    scene, sensor, cloud, planning, pool
+    scene, sensor, materials, returns, noise, weather, cloud, planning, pool
         See `lidarpool.scenario.sections`.
     poses
         Where the sensor scans from, in world coordinates. Where none are given it stands at
@@ -82,15 +91,69 @@ class Scenario(Section):
             examples=[[[0, 0, 1], [0, 0, 2], {"position": [0, 0, 3], "yaw_deg": 90}]],
         ),
     ] = None
+    trajectory: Annotated[
+        TrajectoryEntry | None,
+        Field(
+            description="in place of poses: the way of a carrier that moves, from a TUM, KITTI or "
+            ".csv file, or points",
+            examples=["drive.tum"],
+        ),
+    ] = None
+    sensors: Annotated[
+        dict[Text, CarriedSection],
+        Field(
+            max_length=SENSORS_MOST,
+            description="in place of sensor: several on one carrier, by name, each with its mount",
+            examples=[{"front": {"model": "velodyne/vlp16", "mount": {"position": [2, 0, 0.5]}}}],
+        ),
+    ] = {}  # noqa: RUF012 - of a frozen model
+    actors: Annotated[
+        tuple[ActorSection, ...],
+        Strict(False),
+        Field(
+            max_length=10_000,
+            description="what moves: meshes or boxes, each with a trajectory of its own",
+            examples=[[{"name": "Van", "box": [5, 2, 2.2], "trajectory": "van.tum", "class": 3}]],
+        ),
+    ] = ()
+    mount: Annotated[
+        MountSection | None,
+        Field(
+            description="where the sensor sits on its carrier, in the carrier's axes",
+            examples=[{"position": [1, 0, 2], "pitch_deg": 10}],
+        ),
+    ] = None
     steps: Annotated[
-        int, Field(ge=1, le=1_000_000, description="time steps (scans) from each pose")
-    ] = 36
+        Annotated[int, Field(ge=1, le=STEPS_MOST)] | None,
+        Field(
+            description="time steps (scans) from each pose; along a trajectory by default as many "
+            "as it lasts",
+            examples=[36],
+        ),
+    ] = None
+    materials: Annotated[
+        tuple[MaterialSection, ...],
+        Strict(False),
+        Field(
+            max_length=100_000,
+            description="what objects are made of, by name; the last that names an object counts",
+            examples=[
+                [
+                    {"objects": "*", "reflectance": 0.3},
+                    {"objects": "Window*", "transparent": "pass"},
+                ]
+            ],
+        ),
+    ] = ()
+    returns: Annotated[ReturnsSection, may_be_empty(ReturnsSection)] = ReturnsSection()
+    noise: Annotated[NoiseSection, may_be_empty(NoiseSection)] = NoiseSection()
+    weather: Annotated[WeatherSection, may_be_empty(WeatherSection)] = WeatherSection()
     cloud: Annotated[CloudSection, may_be_empty(CloudSection)] = CloudSection()
     planning: Annotated[PlanningSection, may_be_empty(PlanningSection)] = PlanningSection()
     pool: Annotated[PoolSection, may_be_empty(PoolSection)] = PoolSection()
 
     _folder: Path = PrivateAttr(default=Path())  # that relative file names start from
-    _source: str = PrivateAttr(default="scenario")  # for messages
+    _source: str = PrivateAttr(default="the default survey")  # for messages
     _notes: list[str] = PrivateAttr(default_factory=list)  # of what was left out of the scene
 
     @model_validator(mode="after")
@@ -102,6 +165,10 @@ class Scenario(Section):
             raise ValueError(
                 "planning has one end: give both planning.start and planning.target, or neither."
             )
+        if self.trajectory is not None and self.poses is not None:
+            raise ValueError("give either poses or a trajectory, not both.")
+        if self.sensors and (self.sensor.model or self.sensor.calibration or self.mount):
+            raise ValueError("give either sensor and mount, or sensors, each with a mount.")
         return self
 
     @classmethod
@@ -145,8 +212,11 @@ class Scenario(Section):
             raise LidarpoolError(validation_error(error, _field_names(), source)) from error
         scenario._folder, scenario._source = Path(folder), source
         with scenario._named():
-            if scenario.sensor.calibration is None:  # files are read when they are needed
-                scenario.sensor.sensor(scenario._folder)
+            for section in scenario.sensors.values() or (scenario.sensor,):
+                if section.calibration is None:  # files are read when they are needed
+                    Returns(**scenario.returns.model_dump()).of(
+                        section.sensor(scenario._folder).optics
+                    )
         return scenario
 
     def advice(self, scene: Scene) -> list[str]:
@@ -154,6 +224,7 @@ class Scenario(Section):
 
         Also on objects that `build_scene` left out.
         """
+        notes = list(self._notes)
         unitless = [
             entry.file
             for entry in self.scene.files
@@ -161,9 +232,9 @@ class Scenario(Section):
         ]
         side = float(np.ptp(scene.bounds, axis=0).max())
         if not unitless or SMALL_M <= side <= LARGE_M:
-            return list(self._notes)
+            return notes
         return [
-            *self._notes,
+            *notes,
             f"{unitless[0]} states no unit, and in metres the scene is {side:,.5g} m long: if that "
             f"is wrong, give the file's unit ({'mm' if side > LARGE_M else 'km'}?) in scene.files",
         ]
@@ -183,7 +254,32 @@ class Scenario(Section):
         scene = Scene.from_meshes(meshes)
         if self.scene.ground is not None:
             scene = Scene.from_meshes([*meshes, _ground(self.scene.ground, scene)])
-        return scene
+        return replace(scene, actors=self._actors(scene.origin)) if self.actors else scene
+
+    def _actors(self, origin: np.ndarray[Any, np.dtype[np.float64]]) -> tuple[Actor, ...]:
+        """Build what moves; its trajectories begin when that of the survey does."""
+        meshes = [
+            one_mesh(entry.name, self._read(entry.file))
+            if entry.file is not None
+            else box(entry.name, entry.box or (1, 1, 1))
+            for entry in self.actors
+        ]
+        with self._named():
+            start = 0.0
+            if self.trajectory is not None:
+                start = self.trajectory.track(self._folder, origin).start_s or 0.0
+            ways = [entry.way(self._folder, origin, start) for entry in self.actors]
+        return tuple(Actor(mesh, way) for mesh, way in zip(meshes, ways, strict=True))
+
+    def _materials(self) -> list[Material]:
+        """Materials by name; the classes of actors come last, where they count."""
+        given = [Material(**entry.model_dump()) for entry in self.materials]
+        own = []
+        for entry in self.actors:
+            if entry.semantic_class is not None:
+                of = next((m for m in reversed(given) if m.named(entry.name)), Material("*"))
+                own.append(replace(of, objects=entry.name, semantic_class=entry.semantic_class))
+        return [*(given or [Material("*")] * bool(own)), *own]
 
     def survey(self, scene: Scene) -> Survey:
         """Return the survey, its poses in the local coordinates of `scene`.
@@ -194,18 +290,28 @@ class Scenario(Section):
             If fields that are good by themselves do not fit together.
         """
         x0, y0, z0 = scene.origin
-        poses = [
-            Pose((x - x0, y - y0, z - z0), yaw, pitch, roll)
-            for (x, y, z), yaw, pitch, roll in self._world_poses(scene)
-        ]
         with self._named():
+            track, poses = None, []
+            if self.trajectory is not None:
+                track = self.trajectory.track(self._folder, scene.origin)
+            else:
+                poses = [
+                    Pose((x - x0, y - y0, z - z0), yaw, pitch, roll)
+                    for (x, y, z), yaw, pitch, roll in self._world_poses(scene)
+                ]
             return Survey(
-                sensor=self.sensor.sensor(self._folder),
                 poses=poses,
+                trajectory=track,
+                **self._sensors(),
+                coordinates=self.cloud.coordinates,
                 steps=self.steps,
                 keep_every=self.cloud.keep_every,
-                precision_m=self.cloud.precision_m,
+                precision_m=self.cloud.precision_m,  # type: ignore[arg-type]  # the sensor's
                 columns=self.cloud.columns,
+                materials=self._materials(),
+                returns=Returns(**self.returns.model_dump()),
+                noise=Noise(**self.noise.model_dump()),
+                visibility_km=self.weather.visibility_km,
             )
 
     def plan(self, scene: Scene) -> Planning | None:
@@ -242,6 +348,19 @@ class Scenario(Section):
                 waypoints=section.waypoints,
                 seed=section.seed,
             )
+
+    def _sensors(self) -> dict[str, Any]:
+        """Arguments of the survey."""
+        if not self.sensors and self.mount is None:
+            return {"sensor": self.sensor.sensor(self._folder)}
+        if self.mount is not None:
+            return {"sensors": [Mounted(self.sensor.sensor(self._folder), self.mount.pose())]}
+        return {
+            "sensors": [
+                Mounted(section.sensor(self._folder), section.mount.pose(), name)
+                for name, section in self.sensors.items()
+            ]
+        }
 
     def _read(self, entry: MeshFile) -> tuple[Mesh, ...]:
         with self._named():
@@ -300,6 +419,11 @@ class Scenario(Section):
             rows |= {scene.names[i]: list(scene.footprints[i]) for i in found}
         return np.array(list(rows.values()), dtype=np.float64).reshape(-1, 3), list(rows)
 
+    @property
+    def source(self) -> Path:
+        """The file that it comes from, for people."""
+        return Path(self._source)
+
     @contextmanager
     def _named(self) -> Iterator[None]:
         """Name the scenario's file in errors."""
@@ -311,7 +435,12 @@ class Scenario(Section):
 
 def _field_names() -> set[str]:
     """Names of the fields of all sections."""
-    return {name for section in Section.__subclasses__() for name in section.model_fields}
+    todo, names = [Section], set()
+    while todo:
+        section = todo.pop()
+        todo += section.__subclasses__()
+        names |= {field.alias or name for name, field in section.model_fields.items()}
+    return names
 
 
 def _ground(section: Ground, scene: Scene) -> Mesh:

@@ -8,12 +8,13 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, Strict, model_validator
 
-from ..columns.table import OPTIONAL
+from ..base.vocabulary import BACKENDS
+from ..columns.table import COORDINATES, OPTIONAL
 from ..scene.transform import Transform
 from ..sensor import Sensor
 from ..sensor.models import load_sensor
+from ..sensor.optics import MODES, SUBRAYS
 
-BACKENDS = ("auto", "cuda", "embree", "numpy")
 COLUMN_NAMES = tuple(column.in_files for column in OPTIONAL)
 
 # Nothing on Earth is farther from the origin of its map.
@@ -276,8 +277,17 @@ class CloudSection(Section):
         int, Field(ge=1, le=1_000_000, description="of the hits of each scan, every n-th")
     ] = 5
     precision_m: Annotated[
-        float, Field(ge=1e-6, le=1000, description="metres that points are rounded to")
-    ] = 0.01
+        Annotated[float, Field(ge=1e-6, le=1000)] | None,
+        Field(
+            description="metres that points are rounded to; by default the sensor's resolution, "
+            "or 0.01",
+            examples=[0.01],
+        ),
+    ] = None
+    coordinates: Annotated[
+        Literal[COORDINATES],  # type: ignore[valid-type]
+        Field(description="world; or sensor: of the sensor when it fired, as its driver has them"),
+    ] = "world"
     columns: Annotated[
         tuple[Literal[COLUMN_NAMES], ...],  # type: ignore[valid-type]
         Strict(False),
@@ -287,6 +297,99 @@ class CloudSection(Section):
             examples=[["time", "range", "intensity"]],
         ),
     ] = ()
+
+
+Names = Annotated[tuple[Text, ...], Strict(False)]
+Share = Annotated[float, Field(ge=0, le=1)]
+
+
+class MaterialSection(Section):
+    """What objects are made of; of the entries that name an object, the last counts."""
+
+    objects: Annotated[
+        Names,
+        _short(_is_text, lambda v: [v], Text | Names),
+        Field(min_length=1, description="names of objects, may hold * and ?"),
+    ]
+    reflectance: Annotated[
+        Share | None,
+        Field(description="share of light that is scattered back; by default 0.5, of glass 0"),
+    ] = None
+    semantic_class: Annotated[
+        int, Field(alias="class", ge=0, le=65_535, description="value of the column class")
+    ] = 0
+    retro: Annotated[
+        bool, Field(description="whether light goes back where it came from, as from signs")
+    ] = False
+    transparent: Annotated[
+        Literal["none", "pass", "mirror"],
+        Field(description="what becomes of the rest of the light: it goes on, or is reflected"),
+    ] = "none"
+
+
+class ReturnsSection(Section):
+    """Rays that make up a beam, and which of its returns are reported."""
+
+    mode: Annotated[
+        Literal[MODES],  # type: ignore[valid-type]
+        Field(description="which returns of a pulse are reported; dual: strongest and last"),
+    ] = "strongest"
+    subrays: Annotated[
+        Literal[SUBRAYS],  # type: ignore[valid-type]
+        Field(description="rays a beam is divided into: 1, 7, 19, 37, 61, … 217"),
+    ] = 1
+    divergence_mrad: Annotated[
+        Annotated[float, Field(ge=0, le=1000)] | None,
+        Field(description="full angle of the beam; by default the sensor's", examples=[3.0]),
+    ] = None
+    pulse_ns: Annotated[
+        Annotated[float, Field(ge=0, le=1e6)] | None,
+        Field(
+            description="length of the pulse: surfaces nearer to each other than half of it are "
+            "one return; by default the sensor's, or 5",
+            examples=[5.0],
+        ),
+    ] = None
+
+
+class NoiseSection(Section):
+    """Noise of ranges and angles, and returns that are lost."""
+
+    range_m: Annotated[
+        float, Field(ge=0, le=1000, description="standard deviation of ranges, metres")
+    ] = 0.0
+    range_per_m: Annotated[
+        float, Field(ge=0, le=1, description="what is added to it for each metre of range")
+    ] = 0.0
+    angle_deg: Annotated[
+        float, Field(ge=0, le=10, description="standard deviation of where beams point, each way")
+    ] = 0.0
+    dropout: Annotated[
+        Share, Field(description="share of returns that are lost, however strong")
+    ] = 0.0
+    detection_range_m: Annotated[
+        Annotated[float, Field(ge=0.001, le=1e8)] | None,
+        Field(
+            description="from where half the pulses on a surface of 10 % reflectance are seen; "
+            "weaker returns are lost",
+            examples=[100.0],
+        ),
+    ] = None
+    seed: Annotated[
+        int, Field(ge=0, le=2**63 - 1, description="the same seed gives the same noise")
+    ] = 0
+
+
+class WeatherSection(Section):
+    """What the air does to light."""
+
+    visibility_km: Annotated[
+        Annotated[float, Field(ge=0.001, le=1e6)] | None,
+        Field(
+            description="meteorological visibility; by default the air takes nothing",
+            examples=[10.0],
+        ),
+    ] = None
 
 
 class Obstacle(Section):

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ..base.errors import LidarpoolError
+from ..base.vocabulary import UNITS_M
 from ..base.words import did_you_mean
 from .dae import read_dae
 from .gltf import read_gltf
@@ -18,7 +19,7 @@ from .mesh import Mesh
 from .nodes import Content, MeshFileError
 from .polygon_files import read_obj, read_off, read_ply_mesh, read_stl
 from .threemf import read_3mf
-from .transform import UNITS_M, UP_AXES, Transform
+from .transform import UP_AXES, Transform
 
 # A reader takes the content of a file and its path. It raises MeshFileError for what it refuses,
 # and whatever it stumbles over in a file that is broken. Each is our own; why no library serves is

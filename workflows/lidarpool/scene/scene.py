@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import LidarpoolError
+from .actors import Actor
 from .mesh import Mesh, points_array
 from .meshfile import load_meshes
 from .shapes import seed_objects
@@ -40,6 +41,8 @@ class Scene:
         Names of the objects, each one once.
     origin
         float64 (3,), whole metres.
+    actors
+        What moves; as objects they are numbered after the others.
 
     Raises
     ------
@@ -52,6 +55,7 @@ class Scene:
     face_object: NDArray[np.int32]
     names: tuple[str, ...]
     origin: NDArray[np.float64]
+    actors: tuple[Actor, ...] = ()
 
     def __post_init__(self) -> None:
         vertices = points_array("the scene", self.vertices)
@@ -68,6 +72,7 @@ class Scene:
                 f"each of the {len(faces)} faces."
             )
         object.__setattr__(self, "names", tuple(self.names))
+        object.__setattr__(self, "actors", tuple(self.actors))
         for name, array in (
             ("vertices", vertices),
             ("faces", faces),
@@ -155,6 +160,41 @@ class Scene:
             face_object=np.repeat(np.arange(len(parts), dtype=np.int32), face_counts),
             names=unique_names([mesh.name for mesh in parts]),
             origin=origin,
+        )
+
+    @property
+    def all_names(self) -> tuple[str, ...]:
+        """Names of all objects, actors after the others."""
+        return unique_names((*self.names, *(actor.name for actor in self.actors)))
+
+    @property
+    def triangles(self) -> int:
+        """How many there are, those of actors included."""
+        return len(self.faces) + sum(len(actor.mesh.faces) for actor in self.actors)
+
+    def solid(self, time_ns: float | None = None) -> Scene:
+        """All triangles, those of actors after the others: in their own axes, or where they are.
+
+        Parameters
+        ----------
+        time_ns
+            Nanoseconds since the survey's start.
+        """
+        if not self.actors:
+            return self
+        meshes = [actor.mesh if time_ns is None else actor.placed(time_ns) for actor in self.actors]
+        vertices = [self.vertices, *(mesh.vertices for mesh in meshes)]
+        faces, owners, first = [self.faces], [self.face_object], 0
+        for number, mesh in enumerate(meshes, len(self.names)):
+            first += len(vertices[number - len(self.names)])
+            faces.append((mesh.faces + first).astype(np.int32))
+            owners.append(np.full(len(mesh.faces), number, np.int32))
+        return Scene(
+            np.concatenate(vertices),
+            np.concatenate(faces),
+            np.concatenate(owners),
+            self.all_names,
+            self.origin,
         )
 
     def meshes(self) -> tuple[Mesh, ...]:

@@ -10,20 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 from ..base.errors import LidarpoolError
 from ..sensor import Pose
 
-# Metres in one of each unit.
-UNITS_M = {
-    "um": 1e-6,
-    "mm": 1e-3,
-    "cm": 1e-2,
-    "dm": 1e-1,
-    "m": 1.0,
-    "km": 1e3,
-    "in": 0.0254,
-    "ft": 0.3048,
-    "yd": 0.9144,
-    "mi": 1609.344,
-}
-
 # Proper rotations that take the named axis to +z; the rows hold only 0 and ±1, so that
 # turning large coordinates loses no digit.
 UP_AXES = {

@@ -1,23 +1,34 @@
 """Sensors: beams, the head that moves them, where they are, and what a survey scans."""
 
 from .beams import Beams, Head, Mirror, Spin
+from .materials import Material
+from .noise import Noise
+from .optics import Optics, Returns
 from .rays import ListedSensor, PrismSensor
 from .sensor import LineSensor, Sensor
-from .survey import ScanSpec, Survey
-from .trajectory import Pose, Stations, Trajectory
+from .survey import Mounted, ScanSpec, Survey
+from .trajectory import Pose, Stations, Track, Trajectory
+from .trajectory_files import load_trajectory
 
 __all__ = [
     "Beams",
     "Head",
     "LineSensor",
     "ListedSensor",
+    "Material",
     "Mirror",
+    "Mounted",
+    "Noise",
+    "Optics",
     "Pose",
     "PrismSensor",
+    "Returns",
     "ScanSpec",
     "Sensor",
     "Spin",
     "Stations",
     "Survey",
+    "Track",
     "Trajectory",
+    "load_trajectory",
 ]

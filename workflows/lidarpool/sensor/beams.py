@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property
@@ -186,8 +185,9 @@ class Spin:
 
     def firings(self, step: int) -> tuple[int, int]:
         """See `Head.firings`; after one turn the numbers go on."""
-        per_step = self._firings_per_step
-        return math.ceil(step * per_step), math.ceil((step + 1) * per_step)
+        # Rounded up, in whole numbers: arithmetic of fractions would take as long as a small scan.
+        count, steps = self._firings_per_step.as_integer_ratio()
+        return -(-step * count // steps), -(-(step + 1) * count // steps)
 
     def times_ns(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
         """See `Head.times_ns`."""

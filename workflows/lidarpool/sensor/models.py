@@ -18,6 +18,7 @@ from ..base.errors import LidarpoolError
 from ..base.words import did_you_mean
 from .beams import Beams, Mirror, Spin
 from .calibrations import Calibration, read_calibration, said
+from .optics import Optics
 from .rays import ListedSensor, PrismSensor
 from .sensor import LineSensor, Sensor
 
@@ -86,6 +87,15 @@ class PrismPart(_Part):
     inclined_first: bool
 
 
+class OpticsPart(_Part):
+    """See `Optics`."""
+
+    wavelength_nm: Positive = Optics.wavelength_nm
+    divergence_mrad: Positive | None = None
+    pulse_ns: Positive = Optics.pulse_ns
+    resolution_m: Positive = Optics.resolution_m
+
+
 class SensorModel(_Part):
     """What a data file says of a sensor. `docs/how-to/sensor.md` describes its fields."""
 
@@ -102,6 +112,7 @@ class SensorModel(_Part):
     beams: BeamTable = BeamTable()
     mirror: MirrorPart | None = None
     prisms: PrismPart | None = None
+    optics: OpticsPart = OpticsPart()
     listed: bool = False
 
     @model_validator(mode="after")
@@ -109,6 +120,7 @@ class SensorModel(_Part):
         if (self.firing_us is None) == (self.firings_per_turn is None):
             raise ValueError("give either firing_us or firings_per_turn")
         self.beams.beams()  # LidarpoolError if it cannot be made
+        Optics(**self.optics.model_dump())  # the same
         return self
 
     @property
@@ -170,7 +182,11 @@ def _read(path: Path | Traversable) -> SensorModel:
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"])) or "as a whole"
-        raise LidarpoolError(f"{path}, {place}: {first['msg']}.") from error
+        said_of_it = f"{first['msg']}."
+        if first["type"] == "extra_forbidden":
+            fields = {field for part in _Part.__subclasses__() for field in part.model_fields}
+            said_of_it = f"this is not a field.{did_you_mean(str(first['loc'][-1]), fields)}"
+        raise LidarpoolError(f"{path}, {place}: {said_of_it}") from error
     except (OSError, ValueError, TypeError, KeyError, yaml.YAMLError, LidarpoolError) as error:
         raise LidarpoolError(f"{path} is no model that can be used: {said(error)}") from error
 
@@ -237,6 +253,7 @@ def load_sensor(
         "min_range_m": low if min_range_m is None else min_range_m,
         "max_range_m": high if max_range_m is None else max_range_m,
         "name": described.name if unit is None else f"{described.name}, {unit.file}",
+        "optics": Optics(**described.optics.model_dump()),
     }
     head = Spin(firings, step_deg, rate, described.clockwise, described.zero_deg)
     if unit is not None and (unit.rays is not None or described.listed or described.prisms):

@@ -110,7 +110,8 @@ class ListedSensor(Sensor):
         """See `Sensor.directions`."""
         return self.rays[firings % len(self.rays)][:, None, :]
 
-    def times_ns(self, firings: NDArray[np.int64]) -> NDArray[np.int64]:
-        """See `Sensor.times_ns`."""
+    def begins_ns(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
+        """See `Sensor.begins_ns`."""
         cycles, shots = np.divmod(firings, len(self.rays))
-        return np.rint(cycles * self.cycle_ns + self.shot_ns[shots]).astype(np.int64)[:, None]
+        times: NDArray[np.float64] = cycles * self.cycle_ns + self.shot_ns[shots]
+        return times

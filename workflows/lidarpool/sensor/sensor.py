@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..base.errors import LidarpoolError
 from .beams import CHANNELS_MOST, Beams, Head, Spin
+from .optics import Optics
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,7 +18,7 @@ class Sensor:
     """Beams that a head moves. In each firing all beams are fired once.
 
     A sensor of another kind has beams or a head of its own, or is a subclass with other
-    `directions`, `origins` or `times_ns`: nothing else has to know of it. Its fields are what
+    `directions`, `origins` or `begins_ns`: nothing else has to know of it. Its fields are what
     tells it from others (see `lidarpool.base.fingerprint`), so keep what it depends on in them.
 
     Parameters
@@ -29,6 +30,8 @@ class Sensor:
         is nearer.
     name
         Of the model, for reports; by default that of the class.
+    optics
+        Its light, and how finely it reports.
 
     Raises
     ------
@@ -47,6 +50,7 @@ class Sensor:
     min_range_m: float = 0.0
     max_range_m: float = float("inf")
     name: str = ""
+    optics: Optics = field(default_factory=Optics)
 
     def __post_init__(self) -> None:
         checks = (
@@ -56,6 +60,11 @@ class Sensor:
         for name, good, allowed in checks:
             if not good:
                 raise LidarpoolError(f"{name} is {getattr(self, name)}; it must be {allowed}.")
+
+    @property
+    def model(self) -> str:
+        """What it is, for reports."""
+        return self.name or f"{type(self).__name__} with {self.channels} channels"
 
     @classmethod
     def grid(
@@ -144,26 +153,56 @@ class Sensor:
             return None
         return self._turned(firings, self.beams.origin)
 
+    @property
+    def ahead(self) -> NDArray[np.float64]:
+        """Unit directions of the beams in the head's axes: (channels, 3)."""
+        return self._ahead
+
+    @cached_property
+    def centre(self) -> NDArray[np.float64] | None:
+        """Where all beams leave, (3,) in the head's axes; None where they do not leave together."""
+        origin = self.beams.origin
+        return origin[0] if (origin == origin[0]).all() else None
+
+    def heads(self, firings: NDArray[np.int64]) -> NDArray[np.float64] | None:
+        """Return rotations from the head's axes to the sensor's at firings (k,): (k, 3, 3).
+
+        None where the rays are not those of beams that such a head turns.
+        """
+        kind = type(self)
+        if kind.directions is not Sensor.directions or kind.origins is not Sensor.origins:
+            return None
+        return np.ascontiguousarray(self._turned(firings, np.eye(3)).transpose(0, 2, 1))
+
     def _turned(
         self, firings: NDArray[np.int64], vectors: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Turn a vector of each beam (c, 3) with the head: (k, channels, 3).
+        """Turn vectors (c, 3), such as one of each beam, with the head: (k, c, 3).
 
         Products of what a firing and what a beam has: no trigonometry on each ray.
         """
         azimuth = self.head.azimuths(firings)[:, None]
         cos, sin = np.cos(azimuth), np.sin(azimuth)
         x, y, z = vectors.T
-        out = np.empty((len(firings), self.channels, 3))
+        out = np.empty((len(firings), len(vectors), 3))
         out[..., 0] = cos * x - sin * y
         out[..., 1] = sin * x + cos * y
         out[..., 2] = z
         return out
 
+    def begins_ns(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
+        """When firings (k,) begin, since the head started: (k,)."""
+        return self.head.times_ns(firings)
+
     def times_ns(self, firings: NDArray[np.int64]) -> NDArray[np.int64]:
         """When the rays of firings (k,) are fired, since the head started: (k, channels)."""
-        times = self.head.times_ns(firings)[:, None] + self.beams.time_ns
+        times = self.begins_ns(firings)[:, None] + self.beams.time_ns
         return np.rint(times).astype(np.int64)
+
+    @property
+    def lead_ns(self) -> float:
+        """When the first beam is fired within a firing."""
+        return float(self.beams.time_ns.min())
 
     @cached_property
     def _ahead(self) -> NDArray[np.float64]:

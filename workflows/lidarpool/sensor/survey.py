@@ -1,17 +1,45 @@
-"""A survey: one sensor, its trajectory, and the scans that follow from them."""
+"""A survey: sensors on a carrier, its trajectory, and the scans that follow from them."""
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
+from itertools import accumulate
 
 import numpy as np
 
 from ..base.errors import LidarpoolError
-from ..columns.table import Column, chosen, stored
+from ..columns.table import COORDINATES, Column, chosen, stored
+from .materials import Material, extinction
+from .noise import Noise
+from .optics import Returns, check_numbers
 from .sensor import Sensor
-from .trajectory import Pose, Stations, Trajectory
+from .trajectory import CENTRE, Pose, Stations, Trajectory
+
+STEPS = 36  # from each pose where none are given: one turn of most sensors
+STEPS_MOST = 10_000_000  # along a trajectory
+SENSORS_MOST = 255  # the type of the column
+
+
+@dataclass(frozen=True)
+class Mounted:
+    """A sensor on a carrier.
+
+    Parameters
+    ----------
+    sensor
+        The lidar.
+    mount
+        Where it sits and how it is turned, in the carrier's axes.
+    name
+        What it is called where there are several.
+    """
+
+    sensor: Sensor
+    mount: Pose = CENTRE
+    name: str = ""
 
 
 @dataclass(frozen=True)
@@ -28,44 +56,71 @@ class ScanSpec:
         Half-open range of numbers of firings, counted from the beginning of the station.
     start_ns
         When the station begins, nanoseconds since the survey's start.
+    sensor
+        Number of its sensor.
+    channels
+        Of that.
     """
 
     scan: int
     station: int
     firings: tuple[int, int]
     start_ns: int = 0
+    sensor: int = 0
+    channels: int = 1
 
-    def ray_count(self, sensor: Sensor) -> int:
+    @property
+    def ray_count(self) -> int:
         """Rays in this scan."""
-        return (self.firings[1] - self.firings[0]) * sensor.channels
+        return (self.firings[1] - self.firings[0]) * self.channels
 
 
 @dataclass(frozen=True)
 class Survey:
-    """All scans of one sensor: every time step from every station, one after the other.
+    """All scans of a carrier's sensors.
+
+    Scans of a sensor are in the order of time, and all of one sensor come before those of the
+    next: so a batch is one cast, and each part belongs to one sensor or two. What is simultaneous
+    is told by the column `time`.
 
     Parameters
     ----------
     sensor
-        The lidar.
+        The lidar, where there is one and it is the carrier.
     poses
         Where it scans from, one after the other: `Pose`, or x, y, z.
     steps
-        Time steps from each pose.
+        Time steps from each pose, 36 by default; along a `Track` by default as many as it lasts.
     keep_every
         Of the hits of each scan, the cloud keeps every n-th.
     precision_m
-        Points are rounded to multiples of this, in metres.
+        Points are rounded to multiples of this, in metres; None for the sensor's resolution.
     columns
         What points have beside x, y, z, scan, channel and object: names of the table of columns
-        (`lidarpool.columns.table`), or `Column` of one's own.
+        (`lidarpool.columns.table`), or `Column` of one's own. Of several sensors the column
+        `sensor` is always one.
     trajectory
-        In place of `poses`, where the sensor moves.
+        In place of `poses`, where the carrier moves.
+    sensors
+        In place of `sensor`: `Mounted`, each with a name of its own if there are several.
+    coordinates
+        Of the points: "world", or "sensor" for those of the sensor at the time of each ray, as its
+        driver gives them.
+    materials
+        What objects are made of, by their names; where several name an object, the last counts.
+        Without any, all scatter half of the light.
+    returns
+        Sub-rays of a beam, and which returns of a pulse are reported.
+    noise
+        Of ranges and angles, and returns that are lost.
+    visibility_km
+        Meteorological visibility; None for air that takes no light.
 
     Raises
     ------
     LidarpoolError
-        If a number is out of range, there is no pose, or no such column.
+        If a number is out of range, there is no pose, or no such column, or if the trajectory
+        does not last long enough.
 
     Examples
     --------
@@ -76,72 +131,170 @@ class Survey:
 
     sensor: Sensor = field(default_factory=Sensor.grid)
     poses: Sequence[Pose] = ()
-    steps: int = 36
+    steps: int | None = None
     keep_every: int = 5
-    precision_m: float = 0.01
+    precision_m: float = None  # type: ignore[assignment]  # filled in below
     columns: Sequence[str | Column] = ()
     trajectory: Trajectory | None = None
+    sensors: Sequence[Mounted] = ()
+    coordinates: str = "world"
+    materials: Sequence[Material] = ()
+    returns: Returns = field(default_factory=Returns)
+    noise: Noise = field(default_factory=Noise)
+    visibility_km: float | None = None
 
     def __post_init__(self) -> None:
         poses = tuple(p if isinstance(p, Pose) else _pose(p) for p in self.poses)
         object.__setattr__(self, "poses", poses)
+        object.__setattr__(self, "sensors", tuple(self.sensors))
         if self.trajectory is None:
             if not poses:
                 raise LidarpoolError("A survey needs at least one pose to scan from.")
             object.__setattr__(self, "trajectory", Stations(poses))
         elif poses and self.trajectory != Stations(poses):
             raise LidarpoolError("A survey has either poses or a trajectory, not both.")
-        object.__setattr__(self, "columns", chosen(self.columns))
-        for name, least in (("steps", 1), ("keep_every", 1), ("precision_m", 1e-6)):
+        names = [carried.name for carried in self.sensors]
+        if len(names) > SENSORS_MOST or len({*names}) < len(names):
+            raise LidarpoolError(
+                f"A survey has at most {SENSORS_MOST} sensors, each with a name of its own; given: "
+                f"{', '.join(names[:10])}."
+            )
+        if self.sensors:
+            object.__setattr__(self, "sensor", self.sensors[0].sensor)
+        extra = ("sensor",) if len(self.sensors) > 1 else ()
+        object.__setattr__(self, "columns", chosen((*self.columns, *extra)))
+        if self.coordinates not in COORDINATES:
+            raise LidarpoolError(f"coordinates are {' or '.join(COORDINATES)}.")
+        object.__setattr__(self, "materials", tuple(self.materials))
+        if getattr(self, "precision_m", None) is None:
+            finest = min(carried.sensor.optics.resolution_m for carried in self.carried)
+            object.__setattr__(self, "precision_m", finest)
+        check_numbers(self, {"visibility_km": (1e-3, 1e6)})
+        for carried in self.carried:
+            self.returns.of(carried.sensor.optics)  # LidarpoolError if they do not fit together
+        for name, least in (("keep_every", 1), ("precision_m", 1e-6), ("steps", 1)):
             value = getattr(self, name)
-            if not least <= value < float("inf"):
+            if value is not None and not least <= value < float("inf"):
                 raise LidarpoolError(f"{name} is {value}; it must be at least {least}.")
+        if self.steps is None and self.path.duration_ns == float("inf"):
+            object.__setattr__(self, "steps", STEPS)
+        for carried, steps in zip(self.carried, self.steps_each, strict=True):
+            needed, there = _end_ns(carried.sensor, steps) / 1e9, self.path.duration_ns / 1e9
+            if needed > there:
+                raise LidarpoolError(
+                    f"steps {steps} take {needed:.6g} s and the trajectory lasts {there:.6g} s, "
+                    f"{needed - there:.6g} s less: take fewer steps, or leave them out for as many "
+                    "as it lasts."
+                )
 
     @cached_property
     def path(self) -> Trajectory:
-        """Where the sensor is: the trajectory, or the poses as one."""
+        """Where the carrier is: the trajectory, or the poses as one."""
         assert self.trajectory is not None  # made of the poses where it was not given
         return self.trajectory
+
+    @cached_property
+    def carried(self) -> tuple[Mounted, ...]:
+        """The sensors, also where there is one."""
+        return tuple(self.sensors) or (Mounted(self.sensor),)
+
+    @cached_property
+    def channels(self) -> int:
+        """Beams of the sensor that has most."""
+        return max(carried.sensor.channels for carried in self.carried)
 
     @cached_property
     def stored_columns(self) -> tuple[Column, ...]:
         """All columns of a part."""
         return stored(chosen(self.columns))
 
+    def extinction(self, sensor: Sensor) -> float:
+        """Extinction of the air for a sensor's light, 1/m."""
+        return extinction(self.visibility_km, sensor.optics.wavelength_nm)
+
+    @cached_property
+    def steps_each(self) -> tuple[int, ...]:
+        """Time steps of each sensor from each station."""
+        if self.steps is not None:
+            return (self.steps,) * len(self.carried)
+        counts = []
+        for sensor in (carried.sensor for carried in self.carried):
+            lasts = range(1, STEPS_MOST + 1)
+            ends = partial(_end_ns, sensor)
+            counts.append(bisect_right(lasts, self.path.duration_ns, key=ends))
+            if not counts[-1]:
+                raise LidarpoolError(
+                    f"The trajectory lasts {self.path.duration_ns / 1e9:.6g} s, and one time step "
+                    f"of the sensor takes {ends(1) / 1e9:.6g} s."
+                )
+        return tuple(counts)
+
+    @cached_property
+    def _firsts(self) -> list[int]:
+        """First scan of each sensor, and one past the last of all."""
+        return [0, *accumulate(steps * self.path.stations for steps in self.steps_each)]
+
     @property
     def scan_count(self) -> int:
         """Number of scans."""
-        return self.path.stations * self.steps
+        return self._firsts[-1]
 
     @property
     def ray_count(self) -> int:
         """Number of rays in all scans."""
-        return self.path.stations * self._firings_per_station * self.sensor.channels
+        each = (
+            carried.sensor.firings(steps - 1)[1] * carried.sensor.channels
+            for carried, steps in zip(self.carried, self.steps_each, strict=True)
+        )
+        return self.path.stations * sum(each)
 
     @cached_property
-    def _firings_per_station(self) -> int:
-        return self.sensor.firings(self.steps - 1)[1]
+    def station_ns(self) -> int:
+        """How long a station takes: until the last sensor is done."""
+        return max(
+            round(_begin_ns(carried.sensor, carried.sensor.firings(steps - 1)[1]))
+            for carried, steps in zip(self.carried, self.steps_each, strict=True)
+        )
 
-    @cached_property
-    def _station_ns(self) -> int:
-        """How long a station takes."""
-        last = np.array([self._firings_per_station], np.int64)
-        return int(self.sensor.times_ns(last).min())
+    @property
+    def duration_ns(self) -> float:
+        """Until the last firing begins."""
+        each = zip(self.carried, self.steps_each, strict=True)
+        last = max(_end_ns(carried.sensor, steps) for carried, steps in each)
+        return (self.path.stations - 1) * self.station_ns + last
 
     def scan(self, index: int) -> ScanSpec:
-        """Describe scan `index`: station `index // steps`, time step `index % steps`."""
-        station, step = divmod(index, self.steps)
-        return ScanSpec(index, station, self.sensor.firings(step), station * self._station_ns)
+        """Describe scan `index`: sensor by sensor, station by station, step by step."""
+        sensor = bisect_right(self._firsts, index) - 1
+        station, step = divmod(index - self._firsts[sensor], self.steps_each[sensor])
+        lidar = self.carried[sensor].sensor
+        start = station * self.station_ns
+        return ScanSpec(index, station, lidar.firings(step), start, sensor, lidar.channels)
 
     def scans(self) -> Iterator[ScanSpec]:
         """All scans in order."""
         return (self.scan(index) for index in range(self.scan_count))
 
     def pose(self, index: int) -> Pose:
-        """Pose of the sensor when scan `index` begins."""
+        """Pose of its sensor when scan `index` begins."""
         spec = self.scan(index)
-        first = np.array([spec.firings[0]], np.int64)
-        return self.path.pose(spec.station, float(self.sensor.times_ns(first).min()))
+        time = self.begins_ns(index) - spec.start_ns
+        return self.path.pose(spec.station, time).then(self.carried[spec.sensor].mount)
+
+    def begins_ns(self, index: int) -> float:
+        """When scan `index` begins, nanoseconds since the survey's start."""
+        spec = self.scan(index)
+        sensor = self.carried[spec.sensor].sensor
+        return spec.start_ns + _begin_ns(sensor, spec.firings[0]) + sensor.lead_ns
+
+
+def _begin_ns(sensor: Sensor, firing: int) -> float:
+    return float(sensor.begins_ns(np.array([firing], np.int64))[0])
+
+
+def _end_ns(sensor: Sensor, steps: int) -> float:
+    """When the last firing of so many time steps begins."""
+    return _begin_ns(sensor, sensor.firings(steps - 1)[1] - 1) + sensor.lead_ns
 
 
 def _pose(given: object) -> Pose:

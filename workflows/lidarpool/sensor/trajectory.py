@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from functools import cached_property
+from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..base.errors import LidarpoolError
+
+QUATERNION_SLACK = 1e-3  # of a quaternion's length, which files round
+# Times since 1970 are coarser than a nanosecond in double precision; and the beams of the last
+# firing are fired a little after its pose.
+_CLOCK_S, _FIRING_S = 1e-6, 1e-3
 
 
 @dataclass(frozen=True)
@@ -49,6 +55,28 @@ class Pose:
             ]
         )
 
+    def then(self, mount: Pose) -> Pose:
+        """Pose of what sits at `mount` in the axes of this one."""
+        if mount == CENTRE:
+            return self
+        eye = np.eye(3)
+        one, other = (eye if p.rotation is None else p.rotation for p in (self, mount))
+        return Pose.of(self.position + one @ mount.position, one @ other)
+
+    @classmethod
+    def of(cls, position: ArrayLike, rotation: NDArray[np.float64] | None) -> Pose:
+        """Make a pose of a position and a rotation matrix (3, 3), or None."""
+        place = tuple(np.asarray(position, np.float64).tolist())
+        if rotation is None:
+            return cls(place)
+        yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
+        pitch = -np.arcsin(np.clip(rotation[2, 0], -1, 1))
+        roll = np.arctan2(rotation[2, 1], rotation[2, 2])
+        return cls(place, *np.degrees([yaw, pitch, roll]).tolist())
+
+
+CENTRE = Pose((0.0, 0.0, 0.0))  # where a sensor sits that is its own carrier
+
 
 class Trajectory(Protocol):
     """Poses over time. A survey has stations: between them it jumps, within one it moves.
@@ -63,6 +91,10 @@ class Trajectory(Protocol):
     @property
     def moves(self) -> bool:
         """Whether the sensor moves within a station, so that each firing has its own pose."""
+
+    @property
+    def duration_ns(self) -> float:
+        """How long a station may last, nanoseconds; infinite where it may last for ever."""
 
     def pose(self, station: int, time_ns: float = 0.0) -> Pose:
         """Pose so long after the beginning of a station."""
@@ -89,6 +121,11 @@ class Stations:
         """See `Trajectory.moves`."""
         return False
 
+    @property
+    def duration_ns(self) -> float:
+        """See `Trajectory.duration_ns`."""
+        return np.inf
+
     def pose(self, station: int, time_ns: float = 0.0) -> Pose:
         """See `Trajectory.pose`."""
         return self.at[station]
@@ -101,3 +138,227 @@ class Stations:
         rotation = pose.rotation
         turned = None if rotation is None else np.broadcast_to(rotation, (count, 3, 3))
         return np.broadcast_to(np.array(pose.position), (count, 3)), turned
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """Poses at times, and between them a straight or a smooth way: one station.
+
+    Parameters
+    ----------
+    times_s
+        float64 (k,): when the carrier is at each pose, seconds, ascending; by any clock.
+    positions
+        float64 (k, 3): metres, in the scene's own coordinates.
+    quaternions
+        float64 (k, 4): x, y, z, w of the rotations from the carrier's axes to the scene's, of unit
+        length within 1e-3. None where the carrier faces its way, level.
+    smooth
+        Positions follow cubic Hermite curves (tangents through three poses, as Catmull and Rom,
+        1974), not straight lines. Rotations turn evenly about one axis from each pose to the
+        next in both cases (Shoemake, 1985).
+    start_s
+        Time, by the same clock, at which the station begins; by default the first.
+    duration_s
+        How long the station lasts; by default up to the last time.
+
+    Raises
+    ------
+    LidarpoolError
+        If there are fewer than two poses, a number is not finite, times do not ascend, a
+        quaternion is none, or the station is not within the times.
+
+    Examples
+    --------
+    >>> track = Track([0, 2], [[0, 0, 1], [20, 0, 1]])
+    >>> track.pose(0, 0.5e9).position, track.duration_ns
+    ((5.0, 0.0, 1.0), 2000000000.0)
+    """
+
+    times_s: NDArray[np.float64]
+    positions: NDArray[np.float64]
+    quaternions: NDArray[np.float64] | None = None
+    smooth: bool = False
+    start_s: float | None = None
+    duration_s: float | None = None
+
+    def __post_init__(self) -> None:
+        times = np.array(self.times_s, np.float64)
+        places = np.array(self.positions, np.float64)
+        if times.ndim != 1 or len(times) < 2 or places.shape != (len(times), 3):
+            raise LidarpoolError(
+                f"A trajectory needs two poses at least, with x, y and z each; there are "
+                f"{times.size} times and positions of {places.shape}."
+            )
+        _refuse(~np.isfinite(times), "the time of pose {} is not finite")
+        finite = np.isfinite(places[:, 0] + places[:, 1] + places[:, 2])
+        _refuse(~finite, "the position of pose {} is not finite")
+        late = np.append(False, np.diff(times) <= 0)
+        _refuse(late, "times must ascend, and that of pose {} does not come after the one before")
+        if self.quaternions is None:
+            turns = _along(times, places)
+        else:
+            turns = np.array(self.quaternions, np.float64).reshape(len(times), 4)
+        lengths = np.linalg.norm(turns, axis=1)
+        # Written so that NaN is refused.
+        bad = ~(np.abs(lengths - 1) <= QUATERNION_SLACK)
+        _refuse(bad, "the quaternion of pose {} is not of length 1")
+        turns /= lengths[:, None]
+        for name, array in (("times_s", times), ("positions", places), ("quaternions", turns)):
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+        start = times[0] if self.start_s is None else self.start_s
+        last = times[-1] if self.duration_s is None else start + self.duration_s
+        for what, time in (("start_s", start), ("the end by duration_s", last)):
+            gap = max(times[0] - time, time - times[-1])
+            if gap > _CLOCK_S:
+                raise LidarpoolError(
+                    f"{what} is {time:.9g} s, {gap:.6g} s outside the trajectory, which goes from "
+                    f"{times[0]:.9g} to {times[-1]:.9g} s."
+                )
+        if last <= start:
+            raise LidarpoolError(f"A trajectory from {start:.9g} to {last:.9g} s has no duration.")
+        object.__setattr__(self, "start_s", float(start))
+        object.__setattr__(self, "duration_s", float(last - start))
+
+    @property
+    def stations(self) -> int:
+        """See `Trajectory.stations`."""
+        return 1
+
+    @property
+    def moves(self) -> bool:
+        """See `Trajectory.moves`."""
+        return True
+
+    @property
+    def duration_ns(self) -> float:
+        """See `Trajectory.duration_ns`."""
+        assert self.duration_s is not None  # set above
+        return self.duration_s * 1e9
+
+    def pose(self, station: int, time_ns: float = 0.0) -> Pose:
+        """See `Trajectory.pose`."""
+        positions, rotations = self.poses(station, np.array([time_ns], np.float64))
+        return Pose.of(positions[0], rotations[0])
+
+    def poses(
+        self, station: int, times_ns: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """See `Trajectory.poses`.
+
+        Raises
+        ------
+        LidarpoolError
+            If a time is not within the trajectory.
+        """
+        assert self.start_s is not None  # set above
+        times, at = self.times_s, times_ns / 1e9 + self.start_s
+        low, high = at.min(initial=np.inf), at.max(initial=-np.inf)
+        gap = max(times[0] - low, high - times[-1])
+        if gap > _FIRING_S:
+            raise LidarpoolError(
+                f"The trajectory goes from {times[0]:.9g} to {times[-1]:.9g} s; poses are asked "
+                f"for from {low:.9g} to {high:.9g} s, {gap:.6g} s outside."
+            )
+        segment = np.clip(np.searchsorted(times, at, "right") - 1, 0, len(times) - 2)
+        since = (at - times[segment])[:, None]
+        way, turn, rates = self._segments
+        # By Horner; a straight way has no more than two coefficients.
+        positions = way[-1].take(segment, axis=0)
+        for coefficient in way[-2::-1]:
+            positions = positions * since + coefficient.take(segment, axis=0)
+        angle = since * rates.take(segment)[:, None]
+        rotations = turn[0].take(segment, axis=0)
+        rotations += np.sin(angle) * turn[1].take(segment, axis=0)
+        rotations += np.cos(angle) * turn[2].take(segment, axis=0)
+        return positions, rotations.reshape(-1, 3, 3)
+
+    @cached_property
+    def _segments(self) -> tuple[list[NDArray[np.float64]], NDArray[np.float64], Any]:
+        """What poses between two that are given follow from, one row a segment.
+
+        Returns
+        -------
+        way
+            Coefficients (s, 3) of the position's polynomial in seconds, the constant first.
+        turn
+            (3, s, 9): the rotation is ``turn[0] + sin(a) turn[1] + cos(a) turn[2]`` (Rodrigues,
+            1840), a the angle since the segment began.
+        rates
+            (s,) radians a second.
+        """
+        steps = np.diff(self.times_s)[:, None]
+        speeds = np.diff(self.positions, axis=0) / steps
+        way = [self.positions[:-1], speeds]
+        if self.smooth:
+            tangents = np.gradient(self.positions, self.times_s, axis=0)
+            first, last = tangents[:-1], tangents[1:]
+            way[1:] = [
+                first,
+                (3 * speeds - 2 * first - last) / steps,
+                (first + last - 2 * speeds) / steps**2,
+            ]
+        turns = self.quaternions
+        assert turns is not None  # set above
+        # From each pose to the next, in the axes of the first: conjugate(p) q.
+        (p, pw), (q, qw) = ((t[:, :3], t[:, 3:]) for t in (turns[:-1], turns[1:]))
+        axis = pw * q - qw * p - np.cross(p, q)
+        cosine = (p * q).sum(axis=1, keepdims=True) + pw * qw
+        axis = np.where(cosine < 0, -axis, axis)  # the shorter way
+        sine = np.linalg.norm(axis, axis=1, keepdims=True)
+        rates = 2 * np.arctan2(sine, np.abs(cosine)) / steps
+        x, y, z = (axis / np.where(sine > 0, sine, 1)).T
+        zero = np.zeros_like(x)
+        about = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+        start = matrices(turns[:-1])
+        square = start @ about @ about
+        table = np.stack([start + square, start @ about, -square])
+        return way, table.reshape(3, -1, 9), rates[:, 0]
+
+
+def matrices(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotation matrices (k, 3, 3) of unit quaternions x, y, z, w (k, 4)."""
+    x, y, z, w = quaternions.T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)
+
+
+def quaternions_of(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return unit quaternions x, y, z, w (k, 4) of matrices (k, 3, 3), rounded ones too.
+
+    The eigenvector of the greatest eigenvalue (Bar-Itzhack, 2000).
+    """
+    m = np.moveaxis(rotations, 0, -1)
+    table = np.zeros((len(rotations), 4, 4))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        table[:, i, i] = m[i, i] - m[j, j] - m[k, k]
+        table[:, i, j] = table[:, j, i] = m[i, j] + m[j, i]
+        table[:, k, 3] = table[:, 3, k] = m[j, i] - m[i, j]
+    table[:, 3, 3] = m[0, 0] + m[1, 1] + m[2, 2]
+    found: NDArray[np.float64] = np.linalg.eigh(table)[1][..., -1]
+    return found
+
+
+def _along(times: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Quaternions (k, 4) of a carrier that is level and faces its way; where it stands, as before.
+
+    Before it first moves it faces where it will.
+    """
+    x, y = (np.gradient(axis, times) for axis in (places[:, 0], places[:, 1]))
+    moving = np.flatnonzero(np.hypot(x, y) > 1e-9)
+    if not len(moving):
+        moving = np.zeros(1, np.intp)
+    last = moving[np.maximum(np.searchsorted(moving, np.arange(len(times)), "right") - 1, 0)]
+    half = np.arctan2(y[last], x[last]) / 2
+    return np.stack([np.zeros_like(half), np.zeros_like(half), np.sin(half), np.cos(half)], axis=1)
+
+
+def _refuse(bad: NDArray[np.bool_], words: str) -> None:
+    """Raise LidarpoolError if anything is bad, with the number of the first in the words."""
+    if bad.any():
+        raise LidarpoolError(f"{words.format(int(bad.argmax()))} (poses are counted from 0).")

@@ -10,24 +10,25 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import yaml
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from poolpart.wording import counted
 
-from ...plan import Planning
-from ...render.page import shortened
+from ...render.page import shortened, without_common_prefix
 from ...run.result import Result
 from ...run.trials import TRIAL
 from ...scan import COLLECT, GENERATE, INTERSECT, SORT
-from ..cloud_numbers import CloudNumbers
+from ...scenario.scenario import Scenario
+from ..cloud_numbers import CountedCloud
 from . import words
-from .charts import channel_histogram, convergence, object_bars, range_histogram
-from .recipe import Recipe
 from .timeline import make_timeline
-from .words import duration, excess, large, metres
+from .words import duration, excess, large, metres, share
 
 Report = Mapping[str, Any]
+OBJECTS_MOST = 25  # that have a bar
+SCENARIO_MOST = 50_000  # letters; a survey may have a million poses
 
 # {stage: what it is called on the page}, in the order of the pipeline
 STAGES = {
@@ -54,13 +55,22 @@ class Picture(NamedTuple):
     caption: str
 
 
+class Bar(NamedTuple):
+    """A row of a bar chart: name in full and short, number, share of all, length in per cent."""
+
+    name: str
+    label: str
+    points: int
+    share: str
+    percent: float
+
+
 def write_page(
     path: Path,
     report: Report,
     result: Result,
-    numbers: CloudNumbers,
-    planning: Planning | None,
-    recipe: Recipe | None = None,
+    cloud: CountedCloud,
+    scenario: Scenario | None = None,
 ) -> None:
     """Write a report as one HTML file that needs nothing else, and asks nobody for anything.
 
@@ -70,10 +80,10 @@ def write_page(
         Where to; pictures and cloud of the result are in the same folder.
     report
         What `make_report` says: all numbers of the page that it has are taken from it.
-    result, numbers, planning
-        What it is about, and counts of its cloud.
-    recipe
-        How to have it once more, if that is known.
+    result, cloud
+        What it is about, and its cloud, which was counted.
+    scenario
+        What it was made from, if that was a scenario.
 
     Raises
     ------
@@ -82,10 +92,11 @@ def write_page(
     """
     ordered = sorted(result.stages, key=lambda stage: list(STAGES).index(stage.stage))
     begun = min((stage.start for stage in ordered), default=math.inf)
+    bars, rest = _object_bars(report["points_by_object"])
     page = _environment().get_template("page.html")
     text = page.render(
         report=report,
-        title="Lidar survey" + (f": {recipe.name}" if recipe else ""),
+        title="Lidar survey" + (f": {scenario.source.name}" if scenario else ""),
         begun=f"{datetime.fromtimestamp(begun, UTC):%Y-%m-%d %H:%M UTC}" if ordered else "",
         summary=_summary(report),
         facts=list(_facts(report)),
@@ -93,14 +104,42 @@ def write_page(
         stages=ordered,
         names=STAGES,
         timeline=make_timeline(ordered, result.records, STAGES),
-        objects=object_bars(report["points_by_object"]),
-        cloud=numbers,
-        ranges=range_histogram(numbers.by_range, numbers.edges) if len(numbers.edges) else None,
-        channels=channel_histogram(numbers.by_channel) if len(result.points) else None,
-        curves=convergence(result.trials, result.plan) if planning and result.plan else None,
-        recipe=recipe,
+        bars=bars,
+        rest=rest,
+        bounds=cloud.bounds.tolist(),
+        scenario=_written(scenario) if scenario else "",
     )
     path.write_text(text, encoding="utf-8")
+
+
+def _written(scenario: Scenario) -> str:
+    """Write a scenario as YAML that can be loaded, unless it is so long that it is cut short."""
+    data = scenario.model_dump(mode="json", exclude_defaults=True)
+    text = yaml.safe_dump(
+        data, sort_keys=False, allow_unicode=True, default_flow_style=None, width=96
+    )
+    text = text if len(text) <= SCENARIO_MOST else f"{text[:SCENARIO_MOST]}…"
+    return text if data else ""
+
+
+def _object_bars(counts: Mapping[str, int]) -> tuple[list[Bar], str]:
+    """Bars of the objects with the most points, and words on those that have none."""
+    total, ranked = sum(counts.values()), sorted(counts.items(), key=lambda item: -item[1])
+    hit = [item for item in ranked if item[1]]
+    shown = hit[:OBJECTS_MOST]
+    most = shown[0][1] if shown else 1
+    labels = dict(zip(counts, without_common_prefix(list(counts)), strict=True))
+    bars = [Bar(name, labels[name], n, share(n, total), 100 * n / most) for name, n in shown]
+    rest = []
+    if more := hit[OBJECTS_MOST:]:
+        points = sum(count for _, count in more)
+        rest.append(
+            f"{counted(len(more), 'more object')} with {counted(points, 'point')} "
+            f"({share(points, total)})"
+        )
+    if missed := len(ranked) - len(hit):
+        rest.append(f"{counted(missed, 'object')} without points")
+    return bars, "; ".join(rest)
 
 
 def _environment() -> Environment:
@@ -115,7 +154,7 @@ def _environment() -> Environment:
     )
     for filter_ in (
         words.duration, words.rate, words.large, words.share, words.excess, words.metres,
-        words.numbers, words.grouped, counted,
+        words.numbers, words.grouped, words.bound, counted,
     ):  # fmt: skip
         environment.filters[filter_.__name__] = filter_
     environment.filters["shortened"] = partial(shortened, most=60)
@@ -132,8 +171,11 @@ def _presentable(value: object) -> object:
 def _summary(report: Report) -> str:
     """Say in a sentence what was done and what came out."""
     parameters, planning = report["parameters"], report["planning"]
+    where = f"from {counted(parameters['poses'], 'position')}"
+    if seconds := parameters.get("trajectory_s"):
+        where = f"along a trajectory of {seconds:,.3g} s"
     text = (
-        f"{counted(report['scans'], 'scan')} from {counted(parameters['poses'], 'position')} sent "
+        f"{counted(report['scans'], 'scan')} {where} sent "
         f"{counted(report['rays'], 'ray')} at {counted(parameters['objects'], 'object')}; "
         f"{report['hits']:,} hit, and {counted(report['points'], 'point')} of them "
         f"{'is' if report['points'] == 1 else 'are'} in the cloud"
@@ -168,11 +210,16 @@ def _pictures(report: Report, folder: Path) -> Iterator[Picture]:
     parameters = report["parameters"]
     objects = counted(parameters["objects"], "object")
     poses = counted(parameters["poses"], "sensor position")
+    if parameters.get("trajectory_s"):
+        poses = "the way of the sensors"
+    actors = parameters["actors"]
+    halfway = ", and what moves where it is halfway"
+    halfway = halfway if actors or parameters.get("trajectory_s") else ""
     every = parameters["keep_every"]
     kept = "one for each hit" if every == 1 else f"one for every {every:,} hits of a scan"
     captions = {
         "scene.png": f"The scene: {objects} of {counted(parameters['triangles'], 'triangle')}, "
-        f"{poses} in red.",
+        f"{poses} in red{halfway}.",
         "intensity.png": f"Where the {counted(report['hits'], 'hit')} fell, per square metre, "
         "and some rays.",
         "cloud.png": f"The cloud: {counted(report['points'], 'point')}, {kept}, rounded to "

@@ -14,8 +14,6 @@ from poolpart.wording import counted
 
 from ...base.task_book import StageTotals, union
 from ...render.stage import nice_step
-from ...run.trials import TRIAL
-from ...scan import INTERSECT
 from .words import duration
 
 WIDTH = 1000  # units of the drawing, whatever its width on the page
@@ -50,7 +48,6 @@ class Timeline(NamedTuple):
     seconds: float  # from the first start to the last stop
     ticks: Sequence[tuple[float, str]]  # per cent of the width, label
     groups: Sequence[Group]
-    both: Sequence[Span]  # where stage 2 and planning ran at the same time, in units
     tasks: int
     row: int = ROW  # height of a row
 
@@ -103,15 +100,8 @@ def make_timeline(
         workers = {task.worker for task in tasks}  # that have a record
         workers = workers.union(*(s.workers for s in stages if s.partition == partition))
         groups.append(_group(axis, partition, len(workers), ran[partition], tasks, names))
-    spans = {stage.stage: axis.spans(stage.busy) for stage in stages}
-    both = [
-        (max(a[0], b[0]), min(a[1], b[1]))
-        for a in spans.get(INTERSECT, [])
-        for b in spans.get(TRIAL, [])
-        if min(a[1], b[1]) > max(a[0], b[0])
-    ]
     ticks = [(100 * t / axis.seconds, f"{t:.6g} s") for t in np.arange(0, axis.seconds, step)]
-    return Timeline(axis.seconds, ticks, groups, both, sum(stage.tasks for stage in stages))
+    return Timeline(axis.seconds, ticks, groups, sum(stage.tasks for stage in stages))
 
 
 def _by_partition(records: Iterable[TaskRecord]) -> dict[str, list[TaskRecord]]:

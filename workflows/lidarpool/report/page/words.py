@@ -61,6 +61,11 @@ def excess(fraction: float) -> str:
     return f"{fraction:+.2%}".replace("-", MINUS)
 
 
+def bound(value: float) -> str:
+    """Lowest or highest value of a column, whole numbers with all their digits."""
+    return f"{value:,}" if isinstance(value, int) else f"{value:,.6g}"
+
+
 def metres(value: float | None) -> str:
     """Length in metres, and words for none."""
     return "–" if value is None else f"{value:,.2f} m".replace("-", MINUS)

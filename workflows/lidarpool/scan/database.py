@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from ..base.errors import LidarpoolError
 from ..plan import Trial
-from ..scan.messages import Receipt
+from .messages import Receipt
 
-FORMAT = 3
+FORMAT = 4
 FILE = "run.db"
 
 _TABLES = """
@@ -286,7 +286,7 @@ class RunDatabase:
 
 def _trial_of(data: dict[str, Any]) -> Trial:
     waypoints = np.array(data.pop("waypoints"), np.float64).reshape(-1, 2)
-    return Trial(waypoints=waypoints, history=np.array(data.pop("history"), np.float32), **data)
+    return Trial(waypoints=waypoints, **data)
 
 
 def parts_place(path: Path) -> str:

@@ -1,0 +1,26 @@
+"""Names and figures that scenario files, commands and functions share; importing it costs nothing.
+
+The command's help and the completion of its words at a terminal read no other module.
+"""
+
+from __future__ import annotations
+
+BACKENDS = ("auto", "cuda", "embree", "numpy")
+PICTURES = ("scene", "intensity", "cloud", "path")  # that are drawn
+
+# Metres in one of each unit.
+UNITS_M = {
+    "um": 1e-6,
+    "mm": 1e-3,
+    "cm": 1e-2,
+    "dm": 1e-1,
+    "m": 1.0,
+    "km": 1e3,
+    "in": 0.0254,
+    "ft": 0.3048,
+    "yd": 0.9144,
+    "mi": 1609.344,
+}
+
+WAIT_S = 10.0  # for partitions that are empty when a run begins
+PATIENCE_S = 60.0  # for those that become empty; a nanny needs a few seconds

@@ -1,0 +1,31 @@
+"""Messages of workers on the terminal, see `logs.py`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from distributed.diagnostics.plugin import WorkerPlugin
+
+from .logs import set_logs
+
+
+class WorkerLogs(WorkerPlugin):
+    """Shows or drops messages of workers that share a terminal with the command.
+
+    A task that fails is told of once, by the driver; Dask's worker would log it as well, with
+    a traceback.
+
+    Parameters
+    ----------
+    shown
+        Whether they show what they log.
+    """
+
+    name = "lidarpool-logs"
+
+    def __init__(self, shown: bool) -> None:
+        self.shown = shown
+
+    def setup(self, worker: Any) -> None:
+        """Take effect, also in a worker that is started again."""
+        set_logs(self.shown)

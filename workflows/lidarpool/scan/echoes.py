@@ -1,0 +1,381 @@
+"""What comes back of a pulse: beams of several rays, materials, and noise.
+
+It takes the place of the ray caster's `scan` where a survey has any of these. Random numbers
+follow from scan, ray and return, so nothing depends on how scans are batched.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from raybeam import Pattern, ScanReturns
+
+from ..scene.scene import Scene
+from ..sensor import Sensor, Survey
+from ..sensor.optics import Mode, hexagon, spread
+from .motion import Clock, Poses
+from .surfaces import Surfaces
+from .world import World
+
+PATTERN_RAYS = 20_000_000  # of a period of the head that are kept; 24 bytes each
+CHUNK_RAYS = 1 << 20  # sub-rays that are cast at a time
+BLOCK_RAYS = 1 << 14  # rays whose sub-rays are made at a time, within a cache
+PASSES_MOST = 16  # surfaces that light meets one after the other, before it is given up
+
+Whole = NDArray[np.int64]
+Rays = NDArray[np.integer[Any]]
+Real = NDArray[np.float64]
+
+
+class Hits(NamedTuple):
+    """Where light came back from, in the order of rays: arrays (n,)."""
+
+    ray: Whole
+    distance: Real
+    triangle: NDArray[np.int32]
+    energy: Real
+
+    def take(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Hits:
+        """Return some of them."""
+        return Hits(self.ray[rows], self.distance[rows], self.triangle[rows], self.energy[rows])
+
+
+def joined(parts: list[Hits]) -> Hits:
+    """Put hits one after the other."""
+    return Hits(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+@dataclass(frozen=True)
+class Echoes(ScanReturns):
+    """Returns in the order of rays and distances, perhaps several of a ray.
+
+    Attributes
+    ----------
+    energy
+        float64 (k,): received, see `Surfaces.energy`.
+    number, returns
+        uint8 (k,): which of the reported returns of its pulse, from 1, and of how many.
+    reported
+        float64 (k,): distance with noise; `distance` is without.
+    """
+
+    energy: Real
+    number: NDArray[np.uint8]
+    returns: NDArray[np.uint8]
+    reported: Real
+
+
+@dataclass(frozen=True)
+class Keys:
+    """What random numbers of a ray follow from.
+
+    Parameters
+    ----------
+    scan
+        Number of the first scan.
+    begins
+        Rays at which scans begin.
+    """
+
+    scan: int
+    begins: Whole
+
+    def of(self, ray: Rays) -> tuple[Whole, Whole]:
+        """Return the scans of rays, and their numbers within them."""
+        number = np.searchsorted(self.begins, ray, side="right") - 1
+        return self.scan + number, ray - self.begins[number]
+
+
+class EchoCaster:
+    """A ray caster that knows beams, materials and noise.
+
+    Parameters
+    ----------
+    caster
+        Casts single rays.
+    scene, survey, surfaces
+        What is scanned and how.
+    """
+
+    def __init__(self, caster: World, scene: Scene, survey: Survey, surfaces: Surfaces) -> None:
+        self._caster, self._survey, self._surfaces = caster, survey, surfaces
+        self._noise, self._one_each = survey.noise, _one_each(survey, surfaces)
+        self._faces = surfaces.triangles
+        self._divided: dict[int, Pattern] = {}  # {id of a pattern that is kept: its sub-rays}
+        # So far off a surface light goes on, not to meet it again: Embree rounds to a fourth.
+        reach = np.float32(np.abs(scene.vertices).max())
+        self._clear_m = max(1e-5, 4 * float(np.spacing(reach)))
+
+    @staticmethod
+    def needed(survey: Survey, surfaces: Surfaces) -> bool:
+        """Whether plain casting does not do for a survey."""
+        noise = survey.noise
+        noisy = max(noise.range_m, noise.range_per_m, noise.angle_deg) > 0
+        return noisy or not _one_each(survey, surfaces)
+
+    def divide(self, sensor: Sensor, pattern: Pattern) -> None:
+        """Make the sub-rays of a pattern once that is cast again and again, if they are few."""
+        subrays = self._survey.returns.subrays
+        few = len(pattern) * subrays <= PATTERN_RAYS
+        if few and subrays > 1 and not self._noise.angle_deg:
+            beam = self._beam(sensor)
+            beams = self._beams(beam, pattern, 0, Keys(0, np.zeros(1, int)), 0, len(pattern))
+            self._divided[id(pattern)] = beams
+
+    def _beam(self, sensor: Sensor) -> Real:
+        divergence, _ = self._survey.returns.of(sensor.optics)
+        return hexagon(self._survey.returns.subrays, divergence)
+
+    def scan(
+        self,
+        sensor: Sensor,
+        scan: int,
+        pattern: Pattern,
+        poses: Poses,
+        window: tuple[int, int],
+        groups: Whole,
+    ) -> Echoes:
+        """Cast consecutive scans.
+
+        Parameters
+        ----------
+        sensor
+            Whose beams they are.
+        scan
+            Number of the first scan.
+        pattern, poses, window, groups
+            As of `RayCaster.scan`; each group is a scan.
+        """
+        noise, first, rays = self._noise, window[0], window[1] - window[0]
+        keys = Keys(scan, groups)
+        if self._one_each:
+            if noise.angle_deg:
+                beams = self._beams(np.zeros((1, 2)), pattern, first, keys, 0, rays)
+                pattern, first = beams, 0
+            found = self._once(sensor, pattern, poses, (first, first + rays), groups)
+        else:
+            _, gap_m = self._survey.returns.of(sensor.optics)
+            beam, divided = self._beam(sensor), self._divided.get(id(pattern))
+            if len(beam) == 1 and not noise.angle_deg:
+                divided = pattern
+            unit = poses.rays_per_pose or 1
+            size = max(1, CHUNK_RAYS // (len(beam) * unit)) * unit
+            chunks = []
+            for start in range(0, rays, size):
+                stop = min(start + size, rays)
+                row = (first + start) * len(beam)
+                if divided is None:
+                    beams, row = self._beams(beam, pattern, first, keys, start, stop), 0
+                else:
+                    beams = divided
+                window = (row, row + (stop - start) * len(beam))
+                hits = self._hits(sensor, beams, poses.part(start, stop, len(beam)), window)
+                ray, energy = start + hits.ray // len(beam), hits.energy / len(beam)
+                returns = separated(hits._replace(ray=ray, energy=energy), gap_m)
+                chunks.append(self._reported(returns, keys))
+            found = self._kept(joined(chunks), groups)
+        if noise.range_m or noise.range_per_m:
+            reported = noise.ranges(found.distance, *keys.of(found.ray), found.number)
+            found = replace(found, reported=reported)
+        return found
+
+    def _beams(
+        self, beam: Real, pattern: Pattern, first: int, keys: Keys, start: int, stop: int
+    ) -> Pattern:
+        """Make the sub-rays of rays `start` to `stop`, noise of angles included, ray by ray."""
+        rays = np.arange(start, stop)
+        rows = (first + rays) % len(pattern)
+        directions = np.empty((len(rays), len(beam), 3))
+        for begin in range(0, len(rays), BLOCK_RAYS):
+            block = slice(begin, begin + BLOCK_RAYS)
+            across, up = beam.T[:, None]
+            if self._noise.angle_deg:
+                off_across, off_up = self._noise.angles(*keys.of(rays[block]))
+                across, up = across + off_across[:, None], up + off_up[:, None]
+            directions[block] = spread(pattern.directions[rows[block]], across, up)
+        origins = pattern.origins
+        if origins is not None:
+            origins = np.repeat(origins[rows], len(beam), axis=0)
+        return Pattern(directions.reshape(-1, 3), origins)
+
+    def _once(
+        self,
+        sensor: Sensor,
+        pattern: Pattern,
+        poses: Poses,
+        window: tuple[int, int],
+        groups: Whole,
+    ) -> Echoes:
+        """Cast rays that have one return each: energies of those only that are kept."""
+        found = self._caster.returns(
+            sensor, self._survey.keep_every, pattern, poses, window, groups
+        )
+        _, directions = poses.rays(pattern, found.ray, window[0])
+        times = poses.times(found.ray)
+        along = self._surfaces.along_normal(found.triangle, directions, times)
+        energy = self._energy(sensor, found.triangle, np.abs(along), found.distance)
+        one = np.ones(len(found), np.uint8)
+        return Echoes(
+            **vars(found), energy=energy, number=one, returns=one, reported=found.distance
+        )
+
+    def _energy(
+        self, sensor: Sensor, triangle: NDArray[np.int32], cosine: Real, distance: Real
+    ) -> Real:
+        extinction = self._survey.extinction(sensor)
+        return self._surfaces.energy(triangle, cosine, distance, extinction)
+
+    def _hits(self, sensor: Sensor, beams: Pattern, poses: Poses, window: tuple[int, int]) -> Hits:
+        """Cast sub-rays, and follow the light through what passes it and off mirrors."""
+        surfaces, materials = self._surfaces, self._surfaces.materials
+        farthest = sensor.max_range_m
+        found = self._caster.scan(
+            beams,
+            poses,
+            window=window,
+            t_min=sensor.min_range_m,
+            t_max=farthest,
+        )
+        ray, step, triangle = found.ray.astype(np.int64), found.distance, found.triangle
+        origins, directions = poses.rays(beams, ray, window[0])
+        origins = np.broadcast_to(origins, directions.shape)
+        times = poses.times(ray)
+        share, before = np.ones(len(ray)), np.zeros(len(ray))
+        parts: list[Hits] = []
+        for _ in range(PASSES_MOST):
+            along = surfaces.along_normal(triangle, directions, times)
+            distance = before + step
+            energy = share * self._energy(sensor, triangle, np.abs(along), distance)
+            parts.append(Hits(ray, distance, triangle, energy))
+            rows = surfaces.objects(triangle)
+            on = np.flatnonzero(materials.passes[rows] | materials.mirrors[rows])
+            if not len(on):
+                break
+            rows, along, distance, ahead = rows[on], along[on], distance[on], directions[on]
+            share = share[on] * materials.goes_on(rows, np.abs(along)) ** 2  # and back again
+            ends = origins[on] + step[on, None] * ahead
+            folded = 2 * materials.mirrors[rows] * along
+            ahead = ahead - folded[:, None] * surfaces.normals(triangle[on], times[on])
+            away = self._clear_m / np.maximum(np.abs(along), 1e-3)
+            light = Pattern(ahead, ends + away[:, None] * ahead)
+            # Light that goes on is where it is at once: it passes 300 m in a microsecond.
+            now = Poses(np.zeros(3), clock=Clock(times[on], np.zeros(1)))
+            found = self._caster.scan(light, now, t_max=farthest)
+            before = distance + away
+            near = before[found.ray] + found.distance <= farthest
+            which, step, triangle = found.ray[near], found.distance[near], found.triangle[near]
+            ray, share, before = ray[on][which], share[which], before[which]
+            times = times[on][which]
+            directions = light.directions[which]
+            origins = light.origins[which]  # type: ignore[index]  # it has some
+        hits = joined(parts)
+        if parts[1:]:
+            hits = hits.take(np.argsort(hits.ray, kind="stable"))
+        return hits
+
+    def _reported(self, returns: Hits, keys: Keys) -> Hits:
+        """Take what is seen, and of it what the mode reports."""
+        if self._noise.loses:
+            seen = self._noise.detected(returns.energy, *keys.of(returns.ray), numbers(returns.ray))
+            returns = returns.take(seen)
+        return returns.take(chosen(returns, self._survey.returns.mode))
+
+    def _kept(self, returns: Hits, groups: Whole) -> Echoes:
+        """Count the returns of each scan and thin them out."""
+        ray = returns.ray
+        cuts = np.searchsorted(ray, np.append(groups, np.iinfo(np.int64).max))
+        number = numbers(ray)
+        each = number + numbers(ray[::-1])[::-1] + 1
+        place = np.arange(len(ray)) - np.repeat(cuts[:-1], np.diff(cuts))
+        kept = place % self._survey.keep_every == 0
+        thinned = returns.take(kept)
+        return Echoes(
+            ray=thinned.ray.astype(np.uint32),
+            distance=thinned.distance,
+            triangle=thinned.triangle,
+            hits=np.diff(cuts),
+            tally=np.bincount(returns.triangle, minlength=self._faces),
+            energy=thinned.energy,
+            number=np.minimum(number[kept] + 1, 255).astype(np.uint8),
+            returns=np.minimum(each[kept], 255).astype(np.uint8),
+            reported=thinned.distance,
+        )
+
+
+def _one_each(survey: Survey, surfaces: Surfaces) -> bool:
+    """Whether each ray that hits something has one return."""
+    several = survey.returns.subrays > 1 or survey.noise.loses
+    return surfaces.materials.plain and not several
+
+
+def numbers(ray: Whole) -> Whole:
+    """Count the entries of each ray, which stand together, from 0: (n,)."""
+    return np.arange(len(ray)) - np.repeat(*_runs(ray))
+
+
+def _runs(ray: Whole) -> tuple[Whole, Whole]:
+    """Where runs of equal numbers begin, and how long they are."""
+    begins = np.flatnonzero(np.diff(ray, prepend=-1))
+    return begins, np.diff(begins, append=len(ray))
+
+
+def separated(hits: Hits, gap_m: float) -> Hits:
+    """Make returns of hits: those of a ray that follow within a distance are one return.
+
+    Its energy is the sum of theirs, its distance their mean weighted by energy, its triangle
+    that of the strongest. Hits without energy are none.
+
+    Parameters
+    ----------
+    hits
+        Of all sub-rays, in the order of rays.
+    gap_m
+        Half of the pulse's length in metres.
+
+    Returns
+    -------
+    Hits
+        In the order of rays and distances.
+    """
+    hits = hits.take(hits.energy > 0)
+    if not len(hits.ray):
+        return hits
+    begins, counts = _runs(hits.ray)
+    width = np.maximum.reduceat(hits.distance, begins) - np.minimum.reduceat(hits.distance, begins)
+    # Few beams meet an edge, and only those are sorted.
+    wide = np.flatnonzero(np.repeat(width > gap_m, counts))
+    order = np.arange(len(hits.ray))
+    order[wide] = wide[np.lexsort((hits.distance[wide], hits.ray[wide]))]
+    hits = hits.take(order)
+    new = np.diff(hits.ray, prepend=-1) != 0
+    new |= np.diff(hits.distance, prepend=np.inf) > gap_m
+    begins = np.flatnonzero(new)
+    which = np.cumsum(new) - 1
+    energy = np.bincount(which, hits.energy).astype(np.float64)
+    distance = np.bincount(which, hits.energy * hits.distance) / energy
+    strongest = np.flatnonzero(hits.energy == np.maximum.reduceat(hits.energy, begins)[which])
+    first = strongest[numbers(which[strongest]) == 0]
+    return Hits(hits.ray[begins], distance, hits.triangle[first], energy)
+
+
+def chosen(returns: Hits, mode: Mode) -> NDArray[np.bool_]:
+    """Which returns of each ray a mode reports: (n,)."""
+    ray = returns.ray
+    begins, counts = _runs(ray)
+    first, last = np.zeros((2, len(ray)), np.bool_)
+    first[begins], last[begins + counts - 1] = True, True
+    if mode == "all" or len(begins) == len(ray):
+        return np.ones(len(ray), np.bool_)
+    if mode in ("first", "last"):
+        return first if mode == "first" else last
+    # The strongest has rank 0; of equally strong ones the nearest.
+    rank = np.empty(len(ray), np.int64)
+    rank[np.lexsort((-returns.energy, ray))] = np.arange(len(ray)) - np.repeat(begins, counts)
+    if mode == "strongest":
+        return np.asarray(rank == 0)
+    strongest_is_last = np.repeat(rank[last] == 0, counts)
+    return np.asarray((rank == 0) | last | ((rank == 1) & strongest_is_last))

@@ -1,0 +1,166 @@
+"""Where a carrier is at each firing, and how it moves on until the next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import raybeam.poses
+from raybeam import Motion, Pattern
+
+from ..sensor import Mounted, Trajectory
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Clock:
+    """When rays are fired, in nanoseconds since the survey's start.
+
+    Parameters
+    ----------
+    begins
+        (f,): of each firing.
+    delays
+        (m,): of each ray of a firing.
+    start, subrays
+        Of the rays from number `start` on, each is divided into so many.
+    """
+
+    begins: Float
+    delays: Float
+    start: int = 0
+    subrays: int = 1
+
+    def of(self, ray: NDArray[np.integer[Any]]) -> Float:
+        """When rays (n,) are fired: (n,)."""
+        firing, beam = np.divmod(self.start + ray // self.subrays, len(self.delays))
+        times: Float = self.begins[firing] + self.delays[beam]
+        return times
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Where rays are cast from, as `RayCaster.scan` takes it."""
+
+    positions: Float
+    rotations: Float | None = None
+    rays_per_pose: int | None = None
+    motion: Motion | None = None
+    clock: Clock | None = None
+
+    @property
+    def given(self) -> dict[str, Any]:
+        """Arguments of `RayCaster.scan` and `Pattern.rays`."""
+        if self.rays_per_pose is None:
+            return {"positions": self.positions, "rotations": self.rotations}
+        return {"positions": self._checked}
+
+    @cached_property
+    def _checked(self) -> raybeam.poses.Poses:
+        """Checked once: that takes as long as casting a hundredth of the rays."""
+        each = self.rays_per_pose
+        return raybeam.poses.check_poses(self.positions, self.rotations, each, 0, self.motion)
+
+    def times(self, ray: NDArray[np.integer[Any]]) -> Float:
+        """When rays are fired, nanoseconds since the survey's start; where there are actors."""
+        return np.zeros(len(ray)) if self.clock is None else self.clock.of(ray)
+
+    def part(self, start: int, stop: int, subrays: int) -> Poses:
+        """Poses of rays `start` to `stop`, each divided; they begin where a pose does."""
+        each, motion, clock = self.rays_per_pose, self.motion, self.clock
+        if clock is not None:
+            clock = replace(clock, start=start, subrays=subrays)
+        if each is None:
+            return replace(self, clock=clock)
+        poses = slice(start // each, -(-stop // each))
+        if motion is not None:
+            late = np.repeat(motion.delays, subrays)
+            motion = Motion(late, motion.velocities[poses], motion.rates[poses])
+        rotations = None if self.rotations is None else self.rotations[poses]
+        return Poses(self.positions[poses], rotations, each * subrays, motion, clock)
+
+    def rays(
+        self, pattern: Pattern, ray: NDArray[np.integer[Any]], start: int = 0
+    ) -> tuple[Float, Float]:
+        """Origins and directions of rays of a pattern, see `Pattern.rays`."""
+        return pattern.rays(ray, start=start, **self.given)
+
+
+def poses_of_firings(
+    carried: Mounted, path: Trajectory, station: int, first: int, stop: int
+) -> Poses:
+    """Poses that the beams of a sensor are fired from in firings `first` to `stop`.
+
+    They are those of its head, where all rays are beams that a head turns: then the rays of one
+    firing do for all, and none are made again. Else they are those of the carrier.
+
+    The beams of a firing that are fired later leave from where the carrier is then: it moves
+    evenly from each firing to the next. A pose for each beam would cost as much as casting it.
+
+    There is no motion where all beams of a firing are fired at one time.
+    """
+    sensor = carried.sensor
+    firings = np.arange(first, stop + 1, dtype=np.int64)
+    times = np.minimum(sensor.begins_ns(firings) + sensor.lead_ns, path.duration_ns)
+    positions, turns = path.poses(station, times)
+    turns = np.broadcast_to(np.eye(3), (len(times), 3, 3)) if turns is None else turns
+    heads, rotations = sensor.heads(firings[:-1]), turns[:-1]
+    if heads is not None:
+        mount = carried.mount
+        if any(mount.position):
+            seat = np.broadcast_to(mount.position, positions.shape)
+            positions = positions + into_axes(seat, turns.transpose(0, 2, 1))
+        if mount.rotation is not None:
+            rotations = _product(rotations, mount.rotation[None])
+        rotations = _product(rotations, heads)
+    places = positions[:-1]
+    if heads is not None and sensor.centre is not None and sensor.centre.any():
+        centre = np.broadcast_to(sensor.centre, places.shape)
+        places = places + into_axes(centre, rotations.transpose(0, 2, 1))
+    delays = (sensor.beams.time_ns - sensor.lead_ns) / 1e9
+    if not delays.any():
+        return Poses(places, rotations, sensor.channels)
+    seconds = np.diff(times)[:, None] / 1e9
+    seconds[seconds == 0] = np.inf  # a last firing at the very end: it stands
+    velocities = np.diff(positions, axis=0) / seconds
+    rates = _turned_by(turns[:-1], turns[1:]) / seconds
+    return Poses(places, rotations, sensor.channels, Motion(delays, velocities, rates))
+
+
+def into_axes(vectors: Float, rotations: Float | None) -> Float:
+    """Turn vectors (m, 3) from the scene's axes into those of rotations (m, 3, 3), each its own."""
+    if rotations is None:
+        return vectors
+    x, y, z = vectors.T
+    out = np.empty_like(vectors)
+    for axis in range(3):
+        a, b, c = (rotations[:, row, axis] for row in range(3))
+        out[:, axis] = (x * a + y * b) + z * c
+    return out
+
+
+def _product(one: Float, other: Float) -> Float:
+    """Products of matrices (k, 3, 3), or (1, 3, 3), in one order of rounding, however many."""
+    out = np.empty((max(len(one), len(other)), 3, 3))
+    for row in range(3):
+        a, b, c = (one[:, row, k, None] for k in range(3))
+        out[:, row] = (a * other[:, 0] + b * other[:, 1]) + c * other[:, 2]
+    return out
+
+
+def _turned_by(before: Float, after: Float) -> Float:
+    """Rotation vectors (k, 3), radians, between matrices (k, 3, 3) that differ by little.
+
+    Half the sum of the cross products of the axes before and after: the sine of the angle.
+    """
+    out = np.empty((len(before), 3))
+    for axis in range(3):
+        one, other = (axis + 1) % 3, (axis + 2) % 3
+        cross = before[:, one] * after[:, other] - before[:, other] * after[:, one]
+        out[:, axis] = ((cross[:, 0] + cross[:, 1]) + cross[:, 2]) / 2
+    return out

@@ -1,0 +1,85 @@
+"""What rays meet: objects, their materials, and the energy that comes back of them."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..scene.scene import Scene
+from ..sensor.materials import Material, MaterialTable, at_right_angles
+
+BLOCK_FACES = 1 << 18  # whose normals are made at a time
+
+Triangles = NDArray[np.integer[Any]]
+Real = NDArray[np.float64]
+
+
+class Surfaces:
+    """Triangles as light sees them.
+
+    Parameters
+    ----------
+    scene
+        Triangles and objects.
+    materials
+        Of the objects by name.
+
+    Raises
+    ------
+    LidarpoolError
+        If there are materials, and an object has none, or one is that of no object.
+    """
+
+    def __init__(self, scene: Scene, materials: tuple[Material, ...]) -> None:
+        self._scene, self._actors = scene.solid(), scene.actors
+        self._standing = len(scene.names)  # objects
+        self.triangles = len(self._scene.faces)
+        self.materials = MaterialTable.of(materials, scene.all_names)
+
+    @cached_property
+    def _normals(self) -> NDArray[np.float32]:
+        out = np.empty((len(self._scene.faces), 3), np.float32)
+        for begin in range(0, len(out), BLOCK_FACES):
+            faces = self._scene.faces[begin : begin + BLOCK_FACES]
+            a, b, c = self._scene.vertices[faces].transpose(1, 0, 2)
+            normals = np.cross(b - a, c - a)
+            lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+            out[begin : begin + BLOCK_FACES] = normals / np.maximum(lengths, 1e-300)
+        return out
+
+    def normals(self, triangle: Triangles, times: Real | NDArray[np.int64]) -> Real:
+        """Return the unit normals of triangles (n,): (n, 3), in single precision.
+
+        Those of actors are turned as these are at the times (n,), nanoseconds.
+        """
+        normals = self._normals[triangle].astype(np.float64)
+        for number, actor in enumerate(self._actors, self._standing):
+            rows = np.flatnonzero(self.objects(triangle) == number)
+            _, rotations = actor.trajectory.poses(0, times[rows].astype(np.float64))
+            if rotations is not None:
+                normals[rows] = (rotations * normals[rows, None, :]).sum(axis=2)
+        return normals
+
+    def along_normal(
+        self, triangle: Triangles, directions: Real, times: Real | NDArray[np.int64]
+    ) -> Real:
+        """Cosines between unit directions (n, 3) and the normals of triangles (n,) at times."""
+        if self._actors:
+            return np.asarray((self.normals(triangle, times) * directions).sum(axis=1))
+        return np.asarray((self._normals[triangle] * directions).sum(axis=1))
+
+    def objects(self, triangle: Triangles) -> NDArray[np.int32]:
+        """Objects that triangles (n,) belong to."""
+        return self._scene.face_object[triangle]
+
+    def energy(self, triangle: Triangles, cosine: Real, distance: Real, extinction: float) -> Real:
+        """Energy that comes back of rays that end on triangles (n,), metres away.
+
+        ``reflectance * cosine * (10 m / distance)**2 * exp(-2 * extinction * distance)``; from a
+        retro-reflector, a gain stands in place of the cosine.
+        """
+        scattered = self.materials.scattered(self.objects(triangle), cosine)
+        return np.asarray(scattered * at_right_angles(distance, extinction))

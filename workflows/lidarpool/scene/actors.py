@@ -1,0 +1,64 @@
+"""Actors: objects that move while the scene stands still."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..base.errors import LidarpoolError
+from ..sensor import Trajectory
+from .mesh import Mesh
+
+
+@dataclass(frozen=True, eq=False)
+class Actor:
+    """An object on a way of its own.
+
+    Parameters
+    ----------
+    mesh
+        Its triangles in its own axes (x ahead, z up), and its name.
+    trajectory
+        Where its axes are, in the scene's local coordinates; its one station begins with the
+        survey.
+    """
+
+    mesh: Mesh
+    trajectory: Trajectory
+
+    @property
+    def name(self) -> str:
+        """What it is called."""
+        return self.mesh.name
+
+    def placed(self, time_ns: float) -> Mesh:
+        """Its mesh where it is at a time, in the scene's local coordinates."""
+        positions, rotations = self.trajectory.poses(0, np.array([time_ns]))
+        vertices = self.mesh.vertices if rotations is None else self.mesh.vertices @ rotations[0].T
+        return Mesh(self.name, vertices + positions[0], self.mesh.faces)
+
+    def check(self, duration_ns: float) -> None:
+        """Check that it is somewhere as long as a survey lasts; LidarpoolError if not."""
+        try:
+            self.trajectory.poses(0, np.array([0.0, duration_ns]))
+        except LidarpoolError as error:
+            raise LidarpoolError(f"Actor {self.name!r}: {error}") from error
+
+
+def one_mesh(name: str, meshes: Iterable[Mesh]) -> Mesh:
+    """Put meshes together to one object."""
+    parts = list(meshes)
+    firsts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    faces = [part.faces + first for part, first in zip(parts, firsts, strict=False)]
+    vertices = np.concatenate([part.vertices for part in parts])
+    return Mesh(name, vertices, np.concatenate(faces))
+
+
+def box(name: str, size_m: tuple[float, float, float]) -> Mesh:
+    """Return a box of a length, width and height, its origin in the middle of its underside."""
+    corners = np.array([(x, y, z) for z in (0, 1) for y in (-0.5, 0.5) for x in (-0.5, 0.5)])
+    sides = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
+    faces = [[a, b, c] for a, b, c, _ in sides] + [[a, c, d] for a, _, c, d in sides]
+    return Mesh(name, corners * size_m, np.array(faces))

@@ -1,0 +1,187 @@
+"""What surfaces do to light: materials by the names of objects, energies of returns, weather."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.errors import LidarpoolError
+from ..base.words import did_you_mean
+from .optics import check_numbers
+
+REFERENCE_M = 10.0  # energy 1 is a white surface met at right angles from here
+REFLECTANCE = 0.5  # where none is stated: between asphalt (0.1 to 0.2) and white paint (0.8)
+# Engineer grade sheeting, ASTM D4956 type I white: 70 cd/lx/m², of a white diffuser 1/π.
+RETRO_GAIN = 220.0
+GLASS_INDEX = 1.5
+NEAREST_M = 1e-3  # energies do not grow any more below this
+
+Transparent = Literal["none", "pass", "mirror"]
+
+
+@dataclass(frozen=True)
+class Material:
+    """What the surfaces of some objects are made of.
+
+    Parameters
+    ----------
+    objects
+        Names of objects, which may hold * and ?; one or several.
+    reflectance
+        Share of the light that is scattered back in all directions, 0 to 1, at the sensor's
+        wavelength; by default 0.5, and 0 where `transparent` is "pass" or "mirror".
+    semantic_class
+        Value of the column `class`.
+    retro
+        Whether light goes back where it came from, as from traffic signs and licence plates.
+    transparent
+        What becomes of the light that is not scattered back: "none" (it is lost), "pass" (it
+        goes straight on, less what a surface of glass reflects), "mirror" (it is reflected).
+
+    Raises
+    ------
+    LidarpoolError
+        If a value is outside its range.
+    """
+
+    objects: str | Sequence[str]
+    reflectance: float | None = None
+    semantic_class: int = 0
+    retro: bool = False
+    transparent: Transparent = "none"
+
+    def __post_init__(self) -> None:
+        names = (self.objects,) if isinstance(self.objects, str) else tuple(self.objects)
+        if not names or not all(isinstance(name, str) and name for name in names):
+            raise LidarpoolError(f"objects is {self.objects!r}; it must be names of objects.")
+        object.__setattr__(self, "objects", names)
+        if self.transparent not in ("none", "pass", "mirror"):
+            raise LidarpoolError(
+                f"transparent is {self.transparent!r}; it must be none, pass or mirror."
+            )
+        check_numbers(self, {"reflectance": (0, 1), "semantic_class": (0, 65_535)})
+        if int(self.semantic_class) != self.semantic_class:
+            raise LidarpoolError(f"class is {self.semantic_class}; it must be a whole number.")
+
+    def named(self, name: str) -> bool:
+        """Whether an object is made of it."""
+        return any(name == pattern or fnmatchcase(name, pattern) for pattern in self.objects)
+
+
+@dataclass(frozen=True, eq=False)
+class MaterialTable:
+    """Materials of objects, one row each.
+
+    Attributes
+    ----------
+    reflectance
+        float64 (objects,).
+    retro, passes, mirrors
+        bool (objects,).
+    semantic_class
+        uint16 (objects,).
+    """
+
+    reflectance: NDArray[np.float64]
+    retro: NDArray[np.bool_]
+    passes: NDArray[np.bool_]
+    mirrors: NDArray[np.bool_]
+    semantic_class: NDArray[np.uint16]
+
+    @classmethod
+    def of(cls, materials: Sequence[Material], names: Sequence[str]) -> MaterialTable:
+        """Find the materials of objects by name: the last that names an object counts.
+
+        Raises
+        ------
+        LidarpoolError
+            If a name is that of no object, or there are materials, and none names some object.
+        """
+        for pattern in (one for material in materials for one in material.objects):
+            if not any(Material(pattern).named(name) for name in names):
+                raise LidarpoolError(
+                    f"materials names {pattern!r}, and no object is called so."
+                    + (did_you_mean(pattern, names) or f" There are {', '.join(names[:5])}, …")
+                )
+        default = Material("*")
+        rows = [next((m for m in reversed(materials) if m.named(name)), None) for name in names]
+        without = [name for name, row in zip(names, rows, strict=True) if row is None]
+        if without and materials:
+            more = f" and {len(without) - 1} more" if without[1:] else ""
+            raise LidarpoolError(
+                f"materials: no entry names the object {without[0]!r}{more}: begin with one for "
+                'all the others, such as {objects: "*"}.'
+            )
+        found = [row or default for row in rows]
+        scattered = [
+            (REFLECTANCE if m.transparent == "none" else 0.0) if m.reflectance is None
+            else m.reflectance
+            for m in found
+        ]  # fmt: skip
+        return cls(
+            np.array(scattered, np.float64),
+            np.array([m.retro for m in found], np.bool_),
+            np.array([m.transparent == "pass" for m in found], np.bool_),
+            np.array([m.transparent == "mirror" for m in found], np.bool_),
+            np.array([m.semantic_class for m in found], np.uint16),
+        )
+
+    @property
+    def plain(self) -> bool:
+        """Whether each ray ends where it first meets something, and something comes back."""
+        return bool((self.reflectance > 0).all() and not (self.passes | self.mirrors).any())
+
+    def scattered(
+        self, rows: NDArray[np.integer[Any]], cosine: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Share of the light that comes back from objects (n,): 1 from white at right angles."""
+        return self.reflectance[rows] * np.where(self.retro[rows], RETRO_GAIN, cosine)
+
+    def goes_on(
+        self, rows: NDArray[np.integer[Any]], cosine: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Share of the light that goes on from objects (n,) that pass it or are mirrors."""
+        through = np.where(self.passes[rows], 1 - fresnel(cosine), 1.0)
+        return np.asarray((1 - self.reflectance[rows]) * through)
+
+
+def fresnel(cosine: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Share of unpolarised light that a surface of glass reflects (Fresnel's equations)."""
+    inside = np.sqrt(1 - (1 - cosine**2) / GLASS_INDEX**2)
+    across = (cosine - GLASS_INDEX * inside) / (cosine + GLASS_INDEX * inside)
+    along = (inside - GLASS_INDEX * cosine) / (inside + GLASS_INDEX * cosine)
+    return np.asarray((across**2 + along**2) / 2)
+
+
+def at_right_angles(distance: Any, extinction: float = 0.0) -> Any:
+    """Energy that comes back from white surfaces met at right angles, metres away."""
+    distance = np.maximum(distance, NEAREST_M)
+    return (REFERENCE_M / distance) ** 2 * np.exp(-2 * extinction * distance)
+
+
+def extinction(visibility_km: float | None, wavelength_nm: float) -> float:
+    """Extinction of the air, 1/m (Kruse, McGlauchlin and McQuistan 1962).
+
+    Parameters
+    ----------
+    visibility_km
+        Meteorological visibility, where a contrast has fallen to 2 %; None for clear air, which
+        takes nothing.
+    wavelength_nm
+        Of the laser.
+
+    Examples
+    --------
+    >>> round(1000 * extinction(1.0, 905), 2)  # 1/km in fog
+    2.92
+    """
+    v = visibility_km
+    if v is None:
+        return 0.0
+    q = 1.6 if v > 50 else 1.3 if v > 6 else 0.585 * v ** (1 / 3)
+    return float(3.91 / v * (wavelength_nm / 550) ** -q / 1000)

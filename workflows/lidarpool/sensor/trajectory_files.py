@@ -1,0 +1,147 @@
+"""Trajectories from files: TUM, KITTI, and tables of named columns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.errors import LidarpoolError
+from .calibrations import said
+from .trajectory import Pose, Track, quaternions_of
+
+FORMATS = ("tum", "kitti", "csv")
+_PLACE = ("x", "y", "z")
+_TURNS = (("qx", "qy", "qz", "qw"), ("yaw_deg", "pitch_deg", "roll_deg"))
+# Cameras look along z with y down; carriers look along x with z up.
+_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+def load_trajectory(
+    path: str | Path,
+    *,
+    format: str | None = None,  # noqa: A002 - what it is called in scenarios
+    times: str | Path | None = None,
+    columns: Mapping[str, str] | None = None,
+    camera_axes: bool | None = None,
+    offset_s: float = 0.0,
+    smooth: bool = False,
+    start_s: float | None = None,
+    duration_s: float | None = None,
+) -> Track:
+    """Read the trajectory of a carrier.
+
+    Parameters
+    ----------
+    path
+        TUM (rows of time, x, y, z, qx, qy, qz, qw), KITTI (rows of a 3 x 4 matrix), or
+        comma-separated with a header: time_s or time_ns, x, y, z, and qx, qy, qz, qw, or any of
+        yaw_deg, pitch_deg, roll_deg; without them the carrier faces its way.
+    format
+        "tum", "kitti" or "csv"; by default kitti where there are `times`, csv for a .csv, else
+        tum.
+    times
+        Of a KITTI file: the file with the seconds of its rows.
+    columns
+        Of a table, {name as above: name in the file}, where they differ.
+    camera_axes
+        Whether the poses are a camera's (z ahead, y down), to be turned to a carrier's (x ahead,
+        z up); by default those of KITTI.
+    offset_s
+        Added to all times.
+    smooth, start_s, duration_s
+        As of `Track`.
+
+    Raises
+    ------
+    LidarpoolError
+        If it cannot be read, or is none; the message names the file.
+    """
+    path = Path(path)
+    kind = format or ("kitti" if times else "csv" if path.suffix.lower() == ".csv" else "tum")
+    try:
+        text = path.read_text("utf-8-sig")
+        if not text.strip():
+            raise ValueError("it is empty")
+        if kind == "csv":
+            seconds, places, turns = _table(text, dict(columns or {}))
+        elif kind == "kitti":
+            if times is None:
+                raise ValueError("KITTI's poses have no times: give their file as times")
+            seconds = _numbers(Path(times).read_text("utf-8-sig"), 1)[:, 0]
+            rows = _numbers(text, 12).reshape(-1, 3, 4)
+            if len(rows) != len(seconds):
+                raise ValueError(f"it has {len(rows)} poses and {times} {len(seconds)} times")
+            places, turns = rows[..., 3], quaternions_of(_rotations(rows[..., :3]))
+        elif kind == "tum":
+            rows = _numbers(text, 8)
+            seconds, places, turns = rows[:, 0], rows[:, 1:4], rows[:, 4:]
+        else:
+            raise ValueError(f"there is no format {kind!r}, only {', '.join(FORMATS)}")
+        track = Track(seconds + offset_s, places, turns, smooth, start_s, duration_s)
+        if camera_axes or (camera_axes is None and kind == "kitti"):
+            track = _from_camera(track)
+        return track
+    except (OSError, ValueError, LidarpoolError) as error:
+        raise LidarpoolError(f"{path} is no trajectory that can be used: {said(error)}") from error
+
+
+def _numbers(text: str, columns: int, delimiter: str | None = None) -> NDArray[np.float64]:
+    """Rows of numbers; lines that begin with # are comments."""
+    lines = [line for line in text.splitlines() if line.strip() and line.strip()[0] != "#"]
+    if not lines:
+        raise ValueError("it has no poses")
+    rows = np.loadtxt(lines, delimiter=delimiter, ndmin=2)
+    if rows.shape[1:] != (columns,):
+        raise ValueError(f"its rows have {rows.shape[1]} numbers, not {columns}")
+    return rows
+
+
+def _rotations(given: NDArray[np.float64]) -> NDArray[np.float64]:
+    off = np.abs(given @ given.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    if not (off <= 2e-3).all() or (np.linalg.det(given) < 0).any():
+        raise ValueError("it holds matrices that are no rotations")
+    return given
+
+
+def _table(text: str, names: dict[str, str]) -> tuple[Any, Any, Any]:
+    """Seconds, positions and quaternions, or None, of a table with a header."""
+    head = [name.strip() for name in text.partition("\n")[0].split(",")]
+    known = ("time_s", "time_ns", *_PLACE, *_TURNS[0], *_TURNS[1])
+    if unknown := [name for name in names if name not in known]:
+        raise ValueError(f"columns names {unknown[0]!r}, and there are {', '.join(known)}")
+    at = {
+        name: head.index(names.get(name, name)) for name in known if names.get(name, name) in head
+    }
+    clock = next((name for name in known[:2] if name in at), "time_s")
+    quaternion = any(name in at for name in _TURNS[0])
+    needed = (clock, *_PLACE, *(_TURNS[0] if quaternion else ()))
+    if missing := [names.get(n, n) for n in {**dict.fromkeys(needed), **names} if n not in at]:
+        raise ValueError(f"it has no column {missing[0]!r}; it has {', '.join(head)}")
+    rows = _numbers(text.partition("\n")[2], len(head), ",")
+    seconds = rows[:, at[clock]] / (1e9 if clock == "time_ns" else 1.0)
+    places = rows[:, [at[name] for name in _PLACE]]
+    if quaternion:
+        return seconds, places, rows[:, [at[name] for name in _TURNS[0]]]
+    if not any(name in at for name in _TURNS[1]):
+        return seconds, places, None
+    angles = [rows[:, at[n]] if n in at else np.zeros(len(rows)) for n in _TURNS[1]]
+    return seconds, places, quaternions_from_degrees(np.stack(angles, axis=1))
+
+
+def quaternions_from_degrees(angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Quaternions (k, 4) of yaw, pitch and roll in degrees (k, 3), as of `Pose`."""
+    turns = [Pose((0, 0, 0), *row).rotation for row in angles.tolist()]
+    return quaternions_of(np.array([np.eye(3) if turn is None else turn for turn in turns]))
+
+
+def _from_camera(track: Track) -> Track:
+    """Turn poses of a camera in a camera's axes to those of a carrier."""
+    assert track.quaternions is not None  # of every track
+    x, y, z, w = track.quaternions.T
+    turns = np.stack([z, -x, -y, w], axis=1)  # the axis turned, the angle the same
+    places = track.positions @ _CAMERA.T
+    return Track(track.times_s, places, turns, track.smooth, track.start_s, track.duration_s)
