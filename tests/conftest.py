@@ -1,11 +1,26 @@
 """What all tests start from."""
 
+import logging
+import os
 import signal
+from collections.abc import Iterator
+
+import pytest
 
 # A shell starts jobs in the background with interrupts ignored, and whatever they start inherits
 # that: programs that tests interrupt would not notice.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# Tests keep dozens of Dask processes, most of them idle; each watches itself for 4 % of a core.
+# And a worker that is forked costs a tenth of one that imports Dask anew. Set before Dask is
+# imported, here and in every process that is started from here.
+os.environ |= {
+    "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False",
+    "DASK_DISTRIBUTED__ADMIN__TICK__INTERVAL": "1s",
+    "DASK_DISTRIBUTED__ADMIN__SYSTEM_MONITOR__INTERVAL": "5s",
+    "DASK_DISTRIBUTED__WORKER__MULTIPROCESSING_METHOD": "forkserver",
+}
 
 # Dask's own clusters look this long after each death whether the worker is there, and give it up
 # when it is not: also one that has come back since and was killed again by the same test.
@@ -25,3 +40,10 @@ else:
     slow = [HealthCheck.too_slow]
     settings.register_profile("patient", deadline=None, suppress_health_check=slow)
     settings.load_profile("patient")
+
+
+@pytest.fixture(autouse=True)
+def _logs() -> Iterator[None]:
+    """Undo what a command that ran in this process did: without -v it silences all libraries."""
+    yield
+    logging.disable(logging.NOTSET)

@@ -1,4 +1,4 @@
-"""A run, watched, paused and stopped in a browser while it goes on."""
+"""A run, watched and stopped in a browser while it goes on."""
 
 import re
 import threading
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lidarpool import Scene, Survey
-from lidarpool.live import live_run
+from lidarpool.live.run_page import live_run
 from lidarpool.run.connection import local_client
 from lidarpool.run.job import Job
 from lidarpool.run.run import Run
@@ -41,18 +41,19 @@ def live():
 class Driven:
     """A run in a thread of its own, and how it ended.
 
-    It stands still, without a word to the page, when it has `most` points: a browser may be
-    slower than any run.
+    It stands still when it has `most` points: a browser may be slower than any run.
     """
 
     def __init__(self, client, live, store, most=1):
         self.error, self.most = None, most
 
-        def wants_pause():
-            return live.wants_pause() or store.db.point_count >= self.most
+        def show(progress):
+            tell(progress)  # which the page shows while the run stands still
+            while store.db.point_count >= self.most and not live.stopped.is_set():
+                time.sleep(0.05)
 
-        run = Run(client, store, wants_pause)
-        show = live.with_progress(lambda progress: None, run.partitions)
+        run = Run(client, store)
+        tell = live.with_progress(lambda progress: None, run.partitions)
 
         def drive():
             try:
@@ -77,7 +78,8 @@ def points_in(text):
     return int(found[1].replace(",", "")) if found else 0
 
 
-def test_points_grow_stand_still_and_grow_again(client, live, new_tab, tmp_path):
+@pytest.mark.sample
+def test_points_grow_until_all_are_there(client, live, new_tab, tmp_path):
     live, store = live
     tab, other = opened(new_tab, live), opened(new_tab, live)
     run = Driven(client, live, store)
@@ -85,23 +87,12 @@ def test_points_grow_stand_still_and_grow_again(client, live, new_tab, tmp_path)
         first = tab.wait_for(points_in)
         run.most = first + 1
         tab.wait_for(lambda text: points_in(text) > first)
-        tab.click("Pause")
-        tab.wait_for(lambda text: "paused" in text and "Go on" in text)
-        other.wait_for(lambda text: "paused" in text)
-        still = store.db.point_count
         assert not store.complete
-        time.sleep(2)
-        assert store.db.point_count == still
-        run.most = still + 1
-        other.click("Go on")
-        tab.wait_for(lambda text: "running" in text)
-        tab.wait_for(lambda text: points_in(text) > still)
     finally:
         run.most = ALL
-        live.paused.clear()
         run.thread.join(120)
     assert run.error is None
-    assert store.complete  # nothing was lost by the pause
+    assert store.complete
     total = f"{store.db.point_count:,} points"
     tab.wait_for(lambda text: "done" in text and total in text)
     other.wait_for(lambda text: "done" in text and total in text)

@@ -1,15 +1,18 @@
 """A finished result, looked at in a browser."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from lidarpool import Column
+from lidarpool import Column, Scene, Track
 from lidarpool.columns.table import SCAN
 from lidarpool.export.ply_format import header, row_type
 from lidarpool.live.page import live_page, redrawn
 from lidarpool.live.result_page import ResultFile, ResultView
+from lidarpool.run.picture_file import Pictured, SensorWay
+from lidarpool.scene.actors import Actor, box
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -53,6 +56,32 @@ def test_view_shows_the_cloud_and_asks_nobody_else(served, new_tab, tmp_path):
     tab.wait_for(lambda text: "wetness" in text and "z, m" not in text)
     tab.wait_for(lambda _: colourful(tab.picture(tmp_path / "b.png")) > 500)
     assert tab.errors == []
+
+
+def test_time_is_chosen_and_played(cloud, new_tab, tmp_path):
+    """A red sensor drives along y through the spiral, and a box along x."""
+    way = SensorWay(np.array([0, 2e9]), np.array([[0, -9, 4], [0, 9, 4.0]]), True, "nose", "VLP-16")
+    track = Track([0, 2], [[-9, 0, 8], [9, 0, 8]])
+    scene = Scene.from_meshes([box("Floor", (20, 20, 0.1))])  # few triangles: browsers are slow
+    scene = replace(scene, actors=(Actor(box("Van", (4, 2, 2)), track),))
+    hits, rays = np.zeros(scene.triangles, np.int64), np.zeros((0, 2, 3), np.float32)
+    pictured = Pictured(scene, [way], hits, rays, None, None, (), 2e9)
+    with live_page("a drive", port=0) as page:
+        view = ResultView(page, ResultFile(cloud), pictured)
+        with redrawn(view.draw, 0.1):
+            tab = new_tab(page.url)
+            tab.wait_for(lambda text: "nose: VLP-16" in text and "time, s" in text)
+            tab.click("Play")
+            tab.wait_for(lambda text: "Pause" in text)
+            van = page.scene.get_handle_by_name("/actors/0")
+            tab.wait_for(lambda _: -8 < van.position[0] < 9)
+            tab.click("Pause")
+            tab.wait_for(lambda text: "Play" in text)
+            tab.picture(tmp_path / "a.png")  # what was being drawn is drawn by now
+            at = van.position[0]
+            tab.picture(tmp_path / "b.png")
+            assert van.position[0] == at
+            assert tab.errors == []
 
 
 def colourful(picture):

@@ -14,8 +14,10 @@ from typing import Any
 import dask
 from distributed import Client, SpecCluster
 
+from lidarpool.base.fork_server import start_fork_server
 from lidarpool.run.local import local_cluster
 from poolpart import trace_to
+from poolpart.internals import forked_workers
 
 from .events import Board, ChaosPlugin
 
@@ -53,6 +55,8 @@ class Arena:
             stack.enter_context(dask.config.set(self._config))
             folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="chaos-"))
             self.board = Board(Path(folder))
+            start_fork_server()  # as the product does
+            stack.enter_context(forked_workers())
             self.cluster: SpecCluster = stack.enter_context(
                 local_cluster(gpu_workers=2, other_workers=1)
             )

@@ -17,10 +17,14 @@ class Cart:
     yaw_rate_deg: float = 90.0  # a second
     stations: int = 2
     moves: bool = True
+    duration_ns: float = np.inf
+    height: float = 1.0
 
     def pose(self, station, time_ns=0.0):
         seconds = time_ns / 1e9
-        return Pose((self.speed * seconds, 10.0 * station, 1.0), self.yaw_rate_deg * seconds)
+        return Pose(
+            (self.speed * seconds, 10.0 * station, self.height), self.yaw_rate_deg * seconds
+        )
 
     def poses(self, station, times_ns):
         poses = [self.pose(station, time) for time in times_ns]

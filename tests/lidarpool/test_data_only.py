@@ -96,7 +96,7 @@ def test_a_scenario_made_to_do_harm(text, tmp_path):
 
 def test_a_complaint_commands_no_terminal(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(lidarpool.cli.commands, "interrupt_on_signals", lambda: None)
-    monkeypatch.setattr(lidarpool.cli.commands, "silence_logs", lambda: None)
+    monkeypatch.setattr(lidarpool.cli.commands, "set_logs", lambda shown: None)
     path = tmp_path / "s.yaml"
     path.write_text('scene: {files: ["\\e]0;title\\a\\r\\u202e.ply"]}\n')
     with pytest.raises(SystemExit):

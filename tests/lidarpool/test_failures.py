@@ -5,7 +5,6 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 import pytest
-from distributed.scheduler import NoValidWorkerError
 
 from lidarpool.base.errors import LidarpoolError
 from lidarpool.scan.failures import raise_if_failed
@@ -14,11 +13,6 @@ from lidarpool.scan.failures import raise_if_failed
 @pytest.mark.parametrize(
     ("error", "words"),
     [
-        (
-            NoValidWorkerError("sort-0", set(), set(), {"LIDAR": 1}, 30.0),
-            "Stage sort failed: no worker of LIDAR came within 30 s, the cluster's "
-            "no-workers-timeout; start some.",
-        ),
         (ValueError("too much"), "Stage sort failed: too much"),
         (TimeoutError(), "Stage sort failed: TimeoutError"),
     ],

@@ -194,16 +194,6 @@ def test_a_function_that_ran_has_the_same():
     assert fingerprint(thing) == before
 
 
-def test_a_module_beside_the_script_counts_with_its_text(tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(tmp_path)
-    (tmp_path / "beside.py").write_text("def far(r): return r.range")
-    source = "import beside\ndef thing(r): return beside.far(r)"
-    before = fingerprint(made(source))
-    assert before == fingerprint(made(source))
-    (tmp_path / "beside.py").write_text("def far(r): return -r.range")
-    assert fingerprint(made(source)) != before
-
-
 def test_a_sensor_of_another_class_is_another():
     plain = made("class C(Sensor): pass")
     other = made("class C(Sensor):\n  def origins(self, f): return None")

@@ -22,10 +22,13 @@ except KeyboardInterrupt as error:
 
 @pytest.fixture
 def interrupted_open3d(tmp_path, monkeypatch):
-    (tmp_path / "open3d.py").write_text(INTERRUPTED)
+    (tmp_path / "open3d").mkdir()
+    (tmp_path / "open3d" / "__init__.py").touch()
+    (tmp_path / "open3d" / "pybind.py").write_text(INTERRUPTED)
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setitem(sys.modules, "open3d", None)  # put back afterwards, whatever it was
-    del sys.modules["open3d"]
+    for name in ("open3d", "open3d.pybind"):
+        monkeypatch.setitem(sys.modules, name, None)  # put back afterwards, whatever it was
+        del sys.modules[name]
 
 
 @pytest.mark.parametrize("wanted", ["embree", "numpy"])

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from benchmarks import leaks
 
+pytestmark = pytest.mark.slow
+
 NAMES = ["cube", "unit sphere", "sphere", "vase", "bell", "pawn", "spindle", "bowl", "terrain box"]
 
 

@@ -35,6 +35,22 @@ def test_times_of_a_long_survey_are_told_apart():
     assert len(np.unique(colours, axis=0)) > 100
 
 
+@pytest.mark.parametrize(
+    ("span_ns", "told"), [(2e9, "time, s:"), (3e7, "time, ms:"), (50, "time, ns:")]
+)
+def test_times_are_told_in_a_unit_that_can_be_read(span_ns, told):
+    legend = colours_of(np.linspace(0, span_ns, 200).astype(np.int64), TABLE["time"])[1]
+    assert told in legend
+    assert ("<span>1.0</span>" in legend) == (span_ns == 2e9)
+
+
+def test_few_large_numbers_do_not_hide_many_small_ones():
+    values = np.logspace(-4, 0, 500).astype(np.float32)
+    colours, legend = colours_of(values, TABLE["intensity"])
+    assert len(np.unique(colours[:250], axis=0)) > 100
+    assert "<span>0.01</span>" in legend
+
+
 def test_objects_have_names_and_colours_of_their_own():
     colours, legend = colours_of(np.arange(200) % 3, OBJECT, ("Ball", "<b>Box</b>"))
     assert len(np.unique(colours, axis=0)) == 3
@@ -43,6 +59,8 @@ def test_objects_have_names_and_colours_of_their_own():
     assert "object 2" in legend
     many = tuple(f"thing {number}" for number in range(100))
     assert "and 88 more" in colours_of(np.arange(100), OBJECT, many)[1]
+    often = np.append(np.arange(100), np.full(9, 73))
+    assert "thing 73" in colours_of(often, OBJECT, many)[1]
 
 
 def test_few_labels_are_named_and_many_are_on_a_scale():

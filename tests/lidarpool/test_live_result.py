@@ -1,19 +1,21 @@
 """A finished result on a page: its points, scene, sensors, rays and planning; nobody looks yet."""
 
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import trimesh
 
-from lidarpool import LidarpoolError, Planning, Scene
+from lidarpool import LidarpoolError, Planning, Scene, Track
 from lidarpool.columns.table import CHANNEL, OBJECT, SCAN
 from lidarpool.export.ply_format import header, row_type
 from lidarpool.live.page import live_page
 from lidarpool.live.result_page import ResultFile, ResultView, view_result
 from lidarpool.live.surface import MeshNode, Surface, coloured_mesh
 from lidarpool.plan import Plan
-from lidarpool.run.picture_file import PICTURE_FILE, Pictured
+from lidarpool.run.picture_file import PICTURE_FILE, Pictured, SensorWay
+from lidarpool.scene.actors import Actor, box
 
 POSES = 25
 ORIGIN = np.array([500_000.0, 100.0, 0.0])
@@ -98,7 +100,7 @@ def pictured():
     rays[:9, 1, 2] = 0.5
     return Pictured(
         scene,
-        poses + ORIGIN,
+        (SensorWay(np.arange(POSES), poses),),
         np.arange(12),
         rays.astype(np.float32),
         Planning((1, 1), (5, 7), [(1, 6)], 0.5),
@@ -179,6 +181,31 @@ def test_a_colour_that_is_chosen_is_drawn_and_what_is_hidden_is_not(cloud, pictu
     assert not page.scene.get_handle_by_name("/scene/other").visible
 
 
+def test_what_moves_is_where_it_is_at_the_time_that_is_chosen_or_played(cloud, pictured, page):
+    """A sensor along y, and an actor that turns to the left on its way along x."""
+    way = SensorWay(np.array([0, 2e9]), np.array([[3, 1, 1], [3, 7, 1]]), True, "nose", "VLP-16")
+    half = np.sqrt(0.5)
+    track = Track([0, 2], [[1, 1, 0], [5, 1, 0]], [[0, 0, 0, 1], [0, 0, half, half]])
+    scene = replace(pictured.scene, actors=(Actor(box("Cart", (1, 1, 1)), track),))
+    moving = replace(pictured, scene=scene, sensors=[way], duration_ns=2e9)
+    view = ResultView(page, ResultFile(cloud), moving)
+    view.draw()
+    assert "nose: VLP-16" in view._facts.content
+    assert page.scene.get_handle_by_name("/ways/0") is not None
+    view._view._time.value = 1.0
+    view.draw()
+    sensor, cart = (page.scene.get_handle_by_name(f"/{kind}/0") for kind in ("sensors", "actors"))
+    assert sensor.position == pytest.approx((3, 4, 1))
+    assert cart.position == pytest.approx((3, 1, 0))
+    assert cart.wxyz == pytest.approx((np.cos(np.pi / 8), 0, 0, np.sin(np.pi / 8)))
+    view._view._colour.value = "object"
+    view._view._start_or_stop()
+    view.draw()
+    assert 1.0 < view._view._time.value <= 2.0
+    assert sensor.position[1] > 4
+    assert "room" in view._view._cloud_legend.content
+
+
 def test_without_a_scene_the_cloud_is_shown_alone_near_zero(cloud, page):
     view = ResultView(page, ResultFile(cloud), None, "why & what")
     view.draw()
@@ -243,7 +270,7 @@ def test_what_rises_above_the_cut_is_pressed_down_to_it():
 
 
 def test_floor_and_roof_are_found_and_the_sky_is_none(pictured):
-    local = pictured.poses - ORIGIN
+    local = pictured.sensors[0].positions
     assert Surface(pictured.scene).around(local) == pytest.approx((0, 3))
     assert Surface(Scene.seed()).around(np.array([[0.0, 0, 1]])) == (None, None)
 

@@ -4,20 +4,20 @@ import re
 import subprocess
 import sys
 import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import trimesh
 from benchmarks.live import looking
+from distributed import Client
+from tests.clusters import thread_cluster
 
 from lidarpool import Column, LidarpoolError, Planning, Scene, Sensor, Survey
 from lidarpool.columns.parts import PartColumns, pack
-from lidarpool.live import LiveRun, live_points, live_run
+from lidarpool.live import live_points
 from lidarpool.live.live_points import PARTS_AT_ONCE, PARTS_NOTED, LivePoints
-from lidarpool.live.page import live_page
-from lidarpool.live.result_page import ResultView, open_result
-from lidarpool.run.connection import local_client
+from lidarpool.live.result_page import open_result
+from lidarpool.live.run_page import LiveRun, live_run
 from lidarpool.run.job import Job
 from lidarpool.run.progress import Progress
 from lidarpool.run.run import Run, make_result
@@ -199,26 +199,10 @@ def test_a_resumed_run_shows_what_the_earlier_one_has_left(tmp_path):
         wait_for(lambda: displayed(live) == 600)
 
 
-def test_what_there_is_of_an_unfinished_run_can_be_viewed(tmp_path):
-    store = RunStore(make_job(100, [WETNESS]), tmp_path / "run")
-    for scan in range(60):
-        commit(store, scan, 10, wetness=np.float32([scan] * 10))
-    with pytest.raises(LidarpoolError, match=r"locked.*While it goes on, --live shows it"):
+def test_an_unfinished_run_is_to_be_gone_on_with(tmp_path):
+    RunStore(make_job(100), tmp_path / "run").db.close()
+    with pytest.raises(LidarpoolError, match="holds an unfinished run: continue it with"):
         open_result(tmp_path)
-    store.db.close()
-    file, pictured, note = open_result(tmp_path)
-    assert (len(file), pictured) == (600, None)
-    assert "not finished" in note
-    assert file.table[-1] == replace(WETNESS, source="")
-    cloud, count = file.choose(0, 0, 100)
-    assert (len(cloud), count) == (100, 600)
-    assert set(cloud.positions[:, 2]) == {3 + SCENE.origin[2]}
-    assert cloud["wetness"].tolist() == cloud["scan"].tolist()
-    with live_page("what there is", port=0) as page:
-        view = ResultView(page, file, None, note)
-        view.draw()
-        assert len(page.scene.get_handle_by_name("/cloud").points) == 600
-        assert view._view._colour.options == ("z", "scan", "channel", "object", "wetness")
 
 
 def test_a_run_is_watched_from_its_first_part_to_its_path():
@@ -227,13 +211,14 @@ def test_a_run_is_watched_from_its_first_part_to_its_path():
     job = Job(SCENE, survey, planning, "numpy")
     shown, busy = [], set()
     with (
-        local_client(gpu_workers=1, collectors=2, other_workers=1) as client,
+        thread_cluster({"GPU": 1}, {"LIDAR": 4}, {"OTHER": 1}) as cluster,
+        Client(cluster, set_as_default=False) as client,
         live_run(job, port=0, browser=False) as live,
         looking(live.page.url),
     ):
         store = RunStore(job)
         live.follow(store)
-        run = Run(client, store, live.wants_pause)
+        run = Run(client, store)
 
         def show(progress):
             shown.append(progress)
@@ -244,7 +229,7 @@ def test_a_run_is_watched_from_its_first_part_to_its_path():
         total = f"{len(result.points):,} points"
         wait_for(lambda: "done" in panel(live) and total in panel(live) and "2 / 2" in panel(live))
         wait_for(lambda: displayed(live) == len(result.points))
-        for name in ("/sensor", "/poses", "/rays", "/path", "/discs/0"):
+        for name in ("/sensors/0", "/poses", "/rays", "/path", "/discs/0"):
             wait_for(lambda name=name: live.page.scene.get_handle_by_name(name) is not None)
         assert "hits per square metre" in live._view._scene_legend.content
         cloud = live._points.cloud
@@ -282,27 +267,30 @@ def test_the_panel_tells_stages_pace_points_and_slots(live):
     assert "waiting for slots of &lt;GPU&gt;" in live._panel()
 
 
-def test_a_run_stands_still_until_it_may_go_on_and_ends_as_by_an_interrupt(live):
-    live._on_pause(None)
-    assert live.wants_pause()
-    live.on_progress(progress(1.0, 1))  # a pause ends nothing
-    assert "pausing" in live._panel()
-    live.on_progress(progress(1.0, 1, paused=True))
-    assert "paused" in live._panel()
-    live._on_pause(None)
-    assert not live.wants_pause()
-    live._on_pause(None)
+def test_a_run_ends_as_by_an_interrupt(live):
+    live.on_progress(progress(1.0, 1))
     live.stopped.set()
-    assert not live.wants_pause()
     with pytest.raises(KeyboardInterrupt):
         live.on_progress(progress(2.0, 2))
 
 
-def test_the_command_brings_no_page_before_one_is_wanted():
-    """It takes a second, which --help and a run without a page can do without."""
-    code = "import sys, lidarpool.cli.commands, lidarpool.live; print(*sys.modules, sep='\\n')"
-    loaded = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=LONG_S
-    ).stdout.split()
-    assert "lidarpool.live" in loaded
-    assert {"viser", "matplotlib", "lidarpool.live.run_page"}.isdisjoint(loaded)
+def test_neither_help_nor_a_run_brings_what_it_does_not_need():
+    """NumPy, Dask and Pydantic take a second, viser and Matplotlib another one."""
+
+    def loaded(modules: str) -> set[str]:
+        code = f"import sys, {modules}; print(*sys.modules, sep='\\n')"
+        return set(
+            subprocess.run(
+                [sys.executable, "-c", code],
+                capture_output=True,
+                text=True,
+                check=True,
+                timeout=LONG_S,
+            ).stdout.split()
+        )
+
+    pages = {"viser", "matplotlib", "open3d", "lidarpool.live.run_page"}
+    assert pages.isdisjoint(loaded("lidarpool.cli.run_command"))
+    assert {"numpy", "dask", "pydantic", "poolpart", "rich"}.isdisjoint(
+        loaded("lidarpool.cli.commands")
+    )

@@ -312,7 +312,9 @@ LIVOX = "Time/s,Azimuth/deg,Zenith/deg\n"
 GOOD = "name: A\nsources: {}\n"
 VELODYNE = "num_lasers: 2\nlasers: [{laser_id: 0, vert_correction: 0.1, rot_correction: 0.2}"
 BAD = {
-    "field.yaml": (GOOD + "firing_us: 5\nrage_m: [0, 1]", "rage_m: Extra inputs"),
+    "field.yaml": (GOOD + "firing_us: 5\nrage_m: [0, 1]", "rage_m: this is not a field"),
+    "optic.yaml": (GOOD + "firing_us: 5\noptics: {wavelenght_nm: 9}", "mean 'wavelength_nm'"),
+    "light.yaml": (GOOD + "firing_us: 5\noptics: {wavelength_nm: 0.9}", "light.* is 0.9; it must"),
     "both.yaml": (GOOD + "firing_us: 5\nfirings_per_turn: 5", "either firing_us or"),
     "mirror.yaml": (GOOD + "firing_us: 5\nmirror: {motion: x, width_deg: 9}", "mirror.motion: Inp"),
     "zero.yaml": (GOOD + "firing_us: 0\nbeams: {elevation_deg: [0]}", "firing_us: Input should be"),

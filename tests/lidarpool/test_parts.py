@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarpool import Cloud, LidarpoolError
-from lidarpool.base.choice import one_of_each_part
 from lidarpool.columns.parts import (
     SUFFIX,
     PartColumns,
@@ -101,15 +100,15 @@ def test_damage_at_any_place_is_noticed_or_changes_nothing():
     noticed = 0
     for place in range(len(data)):
         # Each bit somewhere, and digits of the headers of arrays become others.
-        for flip in {1 << place % 8, 6, 0xFF}:
-            damaged = bytearray(data)
-            damaged[place] ^= flip
-            try:
-                assert equal(unpack(bytes(damaged)), SMALL), (place, flip)
-            except LidarpoolError as error:
-                noticed += 1
-                assert str(error).startswith("it is damaged (")
-    assert noticed > len(data)
+        flip = (1 << place % 8, 6, 0xFF)[place % 3]
+        damaged = bytearray(data)
+        damaged[place] ^= flip
+        try:
+            assert equal(unpack(bytes(damaged)), SMALL), (place, flip)
+        except LidarpoolError as error:
+            noticed += 1
+            assert str(error).startswith("it is damaged (")
+    assert noticed > len(data) / 3
 
 
 def test_a_cut_part_is_noticed_wherever_it_was_cut():
@@ -241,8 +240,7 @@ def test_a_sample_is_of_the_cloud_and_in_its_order(storage):
     rows = {tuple(p): i for i, p in enumerate(np.c_[whole.positions, whole.time])}
 
     def picked(most, parts=256):
-        some, count = cloud.sample(one_of_each_part, most, parts)
-        assert count == 200
+        some = cloud.sample(most, parts)
         found = [rows[tuple(p)] for p in np.c_[some.positions, some.time]]
         assert found == sorted(found)
         return some, found
@@ -253,8 +251,8 @@ def test_a_sample_is_of_the_cloud_and_in_its_order(storage):
     _, found = picked(50, parts=2)
     opened = np.searchsorted([40, 137, 138, 200], found, "right")
     assert 0 < len(found) <= 50 and len(set(opened)) <= 2
-    none, count = stored_cloud(storage, [[0], [0, 0]])[0].sample(one_of_each_part, 10)
-    assert (len(none), count) == (0, 0) and none.table[0].name == "scan"
+    none = stored_cloud(storage, [[0], [0, 0]])[0].sample(10, 256)
+    assert len(none) == 0 and none.table[0].name == "scan"
 
 
 def test_a_cloud_whose_part_is_lost_says_so(storage):

@@ -15,7 +15,6 @@ from lidarpool.plan import (
     Plan,
     Planning,
     Trial,
-    TrialCancelledError,
     best,
     run_trial,
     shortest_path_length,
@@ -29,7 +28,7 @@ SMALL = Planning((25, 25), (-30, -20), SEED_SCENE, 2.0, particles=60, iterations
 
 
 def bits(trial):
-    return trial.waypoints.tobytes() + trial.history.tobytes() + bytes([trial.collision_free])
+    return trial.waypoints.tobytes() + bytes([trial.collision_free])
 
 
 def fingerprint():
@@ -42,7 +41,7 @@ def fingerprint():
 
 def test_default_problem_for_many_seeds():
     shortest = shortest_path_length(DEFAULT.start, DEFAULT.target, DEFAULT.centres, DEFAULT.radii)
-    for seed in range(12):
+    for seed in range(4):
         planning = Planning(DEFAULT.start, DEFAULT.target, SEED_SCENE, 2.0, seed=seed)
         plan = best([run_trial(planning, number) for number in range(3)], planning)
         assert plan.collision_free
@@ -59,7 +58,7 @@ scene = st.lists(
 )
 
 
-@settings(max_examples=25, derandomize=True)
+@settings(max_examples=8, derandomize=True)
 @given(discs=scene)
 def test_random_scenes(discs):
     array = np.array(discs, float)
@@ -117,9 +116,6 @@ def test_a_trial_says_what_it_found():
     assert trial.trial == 4
     assert trial.length == path_length(path)
     assert trial.collision_free == (clearance(path, SMALL.centres, SMALL.radii) >= 0)
-    assert trial.history.shape == (40,)
-    assert (np.diff(trial.history) <= 0).all()
-    assert trial.history[-1] == pytest.approx(trial.length, rel=1e-5)
     assert trial.seconds > 0
     assert len(pickle.dumps(trial)) < 2000
 
@@ -135,38 +131,6 @@ def test_a_trial_does_not_claim_a_path_that_collides():
         assert trial.collision_free == (rooms[-1] >= 0)
     assert max(rooms) > 0
     assert any(-0.5 < room < 0 for room in rooms)
-
-
-def test_history_is_above_any_path_while_none_is_free():
-    """One particle and one iteration in a scene that is nearly all disc."""
-    planning = Planning((0, 0), (10, 0), [(5, 0)], 4.9, particles=1, iterations=1, waypoints=1)
-    trial = run_trial(planning, 0)
-    assert not trial.collision_free
-    assert trial.history[-1] > 10 + 4.9 * 2 * np.pi
-
-
-def test_more_iterations_begin_the_same_way():
-    longer = Planning(
-        SMALL.start, SMALL.target, SEED_SCENE, 2.0, particles=60, iterations=60, seed=7
-    )
-    assert np.array_equal(run_trial(longer, 0).history[:40], run_trial(SMALL, 0).history)
-
-
-def test_cancelling_stops_within_a_few_iterations():
-    asked = []
-
-    def cancelled():
-        asked.append(len(asked))
-        return len(asked) > 2
-
-    planning = Planning(centres=SEED_SCENE, radii=2, iterations=10**9 // 1000, particles=20)
-    with pytest.raises(TrialCancelledError, match="Trial 3 was cancelled at iteration 16"):
-        run_trial(planning, 3, cancelled)
-    assert asked == [0, 1, 2]
-
-
-def test_not_cancelling_changes_nothing():
-    assert bits(run_trial(SMALL, 0, lambda: False)) == bits(run_trial(SMALL, 0))
 
 
 # --- the same seeds, the same bits
@@ -272,7 +236,7 @@ def test_windows_lie_in_the_table_and_reach_both_its_ends():
 def trial_of(number, waypoints):
     return Trial(
         trial=number, seed=0, length=-1.0, waypoints=np.array(waypoints, float),
-        collision_free=True, history=np.zeros(1, np.float32), seconds=0.0,
+        collision_free=True, seconds=0.0,
     )  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -12,12 +13,24 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from lidarpool import Cloud, LidarpoolError, Planning, Scene
+from lidarpool import (
+    Cloud,
+    LidarpoolError,
+    Mounted,
+    Planning,
+    Pose,
+    Scene,
+    Sensor,
+    Survey,
+    Track,
+)
+from lidarpool.base.vocabulary import PICTURES
 from lidarpool.cli.commands import cli
 from lidarpool.export.ply import read_positions, save_cloud
 from lidarpool.plan import best
 from lidarpool.plan.trial import run_trial
-from lidarpool.run.picture_file import PICTURE_FILE, PICTURES, Pictured
+from lidarpool.run.picture_file import PICTURE_FILE, Pictured, SensorWay, sensor_ways
+from lidarpool.scene.actors import Actor, box
 from lidarpool.scene.mesh import Mesh
 from lidarpool.scene.shapes import seed_objects
 
@@ -41,7 +54,7 @@ def planned() -> Pictured:
     rays[:, 1] = scene.vertices[:4]
     return Pictured(
         scene,
-        np.array([[0, 0, 1], [0, 0, 2.0]]),
+        (SensorWay(np.zeros(2), np.array([[0, 0, 1], [0, 0, 2.0]])),),
         counts,
         rays,
         planning,
@@ -53,7 +66,7 @@ def planned() -> Pictured:
 @pytest.fixture(scope="module")
 def unplanned(planned: Pictured) -> Pictured:
     return Pictured(
-        planned.scene, planned.poses, planned.hit_counts, planned.sample_rays, None, None, ()
+        planned.scene, planned.sensors, planned.hit_counts, planned.sample_rays, None, None, ()
     )
 
 
@@ -96,7 +109,7 @@ def test_what_is_pictured_comes_back(planned, unplanned, tmp_path):
         assert again.scene.names == shown.scene.names
         for name in ("vertices", "faces", "face_object", "origin"):
             assert np.array_equal(getattr(again.scene, name), getattr(shown.scene, name))
-        for name in ("poses", "hit_counts", "sample_rays"):
+        for name in ("hit_counts", "sample_rays"):
             one, two = getattr(again, name), getattr(shown, name)
             assert np.array_equal(one, two) and one.dtype == two.dtype
         assert (again.plan is None) == (shown.plan is None)
@@ -115,6 +128,29 @@ def test_what_is_pictured_comes_back(planned, unplanned, tmp_path):
         assert np.array_equal(one, two)
 
 
+def test_what_moves_is_drawn_where_it_is_halfway(tmp_path):
+    """Along x, the sensor at 10 m/s and an actor towards it."""
+    scene = replace(
+        Scene.seed(),
+        actors=(Actor(box("Van", (5, 2, 2)), Track([0, 1], [[20, 3, 0], [0, 3, 0]])),),
+    )
+    drive = Track([0, 1], [[0, 0, 1], [10, 0, 1]])
+    nose = Mounted(Sensor.grid(), Pose((2, 0, 0)), "nose")
+    survey = Survey(trajectory=drive, sensors=[nose])
+    none = np.zeros((0, 2, 3), np.float32)
+    shown = Pictured(
+        scene, sensor_ways(survey), np.ones(scene.triangles, np.int64), none, None, None, (), 1e9
+    )
+    again = Pictured.load(make(tmp_path / "result", shown) / PICTURE_FILE)
+    (way,) = again.sensors
+    assert (way.name, way.moves) == ("nose", True)
+    assert np.allclose(way.at(5e8), (7, 0, 1), atol=0.01)
+    assert np.allclose(again.scene.solid(5e8).object_bounds[-1], [(7.5, 2, 0), (12.5, 4, 2)])
+    assert again.when == "1 sensor on its way and 1 actor, at 0.5 s of 1 s"
+    plot(tmp_path / "result", *SMALL)
+    assert {"scene.png", "intensity.png", "cloud.png"} <= names(tmp_path / "result")
+
+
 def changed(data: bytes, **arrays: Any) -> bytes:
     """Write an archive with other arrays in it."""
     with np.load(io.BytesIO(data)) as archive:
@@ -131,7 +167,7 @@ def changed(data: bytes, **arrays: Any) -> bytes:
         (lambda data: data[: len(data) // 2], "is damaged"),
         (lambda data: changed(data, hit_counts=np.zeros(3)), r"hit_counts of \(3,\)"),
         (lambda data: changed(data, radii=None), "radii"),
-        (lambda data: changed(data, poses=np.array([{}])), "allow_pickle"),
+        (lambda data: changed(data, sensor0=np.array([{}])), "allow_pickle"),
         (lambda data: changed(data, format=np.array(7)), "it is of format 7"),
     ],
 )

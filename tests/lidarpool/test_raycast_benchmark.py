@@ -15,6 +15,8 @@ from lidarpool.scene.city import city
 from lidarpool.scene.scene_file import write_scene
 from raybeam import RayCaster
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory):

@@ -11,12 +11,13 @@ from hypothesis import strategies as st
 
 from lidarpool.base.errors import LidarpoolError
 from lidarpool.base.fingerprint import fingerprint
+from lidarpool.base.vocabulary import UNITS_M
 from lidarpool.base.words import did_you_mean
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scenario.sections import Section
 from lidarpool.scenario.yamlfile import read_yaml
-from lidarpool.scene.transform import UNITS_M
-from lidarpool.sensor import Sensor, Survey
+from lidarpool.sensor import Noise, Returns, Sensor, Survey
+from lidarpool.sensor.materials import MaterialTable
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 DEFAULT = Survey(Sensor.grid(), poses=[(0, 0, 1), (0, 0, 2), (0, 0, 3)])
@@ -78,7 +79,7 @@ def test_the_seed_example_writes_out_the_defaults():
     plain, scenario = Scenario().model_dump(), Scenario.load(EXAMPLES / "seed.yaml")
     loaded = scenario.model_dump()
     assert stated["cloud"].keys() == plain["cloud"].keys()
-    assert loaded["cloud"] == plain["cloud"]
+    assert loaded["cloud"] == {**plain["cloud"], "precision_m": Sensor().optics.resolution_m}
     sensors = (scenario.sensor.sensor(Path()), Sensor(), Sensor.grid())
     assert len({fingerprint(sensor) for sensor in sensors}) == 1
     for section in ("planning", "pool"):
@@ -373,9 +374,37 @@ def test_any_data_is_a_scenario_or_one_error_for_users(data):
         assert "\n" not in str(error)
     else:
         assert set(data) <= set(Scenario.model_fields)
-        assert loaded.steps >= 1
+        assert (loaded.steps or 1) >= 1
 
 
 def test_did_you_mean():
     assert did_you_mean("LAYER", ["layers", "step_deg"]) == " Did you mean 'layers'?"
     assert did_you_mean("xyzzy", ["layers"]) == ""
+
+
+def test_materials_returns_noise_and_weather_become_those_of_the_survey():
+    points = [{"time_s": 0, "position": [0, 0, 0]}, {"time_s": 9, "position": [1, 0, 0]}]
+    scenario = Scenario.from_data(
+        {
+            "sensor": {"model": "ouster/os1-64"},
+            "materials": [
+                {"objects": "*", "reflectance": 0.3, "class": 7},
+                {"objects": ["V*", "Bowl"], "transparent": "pass"},
+            ],
+            "actors": [
+                {"name": "Van", "box": [4, 2, 2], "class": 9, "trajectory": {"points": points}},
+            ],
+            "returns": {"mode": "dual", "subrays": 7},
+            "noise": {"range_m": 0.02, "seed": 3},
+            "weather": {"visibility_km": 2},
+        }
+    )
+    survey = scenario.survey(scenario.build_scene())
+    assert survey.returns == Returns("dual", 7)
+    assert survey.noise == Noise(0.02, seed=3)
+    assert survey.visibility_km == 2
+    assert survey.precision_m == 0.001
+    table = MaterialTable.of(survey.materials, ["Sphere", "Vase", "Bowl", "Van"])
+    assert table.semantic_class.tolist() == [7, 0, 0, 9], "an actor's own class"
+    assert table.reflectance.tolist() == [0.3, 0, 0, 0], "with the rest of its material"
+    assert table.passes.tolist() == [False, True, True, True]

@@ -34,7 +34,7 @@ GOOD: list[dict[str, Any]] = [
     {"sensor": {"max_range_m": float("inf")}},
 ]  # fmt: skip
 BAD: list[dict[str, Any]] = [
-    {"sensors": {}},
+    {"sensor_s": {}},
     {"sensor": {"layer": 4}},
     {"sensor": {"layers": 0}},
     {"sensor": {"layers": "40"}},

@@ -6,7 +6,15 @@ import pytest
 import yaml
 
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scenario.sections import CloudSection, PlanningSection, PoolSection, SceneSection
+from lidarpool.scenario.sections import (
+    CloudSection,
+    NoiseSection,
+    PlanningSection,
+    PoolSection,
+    ReturnsSection,
+    SceneSection,
+    WeatherSection,
+)
 from lidarpool.scenario.sections import SensorSection as Sensor
 from lidarpool.scenario.template import scenario_template
 
@@ -26,7 +34,10 @@ def test_its_head_names_the_schema_and_what_to_do():
 
 
 def test_every_field_is_in_it_with_a_comment_of_its_own():
-    for section in (Scenario, SceneSection, Sensor, CloudSection, PlanningSection, PoolSection):
+    for section in (
+        *(Scenario, SceneSection, Sensor, ReturnsSection, NoiseSection, WeatherSection),
+        *(CloudSection, PlanningSection, PoolSection),
+    ):
         for name, field in section.model_fields.items():
             assert re.search(rf"^ *(# )?{name}:", TEXT, re.M), name
             if section is not Scenario:

@@ -8,6 +8,8 @@ import shutil
 import pytest
 from benchmarks import trees
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def rows(tmp_path_factory):

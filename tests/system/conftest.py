@@ -10,7 +10,6 @@ import sys
 import time
 import uuid
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,7 +17,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from distributed import Client, Scheduler, SpecCluster, Worker, WorkerPlugin
+from distributed import Client, Worker, WorkerPlugin
+from tests.clusters import thread_cluster
 
 import lidarpool.report.pictures
 import lidarpool.scan.driver
@@ -105,32 +105,10 @@ def same_cloud() -> Callable[[Cloud, Cloud], bool]:
 
 
 @pytest.fixture(scope="session")
-def threads() -> Callable[..., AbstractContextManager[str]]:
-    """Start a cluster with a worker for each partition, so many slots each; its address.
-
-    The workers are threads of this process, for speed, and each has one: stages 1, 3 and 4 give
-    it away while they wait.
-    """
-    quiet = {"host": "127.0.0.1", "dashboard": False}
-
-    @contextmanager
-    def start(**slots: int) -> Iterator[str]:
-        workers = {
-            name: {"cls": Worker, "options": {"resources": {name: count}, "nthreads": 1, **quiet}}
-            for name, count in slots.items()
-        }
-        scheduler = {"cls": Scheduler, "options": {"port": 0, "dashboard_address": ":0", **quiet}}
-        with SpecCluster(workers=workers, scheduler=scheduler, silence_logs=50) as cluster:
-            yield cluster.scheduler_address
-
-    return start
-
-
-@pytest.fixture(scope="session")
-def cluster(threads: Callable[..., AbstractContextManager[str]]) -> Iterator[str]:
-    """A cluster of threads with the slots of one run; its address."""
-    with threads(GPU=1, LIDAR=4, OTHER=1) as address:
-        yield address
+def cluster() -> Iterator[str]:
+    """Address of a cluster whose workers are threads of this process, with the slots of one run."""
+    with thread_cluster({"GPU": 1}, {"LIDAR": 4}, {"OTHER": 1}) as cluster:
+        yield cluster.scheduler_address
 
 
 @pytest.fixture

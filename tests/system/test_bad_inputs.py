@@ -7,17 +7,16 @@ import re
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import trimesh
-from distributed import Scheduler, SpecCluster, Worker
+from tests.clusters import thread_cluster
 
 import lidarpool.run.checks as lidarpool_checks
 import lidarpool.run.connection
-from lidarpool.cli.log_file import LOG
 from raybeam import available_backends
 
 BOX = trimesh.creation.box((2, 4, 6))
@@ -39,6 +38,35 @@ FILES: dict[str, tuple[str, bytes | None, str]] = {
         b"scene: {ground: {margin_m: 1000000}}\ncloud: {precision_m: 0.000001}\n",
         "too fine",
     ),
+}
+
+# What comes back of a pulse: {content of a scenario: what the message says}
+RETURNS: dict[str, str] = {
+    "materials: [{objects: V*, reflectance: 0.3}]": "no entry names the object",
+    "materials: [{objects: ['*', Vace]}]": "no object is called so. Did you mean 'Vase'?",
+    "materials: [{objects: '*'}, {objects: Q*}]": "'Q*', and no object is called so. There are ",
+    "materials: [{objects: '*', reflectance: 1.2}]": "materials[0].reflectance is 1.2",
+    "materials: [{objects: '*', reflectance: .nan}]": "materials[0].reflectance is nan",
+    "materials: [{objects: '*', class: 65536}]": "materials[0].class is 65536",
+    "materials: [{objects: '*', class: -1}]": "materials[0].class is -1",
+    "materials: [{objects: '*', class: tree}]": "materials[0].class is 'tree'",
+    "materials: [{reflectance: 0.5}]": "materials[0].objects is missing",
+    "materials: [{objects: []}]": "materials[0].objects is []",
+    "materials: [{objects: '*', reflectence: 1}]": "Did you mean 'reflectance'?",
+    "materials: [{objects: '*', transparent: glass}]": "'none', 'pass' or 'mirror'",
+    "returns: {mode: best}": "'strongest', 'first', 'last', 'dual' or 'all'",
+    "returns: {subrays: 20, divergence_mrad: 1}": "returns.subrays is 20; input should be 1, 7, 19",
+    "returns: {subrays: 19}": "the sensor states no divergence: give returns.divergence_mrad",
+    "returns: {divergence_mrad: -1}": "returns.divergence_mrad is -1",
+    "returns: {pulse_ns: -5}": "returns.pulse_ns is -5",
+    "noise: {range_m: -0.01}": "noise.range_m is -0.01",
+    "noise: {angle_deg: -1}": "noise.angle_deg is -1",
+    "noise: {dropout: 1.5}": "noise.dropout is 1.5",
+    "noise: {detection_range_m: 0}": "noise.detection_range_m is 0",
+    "noise: {seed: 0.5}": "noise.seed is 0.5",
+    "weather: {visibility_km: 0}": "weather.visibility_km is 0",
+    "weather: {fog: thick}": "weather.fog is not a field",
+    "cloud: {columns: [intensities]}": "Did you mean 'intensity'?",
 }
 
 # -- options: arguments, what the message says -------------------------------------------------
@@ -94,7 +122,7 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def content(folder: Path) -> dict[str, bytes | None]:
     """All that is in a folder, but for what libraries had to say on a busy machine."""
-    files = {path.relative_to(folder): path for path in folder.rglob("*") if path.name != LOG}
+    files = {path.relative_to(folder): path for path in folder.rglob("*")}
     return {str(k): None if p.is_dir() else p.read_bytes() for k, p in files.items()}
 
 
@@ -128,6 +156,12 @@ def test_a_bad_file(case, place, refused):
     if data is not None:
         (place / name).write_bytes(data)
     refused(["run", name], says)
+
+
+@pytest.mark.parametrize("text", RETURNS)
+def test_returns_that_cannot_be(text, place, refused):
+    (place / "s.yaml").write_text(text)
+    refused(["run", "s.yaml"], RETURNS[text])
 
 
 @pytest.mark.parametrize("case", OPTIONS)
@@ -169,26 +203,6 @@ def test_a_listener_that_is_no_scheduler(refused, impatient):
         refused(["run", "good.yaml", "--scheduler", f"tcp://127.0.0.1:{port}"], "No Dask scheduler")
 
 
-@pytest.fixture
-def made_of() -> Iterator[Callable[..., str]]:
-    """Start a cluster whose workers are threads and declare some resources; its address."""
-    started: list[SpecCluster] = []
-
-    def start(*resources: dict[str, int]) -> str:
-        quiet = {"host": "127.0.0.1", "dashboard": False}
-        workers = {
-            i: {"cls": Worker, "options": {"resources": r, "nthreads": 1, **quiet}}
-            for i, r in enumerate(resources)
-        }
-        scheduler = {"cls": Scheduler, "options": {"port": 0, "dashboard_address": ":0", **quiet}}
-        started.append(SpecCluster(workers=workers, scheduler=scheduler, silence_logs=50))
-        return started[-1].scheduler_address
-
-    yield start
-    for each in started:
-        each.close()
-
-
 CLUSTERS: dict[str, tuple[list[dict[str, int]], str]] = {
     "no workers": ([], "has no workers: start some"),
     "little LIDAR": (
@@ -201,16 +215,18 @@ CLUSTERS: dict[str, tuple[list[dict[str, int]], str]] = {
 
 
 @pytest.mark.parametrize("case", CLUSTERS)
-def test_a_cluster_that_lacks_something(case, made_of, refused):
+def test_a_cluster_that_lacks_something(case, refused):
     resources, says = CLUSTERS[case]
-    command = ["run", "good.yaml", "--scheduler", made_of(*resources)]
-    refused(command if case == "two resources" else [*command, "--wait", "0s"], says)
+    with thread_cluster(*resources) as cluster:
+        command = ["run", "good.yaml", "--scheduler", cluster.scheduler_address]
+        refused(command if case == "two resources" else [*command, "--wait", "0s"], says)
 
 
-def test_workers_that_are_waited_for_are_named_meanwhile(made_of, place, lidarpool, monkeypatch):
-    monkeypatch.setattr(lidarpool_checks, "TELL_EVERY_S", 0.1)
-    address = made_of({"GPU": 1}, {"OTHER": 1})
-    outcome = lidarpool("run", "good.yaml", "--scheduler", address, "--wait", "0.5s")
+def test_workers_that_are_waited_for_are_named_meanwhile(place, lidarpool, monkeypatch):
+    monkeypatch.setattr(lidarpool_checks, "TELL_EVERY_S", 0.0)
+    with thread_cluster({"GPU": 1}, {"OTHER": 1}) as cluster:
+        address = cluster.scheduler_address
+        outcome = lidarpool("run", "good.yaml", "--scheduler", address, "--wait", "3s")
     assert outcome.code == 2
     assert re.match(
         r"note: waiting for workers, for another \d s: Partition 'LIDAR' has 0 of the 4 slots",
@@ -248,18 +264,16 @@ sys.meta_path.insert(0, Absent())
 ANOTHER_VERSION = "import lidarpool._version as v; v.__version__ = '99.0'"
 
 
-@pytest.mark.parametrize(
-    ("preload", "says"),
-    [
+def test_workers_whose_lidarpool_is_not_ours(outside, place, refused):
+    cluster = outside()
+    for preload, says in (
         (WITHOUT_LIDARPOOL, "does not have lidarpool: install lidarpool"),
         (ANOTHER_VERSION, "has lidarpool 99.0, here it is"),
-    ],
-)
-def test_workers_whose_lidarpool_is_not_ours(preload, says, outside, place, refused):
-    cluster = outside()
-    cluster.add("GPU", preload=preload)
-    cluster.wait()
-    refused(["run", "good.yaml", "--scheduler", cluster.address], says)
+    ):
+        cluster.add("GPU", preload=preload)
+        cluster.wait()
+        refused(["run", "good.yaml", "--scheduler", cluster.address], says)
+        cluster.kill(list(cluster.processes)[-1])
 
 
 # -- in a process of its own --------------------------------------------------------------------

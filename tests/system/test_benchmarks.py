@@ -6,15 +6,17 @@ import json
 
 import pytest
 from benchmarks import live, pipeline, scale
+from tests.clusters import thread_cluster
 
 pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(autouse=True)
-def in_threads(monkeypatch, threads):
+def in_threads(monkeypatch):
     """Have benchmarks start clusters of threads."""
+    slots = ({"GPU": 1}, {"LIDAR": 4}, {"OTHER": 1})
     for module in (pipeline, live):
-        monkeypatch.setattr(module, "local_cluster", lambda: threads(GPU=1, LIDAR=4, OTHER=1))
+        monkeypatch.setattr(module, "local_cluster", lambda: thread_cluster(*slots))
 
 
 def test_pipeline(tmp_path, capsys):

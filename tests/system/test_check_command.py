@@ -10,7 +10,8 @@ from typing import Any
 
 import pytest
 import trimesh
-from distributed import Client, Scheduler, SpecCluster, Worker
+from distributed import Client
+from tests.clusters import thread_cluster
 
 import lidarpool.cli.forecast
 from lidarpool import simulate
@@ -26,14 +27,8 @@ Usage = namedtuple("Usage", "total used free")
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[str]:
-    """A cluster without OTHER whose workers are threads of this process; its address."""
-    quiet = {"host": "127.0.0.1", "dashboard": False}
-    workers = {
-        name: {"cls": Worker, "options": {"resources": {name: n}, "nthreads": n, **quiet}}
-        for name, n in {"GPU": 1, "LIDAR": 4}.items()
-    }
-    scheduler = {"cls": Scheduler, "options": {"port": 0, "dashboard_address": ":0", **quiet}}
-    with SpecCluster(workers=workers, scheduler=scheduler, silence_logs=50) as cluster:
+    """Address of a cluster without OTHER whose workers are threads of this process."""
+    with thread_cluster({"GPU": 1}, {"LIDAR": 4}) as cluster:
         yield cluster.scheduler_address
 
 

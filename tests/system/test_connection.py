@@ -13,6 +13,7 @@ import pytest
 
 from lidarpool.base import interrupts
 from lidarpool.base.interrupts import deferred_interrupts, interrupt_on_signals
+from lidarpool.run.connection import local_client
 
 SCRIPT = """
 from lidarpool import Scene, Survey, simulate
@@ -27,6 +28,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_simulate_leaves_nothing_when_it_is_interrupted_twice(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
@@ -49,6 +51,22 @@ def test_simulate_leaves_nothing_when_it_is_interrupted_twice(tmp_path):
     # Python's own helper process ends a moment after its parent.
     _, alive = psutil.wait_procs(started, timeout=120)
     assert alive == []
+
+
+def test_workers_are_forked_from_one_process_also_in_place_of_others():
+    with local_client(gpu_workers=1, collectors=2, other_workers=0) as client:
+        first = client.run(os.getpid)
+        for pid in first.values():
+            os.kill(pid, signal.SIGKILL)
+        stop = time.monotonic() + 120
+        while len(now := client.run(os.getpid, on_error="ignore")) < 2 or {*now} & {*first}:
+            assert time.monotonic() < stop
+            time.sleep(0.1)
+        (server,) = set(client.run(os.getppid).values())
+        assert psutil.Process(server).ppid() == os.getpid()
+        modules = client.run(lambda: {"lidarpool.scan.stages", "open3d"} & sys.modules.keys())
+        assert list(modules.values()) == [{"lidarpool.scan.stages"}] * 2
+    assert psutil.Process(server).children() == []
 
 
 @pytest.fixture

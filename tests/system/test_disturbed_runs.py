@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from distributed import Client
+from tests.clusters import thread_cluster
 
 import lidarpool.scan.driver
 from lidarpool import Frame, LidarpoolError, Planning, Scene, Sensor, Survey, simulate
@@ -14,7 +15,7 @@ from poolpart import placement_violations, worker_identities
 
 # Enough batches that the run is still under way when something happens to it.
 SURVEY = Survey(
-    Sensor.grid(rays_per_revolution=360, layers=8, step_deg=1), [(0, 0, 1), (1, 0, 2)], steps=360
+    Sensor.grid(rays_per_revolution=360, layers=8, step_deg=1), [(0, 0, 1), (1, 0, 2)], steps=180
 )
 
 pytestmark = pytest.mark.usefixtures("small_batches")
@@ -56,15 +57,15 @@ def test_points_of_a_frame_are_in_storage_when_it_comes(cluster_client, undistur
     simulate(Scene.seed(), SURVEY, client=cluster_client, on_frame=on_frame)
 
 
-def test_a_partition_that_stays_empty_ends_the_run(threads, tmp_path):
+def test_a_partition_that_stays_empty_ends_the_run(tmp_path):
     def on_frame(frame: Frame) -> None:
         if frame.scan == 100:
             gpu = [a for a, w in worker_identities(client).items() if "GPU" in w["resources"]]
             client.retire_workers(gpu, close_workers=True, remove=True)
 
     with (
-        threads(GPU=1, LIDAR=4) as address,
-        Client(address, set_as_default=False) as client,
+        thread_cluster({"GPU": 1}, {"LIDAR": 4}) as cluster,
+        Client(cluster, set_as_default=False) as client,
         pytest.raises(LidarpoolError, match="Partition 'GPU' has had no workers for 2 s") as end,
     ):
         simulate(
@@ -72,7 +73,7 @@ def test_a_partition_that_stays_empty_ends_the_run(threads, tmp_path):
             patience_s=2.0,
         )  # fmt: skip
     assert '--resources "GPU=1"' in str(end.value)
-    assert "of 720 scans are kept" in end.value.__notes__[0]
+    assert "of 360 scans are kept" in end.value.__notes__[0]
 
 
 def test_a_failing_task_ends_the_run_with_stage_and_scan(cluster_client, monkeypatch, left_over):

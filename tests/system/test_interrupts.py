@@ -14,7 +14,6 @@ from typing import Any
 import pytest
 
 import lidarpool.cli.run_command
-from lidarpool.cli.log_file import LOG
 from lidarpool.report.output import FILES
 
 pytestmark = pytest.mark.skipif(
@@ -38,7 +37,7 @@ WRITING = r"writing the cloud"
 STAYS_STARTING = """
 import time
 import lidarpool.cli.run_command
-lidarpool.cli.run_command.QuietWorkers = lambda log: time.sleep(600)
+lidarpool.cli.run_command.WorkerLogs = lambda shown: time.sleep(600)
 """
 STAYS_WRITING = """
 import time
@@ -57,13 +56,10 @@ def start(tmp_path: Path, start_command: Callable[..., Any]) -> Callable[..., An
 
 @pytest.fixture
 def untouched(tmp_path: Path) -> Callable[[], bool]:
-    """Whether the earlier result is all there is, beside what is kept of the run, if anything.
-
-    A log, where the libraries had something to say, takes nothing away.
-    """
+    """Whether the earlier result is all there is, beside what is kept of the run, if anything."""
 
     def untouched(*, kept: bool = False) -> bool:
-        names = {path.name for path in (tmp_path / "out").iterdir()} - {LOG}
+        names = {path.name for path in (tmp_path / "out").iterdir()}
         earlier = (tmp_path / "out" / "cloud.ply").read_text() == "an earlier cloud"
         return earlier and names == ({"cloud.ply", "run"} if kept else {"cloud.ply"})
 
@@ -95,7 +91,7 @@ NOT_IGNORED = "import signal; signal.signal(signal.SIGHUP, signal.SIG_DFL)\n"
     ("number", "local"),
     [
         (signal.SIGINT, True),
-        (signal.SIGTERM, False),
+        pytest.param(signal.SIGTERM, False, marks=pytest.mark.slow),
         pytest.param(signal.SIGHUP, False, marks=pytest.mark.slow),
     ],
     ids=["Ctrl-C", "from a job manager", "the terminal is closed"],
@@ -157,7 +153,9 @@ MOMENTS = {
 }
 
 
-@pytest.mark.parametrize("moment", MOMENTS)
+@pytest.mark.parametrize(
+    "moment", ["moved in", *(pytest.param(m, marks=pytest.mark.slow) for m in ("dropped", "told"))]
+)
 def test_ctrl_c_when_the_result_is_whole(
     moment, lidarpool, cluster, tmp_path, monkeypatch, no_pictures
 ):
@@ -178,7 +176,7 @@ def test_ctrl_c_when_the_result_is_whole(
     assert run.err.strip() == (
         "lidarpool: interrupted; everything was stopped. The result in out is complete."
     )
-    names = {path.name for path in (tmp_path / "out").iterdir()} - {LOG}
+    names = {path.name for path in (tmp_path / "out").iterdir()}
     assert names == {*FILES} - {"path.png"}
 
 
@@ -226,16 +224,12 @@ def test_a_second_ctrl_c_ends_it_at_once():
     assert ended.stderr.startswith(b"lidarpool: stopped at once")
 
 
-@pytest.mark.parametrize("again_s", [0.01, 0.0])  # sooner than the hook for it is left
-def test_a_ctrl_c_where_python_drops_what_is_raised_comes_again(again_s):
+def test_a_ctrl_c_where_python_drops_what_is_raised_comes_again():
     script = (
         "import signal, time\n"
-        "from lidarpool.base import interrupts\n"
-        f"interrupts._AGAIN_S = {again_s}\n"
         "from lidarpool.base.interrupts import interrupt_on_signals\n"
         "class Future:\n"
         "    def __del__(self): signal.raise_signal(signal.SIGINT)\n"
-        "interrupt_on_signals()\n"
         "interrupt_on_signals()\n"
         "try:\n"
         "    Future()\n"
@@ -255,6 +249,7 @@ def test_workers_follow_a_driver_that_was_killed(start, untouched):
     assert untouched(kept=True)
 
 
+@pytest.mark.slow
 def test_a_run_that_was_stopped_and_killed_while_it_wrote_is_resumed(
     start, untouched, cluster, lidarpool, tmp_path, monkeypatch, no_pictures
 ):
@@ -276,7 +271,7 @@ def test_a_run_that_was_stopped_and_killed_while_it_wrote_is_resumed(
     run = lidarpool("run", "s.yaml", "--out", "out", "--resume")
     assert run.code == 0, run.err
     assert "starting the workers" not in run.err
-    names = {path.name for path in (tmp_path / "out").iterdir()} - {LOG}
+    names = {path.name for path in (tmp_path / "out").iterdir()}
     assert names == {*FILES}
 
 

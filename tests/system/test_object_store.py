@@ -107,6 +107,7 @@ Storage.write = write_and_die
 
 
 @pytest.mark.slow
+@pytest.mark.sample
 def test_a_collector_dies_while_it_uploads(run, check, outside, environment):
     """The stages begin on the worker with more slots, which dies, and go on on the other."""
     cluster = outside()
@@ -130,6 +131,7 @@ def test_a_place_that_there_cannot_be(place, run, tmp_path):
     assert not (tmp_path / "out" / "run").exists()
 
 
+@pytest.mark.slow
 def test_a_bucket_that_the_workers_cannot_reach(run, check, monkeypatch):
     """Parts come to it through the driver."""
     monkeypatch.setattr(Storage, "sees", lambda *_: False)

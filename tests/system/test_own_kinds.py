@@ -88,7 +88,7 @@ def test_a_column_of_ones_own_is_what_its_function_makes(result):
     assert np.allclose(cloud["brightness"], expected, rtol=1e-5)
 
 
-def test_both_are_in_the_files_of_the_result(result, tmp_path):
+def test_both_are_in_the_files_of_the_result(result, tmp_path, no_pictures):
     wanted = survey(columns=[BRIGHTNESS, "time", "range", "intensity"])
     write_result(tmp_path, result, Scene.seed(), wanted, None)
     report = json.loads((tmp_path / "report.json").read_text())
@@ -100,10 +100,11 @@ def test_both_are_in_the_files_of_the_result(result, tmp_path):
     limits = [own["lowest"], own["highest"]]
     assert limits == pytest.approx([values.min(), values.max()])
     sensor = report["parameters"]["sensor"]
-    assert (sensor["kind"], sensor["head"]["kind"], sensor["channels"]) == ("Tilted", "Nod", 12)
+    assert sensor["kind"] == "Tilted with 12 channels"
+    assert (sensor["head"]["kind"], sensor["channels"]) == ("Nod", 12)
     page = (tmp_path / "report.html").read_text()
     assert "brightness" in page and "light that comes back" in page
-    assert "<dd>Tilted</dd>" in page and "<dd>Nod</dd>" in page
+    assert "Tilted with 12 channels" in page and "<dd>Nod</dd>" in page
 
     cloud = read_cloud(tmp_path / "cloud.ply")
     assert np.array_equal(cloud["brightness"], values)

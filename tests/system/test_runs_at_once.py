@@ -9,6 +9,7 @@ from dataclasses import replace
 import pytest
 from distributed import Client, Queue
 from tests.chaos.traces import scheduler_state, settled_differences
+from tests.clusters import thread_cluster
 
 from lidarpool import Frame, LidarpoolError, Planning, Result, Scene, Sensor, Survey, simulate
 from lidarpool.run.progress import Progress
@@ -37,7 +38,7 @@ def test_they_run_one_after_the_other(cluster, left_over, same_cloud):
             go.wait()
             results.append(
                 simulate(
-                    Scene.seed(), SURVEY, client=client, backend="numpy",
+                    Scene.seed(), SURVEY, client=client,
                     on_frame=hold, on_progress=told,
                 )
             )  # fmt: skip
@@ -68,7 +69,8 @@ def test_slots_that_are_gone_are_not_waited_for_forever(cluster, monkeypatch, le
         assert left_over(client) == ([], [], [])
 
 
-def test_two_surveys_and_a_foreign_user_do_not_see_each_other(threads, same_cloud):
+@pytest.mark.slow
+def test_two_surveys_and_a_foreign_user_do_not_see_each_other(same_cloud):
     """Of what a run has used nothing stays either, but what is the cluster's own."""
     planning = Planning((25, 25), (-30, -20), trials=3, particles=50, iterations=20)
     all_there = threading.Barrier(3)
@@ -98,7 +100,9 @@ def test_two_surveys_and_a_foreign_user_do_not_see_each_other(threads, same_clou
         return results, taken
 
     surveys = [SURVEY, replace(SURVEY, keep_every=7)]
-    with threads(GPU=2, LIDAR=8, OTHER=1) as address, Client(address) as client:
+    slots = ({"GPU": 2}, {"LIDAR": 8}, {"OTHER": 1})
+    with thread_cluster(*slots) as cluster, Client(cluster) as client:
+        address = cluster.scheduler_address
         alone = [simulate(Scene.seed(), survey, planning, client=client) for survey in surveys]
         before = scheduler_state(client)
         with ThreadPoolExecutor() as pool:

@@ -14,7 +14,8 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
-from distributed import Client, Scheduler, Security, SpecCluster
+from distributed import Client, Security
+from tests.clusters import thread_cluster
 
 from lidarpool import LidarpoolError
 from lidarpool.run.connection import TlsFiles, connected
@@ -65,7 +66,7 @@ def ours(tmp_path_factory) -> Authority:
 
 @pytest.fixture(scope="module")
 def encrypted(ours) -> Iterator[str]:
-    """Address of a scheduler with certificates of ours."""
+    """Address of a cluster with certificates of ours, whose workers are threads."""
     files = ours.signed("scheduler")
     security = Security(
         require_encryption=True,
@@ -76,9 +77,8 @@ def encrypted(ours) -> Iterator[str]:
             for part in ("cert", "key")
         },
     )
-    options = {"host": "127.0.0.1", "port": 0, "dashboard": False, "security": security}
-    scheduler = {"cls": Scheduler, "options": {**options, "dashboard_address": "127.0.0.1:0"}}
-    with SpecCluster(scheduler=scheduler, security=security, silence_logs=50) as cluster:
+    slots = ({"GPU": 1}, {"LIDAR": 4}, {"OTHER": 1})
+    with thread_cluster(*slots, security=security) as cluster:
         yield str(cluster.scheduler_address)
 
 
@@ -115,31 +115,23 @@ def test_others_are_told_what_is_wrong(encrypted, ours, tmp_path):
         assert "of an encrypted one as tls://host:8786, with --tls-ca" in said
 
 
+@pytest.mark.slow
 def test_an_encrypted_local_cluster():
-    with local_cluster(gpu_workers=1, other_workers=1, security=True) as cluster:
+    with local_cluster(gpu_workers=1, other_workers=0, security=True) as cluster:
         assert cluster.scheduler_address.startswith("tls://127.0.0.1:")
         with Client(cluster, set_as_default=False) as client:
             assert all(worker.address.startswith("tls://") for worker in Pool.from_client(client))
-            assert client.submit(pow, 2, 10, resources={"OTHER": 1}).result() == 1024
+            assert client.submit(pow, 2, 10, resources={"GPU": 1}).result() == 1024
         # Another temporary certificate is no better than none.
         stranger = Security.temporary()
         with pytest.raises(OSError, match="TLS certificate does not match"):
             Client(cluster.scheduler_address, security=stranger, timeout=5, set_as_default=False)
 
 
-def test_a_survey_on_an_encrypted_outside_cluster(lidarpool, outside, ours, tmp_path, no_pictures):
-    """From the `dask` command line, with a certificate for each role."""
-    files = ours.signed("cluster")
-    options = ["--tls-ca-file", files.ca, "--tls-cert", files.cert, "--tls-key", files.key]
-    cluster = outside(*map(str, options))
-    assert cluster.address.startswith("tls://")
-    for name, slots in (("GPU", 1), ("LIDAR", 4), ("OTHER", 1)):
-        cluster.add(name, slots=slots)
-    with connected(cluster.address, files) as client:
-        client.wait_for_workers(3, timeout=120)
+def test_a_survey_on_an_encrypted_cluster(lidarpool, encrypted, ours, tmp_path, no_pictures):
     (tmp_path / "s.yaml").write_text("sensor: {layers: 4}\nplanning: {trials: 2}\n")
     mine = ours.signed("me")
-    given = ["--scheduler", cluster.address]
+    given = ["--scheduler", encrypted]
     given += ["--tls-ca", mine.ca, "--tls-cert", mine.cert, "--tls-key", mine.key]
     outcome = lidarpool("run", tmp_path / "s.yaml", "--out", tmp_path / "out", "-q", *given)
     assert (outcome.code, outcome.err) == (0, "")

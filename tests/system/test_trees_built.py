@@ -6,7 +6,7 @@ import time
 
 from lidarpool import Scene, Sensor, Survey, simulate
 
-REST_S = 5.0  # Dask's Active Memory Manager looks every two seconds
+REST_S = 3.0  # Dask's Active Memory Manager looks every two seconds
 
 
 def _count_builds(dask_worker=None) -> None:

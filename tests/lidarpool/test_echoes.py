@@ -1,0 +1,463 @@
+"""What comes back of a pulse: beams of several rays, materials, weather and noise."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import trimesh
+from tests.lidarpool.carts import Cart
+
+from lidarpool import (
+    Beams,
+    LidarpoolError,
+    Material,
+    Noise,
+    Optics,
+    Pose,
+    Returns,
+    Scene,
+    Sensor,
+    Spin,
+    Survey,
+)
+from lidarpool.base.counted import normal, raw, uniform
+from lidarpool.scan.echoes import Hits, chosen, separated
+from lidarpool.scan.rig import Rig, RigPlan
+from lidarpool.scene.mesh import Mesh
+from lidarpool.scene.shapes import seed_objects
+from lidarpool.sensor.materials import extinction, fresnel
+from lidarpool.sensor.optics import SUBRAYS, hexagon, spread
+from raybeam import available_backends
+
+COLUMNS = ("ray", "range", "intensity", "reflectivity", "return_number", "returns", "class")
+
+
+def wall(name, x, y=(-50.0, 50.0), z=(-50.0, 50.0)):
+    """A rectangle across the x axis."""
+    corners = [[x, y[0], z[0]], [x, y[1], z[0]], [x, y[1], z[1]], [x, y[0], z[1]]]
+    return Mesh(name, np.array(corners), np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+def beam_along_x(rays=1, max_range_m=float("inf"), **optics):
+    """A sensor that fires once, so many beams along x."""
+    return Sensor(Beams(np.zeros(rays)), Spin(1, 360), 0, max_range_m, optics=Optics(**optics))
+
+
+def cast(meshes, sensor=None, backend="numpy", **options):
+    """Points of one scan of some meshes, by column."""
+    survey = Survey(
+        sensor or beam_along_x(),
+        poses=[(0, 0, 0)],
+        steps=1,
+        keep_every=options.pop("keep_every", 1),
+        columns=COLUMNS,
+        **options,
+    )
+    rig = Rig(RigPlan(Scene.from_meshes(meshes), survey, backend))
+    (batch,) = rig.cast(0, 1)
+    return {c.name: c.make(batch) for c in survey.stored_columns} | {"batch": batch}
+
+
+# -- random numbers ------------------------------------------------------------------------------
+
+
+def test_random_numbers_follow_from_what_they_are_for_alone():
+    rays = np.arange(1000)
+    whole = raw(7, 1, 3, rays)
+    assert np.array_equal(whole[500:], raw(7, 1, np.full(500, 3), rays[500:]))
+    others = [raw(8, 1, 3, rays), raw(7, 2, 3, rays), raw(7, 1, 4, rays), raw(7, 1, 3, rays, 1)]
+    assert len(set(np.concatenate([whole, *others]).tolist())) == 5000
+    assert raw(0, 0, 0, 0).tolist() == [16294208416658607535], "SplitMix64 of another program"
+
+
+def test_random_numbers_have_their_distributions():
+    rays, scans = np.arange(200_000) % 1000, np.arange(200_000) // 1000
+    even, bell = uniform(1, 2, scans, rays), normal(1, 2, scans, rays)
+    assert np.abs(np.histogram(even, 20, (0, 1))[0] / 10_000 - 1).max() < 0.04
+    assert abs(bell.mean()) < 0.01
+    assert abs(bell.std() - 1) < 0.005
+    assert abs((np.abs(bell) > 1.96).mean() - 0.05) < 0.002
+    assert abs((bell**4).mean() - 3) < 0.06
+    assert abs(np.corrcoef(bell[:-1], bell[1:])[0, 1]) < 0.01
+
+
+# -- energies ------------------------------------------------------------------------------------
+
+
+def test_energy_falls_with_distance_angle_and_reflectance():
+    near = cast([wall("W", 5)], materials=[Material("*", reflectance=1.0)])
+    assert near["intensity"] == pytest.approx([4.0])
+    assert near["reflectivity"] == pytest.approx([1.0])
+    assert cast([wall("W", 20)])["intensity"] == pytest.approx([0.5 / 4]), "half is scattered"
+    slanted = Mesh("S", np.array([[4, -9, 9], [4, 9, 9], [22, -9, -9.0]]), np.array([[0, 1, 2]]))
+    found = cast([slanted], materials=[Material("S", reflectance=0.8, semantic_class=65_535)])
+    assert found["reflectivity"] == pytest.approx([0.8 * math.sqrt(0.5)], rel=1e-6)
+    assert found["class"].tolist() == [65_535]
+    retro = cast([slanted], materials=[Material("S", reflectance=0.8, retro=True)])
+    assert retro["reflectivity"] == pytest.approx([0.8 * 220], rel=1e-6), "from all angles"
+
+
+@pytest.mark.parametrize(
+    ("visibility_km", "nm", "per_km"),
+    [
+        # 3.91 / V * (wavelength / 0.55 µm)**-q, worked out by hand
+        (60.0, 905, 3.91 / 60 * (905 / 550) ** -1.6),
+        (10.0, 1550, 3.91 / 10 * (1550 / 550) ** -1.3),
+        (1.0, 550, 3.91),
+        (0.2, 905, 3.91 / 0.2 * (905 / 550) ** (-0.585 * 0.2 ** (1 / 3))),
+    ],
+)
+def test_weather_takes_light_by_kruse(visibility_km, nm, per_km):
+    assert 1000 * extinction(visibility_km, nm) == pytest.approx(per_km)
+    sensor = beam_along_x(wavelength_nm=nm)
+    clear, dull = (cast([wall("W", 40)], sensor, visibility_km=v) for v in (None, visibility_km))
+    lost = math.exp(-2 * per_km * 0.040)
+    assert dull["intensity"] / clear["intensity"] == pytest.approx([lost], rel=1e-6)
+    assert dull["reflectivity"] == pytest.approx(clear["reflectivity"], rel=1e-6)
+
+
+def test_the_last_material_that_names_an_object_counts():
+    walls = [wall(name, 5, z=(k, k + 1)) for k, name in enumerate(["A", "B[1]", "B1"], -1)]
+    up = Sensor(Beams(np.radians([-6, 6, 16])), Spin(1, 360))
+    materials = [Material("*", 0.1), Material(["B[1]", "B1"], 0.2), Material("B?", 0.3)]
+    found = cast(walls, up, materials=materials)
+    assert found["object"].tolist() == [0, 1, 2]
+    cosines = np.cos(np.radians([6, 6, 16]))
+    assert found["reflectivity"] == pytest.approx([0.1, 0.2, 0.3] * cosines, rel=1e-6)
+
+
+# -- beams ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", SUBRAYS)
+def test_a_hexagon_fills_its_cone_evenly(count):
+    places = hexagon(count, 0.01)
+    assert places.shape == (count, 2)
+    assert np.abs(places.mean(axis=0)).max() < 1e-12
+    assert np.hypot(*places.T).max(initial=0) < 0.005
+    if count > 1:
+        apart = np.linalg.norm(places[:, None] - places[None], axis=2) + np.eye(count)
+        assert np.allclose(apart.min(axis=1), apart.min()), "all have a neighbour as near"
+
+
+def test_directions_are_spread_by_their_angles_wherever_they_point():
+    rng = np.random.default_rng(0)
+    axes = np.concatenate([rng.normal(size=(50, 3)), np.eye(3), -np.eye(3)])
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    across, up = np.full((2, len(axes), 1), 0.0)
+    across[:], up[:] = 3e-3, 4e-3
+    turned = spread(axes, across, up)[:, 0]
+    turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+    assert np.allclose(np.arccos((turned * axes).sum(axis=1)), math.atan(5e-3), atol=1e-9)
+
+
+def test_half_a_beam_on_each_of_two_surfaces_is_two_returns():
+    """As bright both, where the farther one scatters four times as much of the light."""
+    materials = [Material("Near", 0.2), Material("Far", 0.8)]
+    meshes = [wall("Near", 5, y=(0, 50)), wall("Far", 10)]
+    beam = Returns("all", subrays=217, divergence_mrad=3, pulse_ns=5)
+    found = cast(meshes, materials=materials, returns=beam)
+    assert found["range"] == pytest.approx([5, 10], abs=1e-3)
+    assert found["intensity"] / found["intensity"].sum() == pytest.approx([0.5, 0.5], abs=0.02)
+    assert found["intensity"].sum() == pytest.approx(0.8, rel=1e-3)
+    assert found["return_number"].tolist() == [1, 2]
+    assert found["returns"].tolist() == [2, 2]
+    assert found["object"].tolist() == [0, 1]
+
+
+@pytest.mark.parametrize(("apart_m", "returns"), [(0.74, 1), (0.76, 2)])
+def test_what_is_nearer_than_half_a_pulse_is_one_return(apart_m, returns):
+    """Half of 5 ns are 0.7495 m."""
+    meshes = [wall("Near", 5, y=(0, 50)), wall("Far", 5 + apart_m)]
+    beam = Returns("all", subrays=37, divergence_mrad=1, pulse_ns=5)
+    found = cast(meshes, returns=beam)
+    assert len(found["range"]) == returns
+    if returns == 1:
+        energies = {5.0: 18 / 5**2, 5.74: 19 / 5.74**2}
+        mean = sum(r * e for r, e in energies.items()) / sum(energies.values())
+        other = {5.0: 19 / 5**2, 5.74: 18 / 5.74**2}
+        mean_of_other = sum(r * e for r, e in other.items()) / sum(other.values())
+        assert min(abs(found["range"] - mean), abs(found["range"] - mean_of_other)) < 1e-4
+
+
+MODES = {
+    "all": [3.0, 5.0, 7.0, 9.0],
+    "first": [3.0],
+    "last": [9.0],
+    "strongest": [7.0],
+    "dual": [7.0, 9.0],
+}
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_modes(mode):
+    hits = Hits(
+        np.array([1, 4, 4, 4, 4]),
+        np.array([2.0, 9.0, 3.0, 7.0, 5.0]),
+        np.arange(5, dtype=np.int32),
+        np.array([1.0, 1.0, 2.0, 4.0, 3.0]),
+    )
+    returns = separated(hits, 0.5)
+    found = returns.take(chosen(returns, mode))
+    assert found.ray.tolist() == [1] + [4] * len(MODES[mode])
+    assert found.distance.tolist() == [2.0, *MODES[mode]]
+    # Where the strongest is the last, the next strongest is the other one.
+    swapped = separated(hits._replace(energy=np.array([1.0, 9.0, 2.0, 4.0, 3.0])), 0.5)
+    dual = swapped.take(chosen(swapped, "dual"))
+    assert dual.distance.tolist() == [2.0, 7.0, 9.0]
+
+
+def test_separated_returns_are_those_of_a_loop():
+    """However many rays there are: against the plainest way to do it."""
+    rng = np.random.default_rng(3)
+    ray = np.sort(rng.integers(0, 400, 3000))
+    distance, energy = rng.uniform(5, 15, 3000), rng.uniform(0, 1, 3000)
+    energy[::7] = 0
+    triangle = np.arange(3000, dtype=np.int32)
+    found = separated(Hits(ray, distance, triangle, energy), 0.6)
+    rows = []
+    for number in range(400):
+        mine = np.flatnonzero((ray == number) & (energy > 0))
+        mine = mine[np.argsort(distance[mine])]
+        cuts = np.flatnonzero(np.diff(distance[mine]) > 0.6) + 1
+        for group in np.split(mine, cuts):
+            if len(group):
+                e = energy[group]
+                mean = (e * distance[group]).sum() / e.sum()
+                rows.append((number, mean, triangle[group[e.argmax()]], e.sum()))
+    for ours, theirs in zip(found, zip(*rows, strict=True), strict=True):
+        assert np.allclose(ours, theirs)
+
+
+# -- glass and mirrors ---------------------------------------------------------------------------
+
+
+CPU = [name for name in ("numpy", "embree") if not available_backends()[name]]
+
+
+@pytest.mark.parametrize("backend", CPU)
+def test_light_passes_glass(backend):
+    meshes = [wall("Pane", 4), wall("Behind", 9)]
+    materials = [Material("*", 0.5), Material("Pane", transparent="pass")]
+    found = cast(meshes, materials=materials, backend=backend)
+    assert found["object"].tolist() == [1]
+    assert found["range"] == pytest.approx([9], abs=1e-9)
+    assert found["reflectivity"] == pytest.approx([0.5 * 0.96**2], rel=1e-6), "4 % each way"
+    dirty = [*materials[:1], Material("Pane", 0.1, transparent="pass")]
+    found = cast(meshes, materials=dirty, returns=Returns("all"), backend=backend)
+    assert found["object"].tolist() == [0, 1]
+    assert found["reflectivity"] == pytest.approx([0.1, 0.5 * (0.9 * 0.96) ** 2], rel=1e-6)
+    assert not len(cast(meshes, beam_along_x(max_range_m=8), materials=materials)["range"])
+
+
+@pytest.mark.parametrize("backend", CPU)
+@pytest.mark.parametrize("away_m", [0, 2000])
+@pytest.mark.parametrize("angle_deg", [0, 60, 85])
+def test_a_pane_has_two_surfaces_from_whatever_side(backend, away_m, angle_deg):
+    """4 mm of glass, also far from the origin, where single precision is coarse."""
+    pane = trimesh.creation.box((0.004, 300, 20))
+    angle = math.radians(angle_deg)
+    pane.apply_transform(trimesh.transformations.rotation_matrix(angle, (0, 0, 1)))
+    meshes = [
+        Mesh("Pane", np.add(pane.vertices, (away_m + 30, 0, 0)), pane.faces),
+        wall("Behind", away_m + 60),
+    ]
+    materials = [Material("Behind", 0.5), Material("Pane", transparent="pass")]
+    survey = Survey(
+        beam_along_x(),
+        poses=[(away_m, 0.01, 0.02)],
+        steps=1,
+        keep_every=1,
+        columns=COLUMNS,
+        materials=materials,
+    )
+    (batch,) = Rig(RigPlan(Scene.from_meshes(meshes), survey, backend)).cast(0, 1)
+    through = (1 - fresnel(np.array([math.cos(angle)]))) ** 4  # two surfaces, there and back
+    assert batch.range == pytest.approx([60], abs=1e-3)
+    assert batch.reflectivity == pytest.approx(0.5 * through, rel=1e-4)
+
+
+def test_glass_reflects_by_fresnel():
+    assert fresnel(np.array([1.0, 0.0])) == pytest.approx([0.04, 1.0])
+    brewster = math.atan(1.5)
+    along = (math.sin(2 * brewster - math.pi / 2)) ** 2 / 2  # one polarisation is not reflected
+    assert fresnel(np.array([math.cos(brewster)])) == pytest.approx([along])
+
+
+@pytest.mark.parametrize("backend", CPU)
+@pytest.mark.parametrize("subrays", [1, 19])
+def test_a_mirror_shows_what_is_reflected_at_the_unfolded_range(subrays, backend):
+    """A mirror at 45 degrees turns the beam up, to a ceiling 3 m above."""
+    corners = np.array([[2, -9, -2], [2, 9, -2], [6, 9, 2], [6, -9, 2.0]])
+    mirror = Mesh("Mirror", corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    ceiling = np.array([[-9, -9, 3], [9, -9, 3], [9, 9, 3], [-9, 9, 3.0]])
+    meshes = [mirror, Mesh("Ceiling", ceiling, mirror.faces)]
+    materials = [Material("*"), Material("Mirror", transparent="mirror")]
+    beam = Returns(subrays=subrays, divergence_mrad=1)
+    found = cast(meshes, materials=materials, returns=beam, backend=backend)
+    assert found["object"].tolist() == [1]
+    assert found["range"] == pytest.approx([7], abs=1e-4)
+    assert found["reflectivity"] == pytest.approx([0.5], rel=1e-4)
+    assert np.allclose(found["batch"].positions, [[7, 0, 0]], atol=1e-4), "behind the mirror"
+
+
+def test_light_between_two_mirrors_is_given_up():
+    meshes = [wall("A", 4), wall("B", -4)]
+    found = cast(meshes, materials=[Material("*", transparent="mirror")])
+    assert not len(found["range"])
+
+
+# -- noise ---------------------------------------------------------------------------------------
+
+MANY = 40_000
+
+
+@pytest.mark.parametrize("distance", [5.0, 80.0])
+@pytest.mark.parametrize("beam", [Returns(), Returns(subrays=7, divergence_mrad=0.5)])
+def test_ranges_have_the_noise_that_was_asked_for(distance, beam):
+    noise = Noise(range_m=0.02, range_per_m=0.001)
+    found = cast([wall("W", distance)], beam_along_x(MANY), noise=noise, returns=beam)
+    off = found["range"].astype(float) - distance
+    sigma = 0.02 + 0.001 * distance
+    assert len(off) == MANY
+    assert abs(off.mean()) < 4 * sigma / math.sqrt(MANY)
+    assert off.std() == pytest.approx(sigma, rel=0.02)
+    assert found["batch"].positions[:, 0] == pytest.approx(distance + off, abs=1e-4)
+    assert np.ptp(found["intensity"]) < 1e-6, "what came back knows nothing of it"
+
+
+def test_light_goes_where_a_beam_points_and_its_angle_is_reported_without_noise():
+    """On a wall that is met at 45 degrees, ranges tell how far beams point off."""
+    corners = np.array([[-40, 50, -50], [60, -50, -50], [60, -50, 50], [-40, 50, 50.0]])
+    slanted = Mesh("W", corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    found = cast([slanted], beam_along_x(MANY), noise=Noise(angle_deg=0.1))
+    # Along x the wall is at 10 m; turned by a small angle, at 10 (1 - angle).
+    off = (10 - found["range"]) / 10
+    assert off.std() == pytest.approx(math.radians(0.1), rel=0.03)
+    across = found["batch"].positions[:, 1:]
+    assert np.abs(across).max() < 1e-2, "reported along the nominal ray"
+
+
+def test_noise_depends_on_its_seed():
+    ranges = [
+        cast([wall("W", 9)], beam_along_x(9), noise=Noise(range_m=0.1, seed=seed))["range"]
+        for seed in (1, 1, 2)
+    ]
+    assert np.array_equal(ranges[0], ranges[1])
+    assert not np.array_equal(ranges[0], ranges[2])
+
+
+@pytest.mark.parametrize("distance", [80, 95, 100, 105, 130])
+def test_weak_returns_are_lost_by_the_model(distance):
+    """Threshold detection of a signal in normally distributed noise."""
+    noise = Noise(dropout=0.1, detection_range_m=100)
+    wall_of_10 = [Material("*", 0.1)]
+    found = cast([wall("W", distance)], beam_along_x(MANY), noise=noise, materials=wall_of_10)
+    above = 5 * ((100 / distance) ** 2 - 1)
+    share = 0.9 * (1 + math.erf(above / math.sqrt(2))) / 2
+    sigma = math.sqrt(MANY * share * (1 - share))
+    assert abs(len(found["range"]) - MANY * share) < 3 * sigma + 2
+    assert (
+        len(found["range"]) == found["batch"].found.hits.sum() == found["batch"].found.tally.sum()
+    )
+
+
+# -- the same bits however it is batched ----------------------------------------------------------
+
+ALL_ON = {
+    "materials": [
+        Material("*", 0.4, semantic_class=1),
+        Material("V*", 0.1, transparent="pass"),
+        Material("Sphere", transparent="mirror"),
+    ],
+    "returns": Returns("dual", subrays=7, divergence_mrad=20, pulse_ns=2),
+    "noise": Noise(0.02, 0.001, 0.05, 0.1, 40, seed=5),
+    "visibility_km": 0.5,
+}
+NOISE_ONLY = {"noise": Noise(0.02, 0.001, 0.05, seed=5)}
+BEAMS = Beams(
+    np.radians([-20, -5, 0, 12]),
+    time_ns=[0, 50_000, 100_000, 150_000],
+    origin=[[0.1, 0, 0], [0.1, 0.02, 0], [0.1, -0.02, 0], [0.1, 0, 0.05]],
+)
+TURNED = {"poses": (Pose((0, 0, 1), 10, 5, -3), Pose((3, -2, 2)))}
+
+
+@pytest.mark.parametrize("options", [ALL_ON, NOISE_ONLY], ids=["all on", "noise"])
+@pytest.mark.parametrize("path", [TURNED, {"trajectory": Cart()}], ids=["standing", "moving"])
+@pytest.mark.parametrize("per_turn", [360, 360.449])
+def test_batches_and_chunks_leave_no_trace(options, path, per_turn, monkeypatch):
+    sensor = Sensor(BEAMS, Spin(per_turn, step_deg=30, rate_hz=10), 0.5, 40)
+    survey = Survey(sensor, steps=14, keep_every=3, columns=COLUMNS, **options, **path)
+    scene = Scene.from_meshes(seed_objects(rings=8, segments=12))
+    rig = Rig(RigPlan(scene, survey, "numpy"))
+
+    def columns(cuts):
+        batches = [batch for span in itertools.pairwise(cuts) for batch in rig.cast(*span)]
+        return [
+            np.concatenate([column.make(batch) for batch in batches]).tobytes()
+            for column in survey.stored_columns
+        ]
+
+    whole = columns([0, 28])
+    assert len(whole[0]) > 200
+    assert columns([0, 1, 5, 14, 17, 28]) == whole
+    monkeypatch.setattr("lidarpool.scan.echoes.CHUNK_RAYS", 100)
+    monkeypatch.setattr("lidarpool.scan.echoes.BLOCK_RAYS", 7)
+    assert columns(list(range(29))) == whole
+
+
+def test_returns_are_thinned_out_scan_by_scan():
+    scene = seed_objects(rings=8, segments=12)
+    sensor = Sensor(BEAMS, Spin(90, step_deg=360))
+    beam = Returns("all", subrays=7, divergence_mrad=50, pulse_ns=1)
+    every, third = (cast(scene, sensor, returns=beam, keep_every=n) for n in (1, 3))
+    assert every["returns"].max() > 1
+    for name in COLUMNS:
+        assert np.array_equal(every[name][::3], third[name])
+    assert every["batch"].found.hits.tolist() == third["batch"].found.hits.tolist()
+    assert every["batch"].found.hits.sum() == len(every["ray"])
+
+
+def test_one_subray_without_noise_is_the_plain_ray():
+    """The way through beams and returns ends where the plain one does."""
+    scene = seed_objects(rings=8, segments=12)
+    sensor = Sensor(BEAMS, Spin(90, step_deg=360))
+    plain = cast(scene, sensor)
+    beam = cast(scene, sensor, noise=Noise(dropout=1e-12))
+    assert plain["batch"].echoes is None
+    assert beam["batch"].echoes is not None
+    for name in ("x", "y", "z", "ray", "object", "channel", "class", "returns"):
+        assert np.array_equal(plain[name], beam[name])
+    assert np.allclose(plain["intensity"], beam["intensity"], rtol=1e-6)
+    assert np.allclose(plain["range"], beam["range"], rtol=1e-6)
+
+
+# -- what is refused ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda: Material("*", 1.1), "reflectance is 1.1"),
+        (lambda: Material("*", float("nan")), "reflectance is nan"),
+        (lambda: Material([]), "objects is"),
+        (lambda: Material("*", semantic_class=65_536), "semantic_class is 65536"),
+        (lambda: Material("*", transparent="yes"), "none, pass or mirror"),
+        (lambda: Returns(mode="best"), "mode is 'best'"),
+        (lambda: Returns(subrays=8), "it must be one of 1, 7, 19, 37"),
+        (lambda: Returns(pulse_ns=-1), "pulse_ns is -1"),
+        (lambda: Noise(range_m=-0.1), "range_m is -0.1"),
+        (lambda: Noise(dropout=2), "dropout is 2"),
+        (lambda: Noise(seed=-1), "seed is -1"),
+        (lambda: Optics(wavelength_nm=0.905), "wavelength_nm is 0.905"),
+        (lambda: Survey(poses=[(0, 0, 1)], visibility_km=0), "visibility_km is 0"),
+        (lambda: Survey(poses=[(0, 0, 1)], returns=Returns(subrays=7)), "no divergence"),
+    ],
+)
+def test_numbers_that_mean_nothing_are_refused(make, says):
+    with pytest.raises(LidarpoolError, match=says):
+        make()

@@ -1,0 +1,224 @@
+"""What a carrier on the move gives: points that are skewed, and what puts them right."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lidarpool import (
+    LidarpoolError,
+    Material,
+    Mounted,
+    Pose,
+    Scene,
+    Survey,
+    Track,
+    load_sensor,
+)
+from lidarpool.run.identity import identity_of
+from lidarpool.run.job import Job
+from lidarpool.scan.motion import into_axes
+from lidarpool.scan.rig import Rig, RigPlan
+from lidarpool.scene.actors import Actor, box
+from lidarpool.scene.mesh import Mesh
+from lidarpool.sensor.optics import Returns
+
+WALL_M = 8.0
+PRECISION_M = 0.001
+SECONDS = np.linspace(0, 0.5, 6)
+HALF = np.radians(30) * SECONDS / 2
+# 20 m/s, and 30 degrees a second to the left.
+DRIVE = Track(
+    SECONDS,
+    np.stack([20 * SECONDS, 0 * SECONDS, 2 + 0 * SECONDS], axis=1),
+    np.stack(
+        [0 * SECONDS, 0 * SECONDS, *(f(np.radians(15) * SECONDS) for f in (np.sin, np.cos))], 1
+    ),
+)
+MOUNT = Pose((1.2, 0.1, 0.4), 20, 5, -3)
+
+
+def made(survey, scene, backend="numpy"):
+    """Columns of all points that a survey gives: {name: (n,)}."""
+    batches = list(Rig(RigPlan(scene, survey, backend)).cast(0, survey.scan_count))
+    return {
+        column.name: np.concatenate([column.make(batch) for batch in batches])
+        for column in survey.stored_columns
+    }
+
+
+def stored_positions(columns, precision_m=PRECISION_M):
+    return np.stack([columns[axis] for axis in "xyz"], axis=1) * precision_m
+
+
+@pytest.fixture(scope="module")
+def wall():
+    corners = np.array(
+        [[-500, WALL_M, -50], [500, WALL_M, -50], [500, WALL_M, 90], [-500, WALL_M, 90]]
+    )
+    return Scene.from_meshes([Mesh("Wall", corners * 1.0, np.array([[0, 1, 2], [0, 2, 3]]))])
+
+
+@pytest.mark.parametrize("model", ["velodyne/vlp16", "velodyne/hdl64e-s2", "ouster/os0-32"])
+def test_raw_points_are_off_by_metres_and_deskewed_ones_on_the_wall(wall, model):
+    sensor = load_sensor(model, max_range_m=30)
+    common = {"trajectory": DRIVE, "keep_every": 1, "precision_m": PRECISION_M, "columns": ["time"]}
+    common["sensors"] = [Mounted(sensor, MOUNT)]
+    raw = made(Survey(coordinates="sensor", **common), wall)
+    world = made(Survey(**common), wall)
+    assert len(raw["time"]) > 10_000
+    assert np.abs(stored_positions(world)[:, 1] - WALL_M).max() <= PRECISION_M / 2
+
+    def placed(times_ns):
+        """The raw points as if each had been seen at a time: (n, 3), world coordinates."""
+        positions, rotations = DRIVE.poses(0, times_ns.astype(np.float64))
+        seen = stored_positions(raw) @ MOUNT.rotation.T + MOUNT.position
+        return np.einsum("kij,kj->ki", rotations, seen) + positions
+
+    assert np.abs(placed(raw["time"])[:, 1] - WALL_M).max() <= PRECISION_M, "as stored, in 3 axes"
+    turn = (raw["time"] // 100_000_000) * 100_000_000  # deskewed turn by turn only
+    off = placed(turn) - placed(raw["time"])
+    assert np.linalg.norm(off, axis=1).max() > 1.2
+    assert np.abs(placed(turn)[:, 1] - WALL_M).max() > 0.3
+
+
+def test_beams_of_one_firing_leave_from_different_places(wall):
+    """VLP-16: 16 beams in 34.56 µs, in which 20 m/s are 0.7 mm."""
+    sensor = load_sensor("velodyne/vlp16", max_range_m=30)
+    columns = ["time", "azimuth", "range"]
+    survey = Survey(sensor, trajectory=DRIVE, keep_every=1, columns=columns, precision_m=1e-6)
+    batch = next(Rig(RigPlan(wall, survey, "numpy")).cast(0, 36))
+    first = batch.firing == batch.firing[len(batch) // 2]
+    steps = np.diff(batch.origins[first], axis=0)[:, 0]
+    order = np.diff(batch.time[first])
+    assert first.sum() > 8
+    assert np.allclose(steps, 20e-9 * order, atol=3e-8)
+
+
+def way(*steps, **options):
+    """A trajectory of (seconds, x, y, z, yaw in degrees)."""
+    seconds, x, y, z, yaw = np.array(steps, np.float64).T
+    half, zero = np.radians(yaw) / 2, np.zeros(len(yaw))
+    turns = np.stack([zero, zero, np.sin(half), np.cos(half)], axis=1)
+    return Track(seconds, np.stack([x, y, z], axis=1), turns, **options)
+
+
+SIZE = np.array([4.5, 1.8, 1.5])
+# 10 m/s, and 40 degrees a second to and fro.
+CAR = Actor(
+    box("Car", tuple(SIZE)), way((0, -3, 4, 0, 0), (0.25, -0.5, 4, 0, 10), (0.5, 2, 4, 0, 0))
+)
+
+
+@pytest.fixture(scope="module")
+def street(wall):
+    corners = np.array([[-99, -99, 0], [99, -99, 0], [99, 99, 0], [-99, 99, 0.0]])
+    ground = Mesh("Ground", corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    return Scene.from_meshes([*wall.meshes(), ground])
+
+
+COLUMNS = ["ray", "time", "range", "triangle", "intensity", "class"]
+SURVEYS = {
+    "standing": {"poses": [(0, 0, 1.5), (1, 0, 1.5)], "steps": 54},
+    "driving": {"trajectory": DRIVE},
+    "beams of several rays": {"trajectory": DRIVE, "returns": Returns("all", 7, 3.0)},
+}
+
+
+@pytest.mark.parametrize("backend", ["numpy", "embree"])
+@pytest.mark.parametrize("name", SURVEYS)
+def test_an_actor_is_where_it_is_at_the_time_of_each_ray(street, name, backend):
+    sensor = load_sensor("velodyne/vlp16")
+    options = {"keep_every": 1, "columns": COLUMNS, "precision_m": 1e-3, **SURVEYS[name]}
+    survey = Survey(sensor, **options)
+    rig = Rig(RigPlan(replace(street, actors=(CAR,)), survey, backend))
+    batches = list(rig.cast(0, survey.scan_count))
+    seen = 0
+    for batch in batches:
+        on = batch.object == 2
+        positions, rotations = CAR.trajectory.poses(0, batch.time[on].astype(np.float64))
+        own = into_axes(batch.positions[on] - positions, rotations) - [0, 0, SIZE[2] / 2]
+        off = np.abs(np.abs(own) - SIZE / 2)
+        if "several" not in name:  # whose range is the mean of several rays
+            assert off.min(axis=1).max(initial=0) < 1e-6
+            face = off.argmin(axis=1)
+            cosines = np.abs(into_axes(batch.directions[on], rotations))[np.arange(on.sum()), face]
+            assert np.allclose(batch.cosine[on], cosines, atol=1e-6)
+            assert (np.abs(own) <= SIZE / 2 + 1e-6).all()
+        assert (batch.triangle[on] >= 4).all()
+        seen += on.sum()
+    assert seen > 500
+    plain = Rig(RigPlan(street, survey, backend)).cast(0, survey.scan_count)
+    for batch, without in zip(batches, plain, strict=True):
+        both = {}
+        for found in (batch, without):
+            rays = np.flatnonzero(found.object != 2)
+            made = [column.make(found)[rays] for column in survey.stored_columns]
+            both[found is batch] = {
+                key[:2]: key
+                for key in zip(found.found.ray[rays].tolist(), *map(list, made), strict=True)
+            }
+        hidden = {int(ray) for ray in batch.found.ray[batch.object == 2]}
+        assert {ray for ray, _ in both[False]} - {ray for ray, _ in both[True]} <= hidden
+        untouched = {k: v for k, v in both[False].items() if k[0] not in hidden}
+        if "several" not in name:
+            assert untouched == {k: v for k, v in both[True].items() if k[0] not in hidden}
+
+
+@pytest.mark.parametrize("backend", ["numpy", "embree"])
+def test_an_actor_behind_glass_is_where_it_is_without(street, backend):
+    corners = np.array([[-90, 2, -9], [90, 2, -9], [90, 2, 9], [-90, 2, 9.0]])
+    pane = Mesh("Pane", corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    found = []
+    for meshes in ([], [pane]):
+        scene = replace(Scene.from_meshes([*street.meshes(), *meshes]), actors=(CAR,))
+        materials = [Material("*", 0.5)] + [Material("Pane", transparent="pass") for _ in meshes]
+        survey = Survey(
+            load_sensor("velodyne/vlp16"), materials=materials, columns=COLUMNS, keep_every=1,
+            **SURVEYS["standing"],
+        )  # fmt: skip
+        columns = made(survey, scene, backend)
+        on = columns["object"] == len(scene.names)
+        found.append({name: columns[name][on] for name in ("time", "ray", "range", "intensity")})
+    plain, seen = found
+    assert len(plain["ray"]) > 500
+    assert np.array_equal(plain["time"], seen["time"])
+    assert np.allclose(plain["range"], seen["range"], atol=1e-4)
+    assert (seen["intensity"] < 0.93 * plain["intensity"]).all()
+
+
+def test_actors_that_cannot_be_met_are_not_asked(street, monkeypatch):
+    far = Actor(box("Far", (1, 1, 1)), way((0, 500, 0, 0, 0), (9, 500, 0, 0, 0)))
+    behind = Actor(box("Above", (1, 1, 1)), way((0, 0, 0, 60, 0), (9, 0, 0, 60, 0)))
+    scene = replace(street, actors=(far, behind))
+    rig = Rig(RigPlan(scene, Survey(load_sensor("velodyne/vlp16"), poses=[(0, 0, 1)]), "numpy"))
+    for actor in rig._caster._actors:
+        monkeypatch.setattr(actor, "_caster", None)
+    assert sum(len(batch) for batch in rig.cast(0, 36)) > 1000
+
+
+def test_however_scans_are_batched_actors_have_the_same_bits(street):
+    survey = Survey(load_sensor("velodyne/vlp16"), trajectory=DRIVE, columns=COLUMNS)
+    rig = Rig(RigPlan(replace(street, actors=(CAR,)), survey, "numpy"))
+
+    def columns(cuts):
+        batches = [batch for span in itertools.pairwise(cuts) for batch in rig.cast(*span)]
+        tally = np.sum([batch.found.tally for batch in batches], axis=0)
+        made = [[column.make(batch) for batch in batches] for column in survey.stored_columns]
+        return [np.concatenate(parts).tobytes() for parts in made], tally.tolist()
+
+    count = survey.scan_count
+    assert columns([0, count]) == columns([0, 1, 7, 30, count - 3, count])
+
+
+def test_an_actor_must_be_there_as_long_as_the_survey_lasts(street):
+    scene = replace(street, actors=(CAR,))
+    with pytest.raises(LidarpoolError, match=r"Actor 'Car': .* 0\.19\d* s outside"):
+        Job(scene, Survey(poses=[(0, 0, 1)] * 7))
+    assert (
+        identity_of(Job(scene, Survey(poses=[(0, 0, 1)])))["scene"]
+        != (identity_of(Job(street, Survey(poses=[(0, 0, 1)])))["scene"])
+    )

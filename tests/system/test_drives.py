@@ -1,0 +1,145 @@
+"""Surveys from carriers that move, and what users get wrong with them."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lidarpool import read_cloud
+from lidarpool.scan.rig import Rig, RigPlan
+from lidarpool.scenario.scenario import Scenario
+from lidarpool.scene.city import city
+from lidarpool.scene.scene_file import write_scene
+
+ROOT = Path(__file__).parents[2]
+
+POINTS = "{time_s: 0, position: [0, 0, 1]}, {time_s: 1, position: [9, 0, 1]}"
+LINE = "1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n"
+# (scenario, the file it names, what is said)
+BAD = [
+    ("trajectory: t.txt", "", "t.txt is no trajectory.* it is empty"),
+    ("trajectory: t.txt", "# only a comment", "it has no poses"),
+    ("trajectory: none.txt", "", "none.txt.*No such file"),
+    ("trajectory: t.txt", "1 0 0 0 0 0 0 1\n", "two poses at least"),
+    ("trajectory: t.txt", LINE + "3 nan 0 0 0 0 0 1\n", "position of pose 2 is not finite"),
+    ("trajectory: t.txt", LINE + "inf 0 0 0 0 0 0 1\n", "time of pose 2 is not finite"),
+    ("trajectory: t.txt", LINE + "2 5 0 0 0 0 0 1\n", "times must ascend.*pose 2"),
+    ("trajectory: t.txt", LINE + "1.5 5 0 0 0 0 0 1\n", "times must ascend.*pose 2"),
+    ("trajectory: t.txt", LINE + "3 5 0 0 0 0 0 1.01\n", "quaternion of pose 2 is not of length 1"),
+    ("trajectory: t.txt", LINE + "3 5 0 0 nan 0 0 1\n", "quaternion of pose 2 is not of length 1"),
+    ("trajectory: t.txt", LINE + "3 5 0 0 0 0 1\n", "number of columns changed"),
+    ("trajectory: t.txt", LINE + "3 5 0 0 0 0 0 east\n", "could not convert string"),
+    ("trajectory: {file: t.txt, start_s: 4.5}", LINE, "start_s is 4.5 s, 2.5 s outside"),
+    ("trajectory: {file: t.txt, duration_s: 9}", LINE, "8 s outside the trajectory"),
+    ("trajectory: {file: t.txt, format: kitti}", LINE, "give their file as times"),
+    ("trajectory: {file: t.txt, times: t.txt}", "0.5\n", "1 numbers, not 12"),
+    ("trajectory: {file: t.txt, times: t.txt, format: tum}\nsteps: 399", LINE, "1.*s less"),
+    ("trajectory: {file: t.txt, format: csv}", "x,y,z\n1,2,3\n", "no column 'time_s'"),
+    ("trajectory: {file: t.txt, format: csv}", "time_s,x,y,z,qx\n", "no column 'qy'"),
+    ("trajectory: {file: t.txt, format: csv}", "time_s,x,y,z\n", "it has no poses"),
+    (
+        "trajectory: {file: t.txt, format: csv, columns: {time_s: at}}",
+        "time_s,x,y,z\n1,2,3,4\n",
+        "no column 'at'",
+    ),
+    ("trajectory: {file: t.txt, points: [" + POINTS + "]}", LINE, "either file or points"),
+    ("trajectory: {}", "", "either file or points"),
+    ("trajectory: {file: t.txt, format: gpx}", LINE, "trajectory.format is 'gpx'"),
+    ("trajectory: {points: [{position: [0, 0, 0]}]}", "", "time_s is missing"),
+    ("trajectory: t.txt\nposes: [[0, 0, 1]]", LINE, "either poses or a trajectory"),
+    ("mount: {place: [0, 0, 1]}", "", "mount.place is not a field"),
+    ("mount: {position: [0, 0]}", "", "mount.position"),
+    ("sensors: {a: {mount: {yaw: 1}}}", "", "yaw is not a field"),
+    ("sensors: {a: {}}\nmount: {yaw_deg: 3}", "", "either sensor and mount, or sensors"),
+]
+
+
+CAR = "actors: [{name: Car, box: [4, 2, 1.5]%s}]"
+AWAY = "\ntrajectory: {file: t.txt, offset_s: -0.5}"
+BAD += [
+    (CAR % "", "", r"actors\[0\].trajectory is missing"),
+    (CAR % ", trajectory: t.txt", LINE, "actor 'Car': .* start_s is 0 s, 1 s outside"),
+    (CAR % ", trajectory: t.txt" + AWAY, LINE, "0.5 s outside"),
+    (CAR % ", file: a.stl, trajectory: t.txt", LINE, "either file or box"),
+    (CAR % ", colour: red, trajectory: t.txt", LINE, "colour is not a field"),
+    (CAR % ", trajectory: {file: t.txt, start_s: 1}", LINE, "give offset_s"),
+    (CAR % (", trajectory: {points: [" + POINTS + "]}") + "\nsteps: 150", "", "0.25 s outside"),
+    ("actors: [{name: Car, file: no.stl, trajectory: t.txt}]", LINE, "no.stl does not exist"),
+]
+
+
+@pytest.mark.parametrize(("text", "content", "said"), BAD, ids=str)
+def test_what_cannot_be_is_one_line_and_exit_code_2(tmp_path, lidarpool, text, content, said):
+    (tmp_path / "t.txt").write_text(content)
+    (tmp_path / "s.yaml").write_text("planning: {enabled: false}\n" + text)
+    done = lidarpool("check", tmp_path / "s.yaml", "--out", tmp_path / "out")
+    assert done.code == 2
+    assert len(done.err.splitlines()) == 1
+    assert re.search(said, done.err), done.err
+
+
+@pytest.fixture
+def town(tmp_path):
+    """The example of the documents beside the city that it drives through."""
+    write_scene(tmp_path / "city.glb", city(20_000))
+    text = (ROOT / "examples" / "drive.yaml").read_text("utf-8")
+    text = text.replace("duration_s: 2 ", "duration_s: 0.2 ")
+    (tmp_path / "drive.yaml").write_text(text)
+    return tmp_path
+
+
+def test_what_check_says_of_a_drive(town, lidarpool):
+    told = lidarpool("check", town / "drive.yaml", "--out", town / "out").out
+    assert re.search(r"144 scans along a trajectory, .* \(2 sensors\)", told)
+    assert re.search(r"way         2\.\d\d m in 0.200 s", told)
+    assert re.search(
+        r"roof        3,61\d firings, 2.00 turns; in one the carrier moves 1\.\d+ m", told
+    )
+    done = lidarpool("check", town / "drive.yaml", "--out", town / "out", "--json")
+    assert [s["name"] for s in json.loads(done.out)["drive"]["sensors"]] == ["roof", "nose"]
+
+
+def test_a_drive_with_actors_on_a_cluster(town, lidarpool, cluster, no_pictures):
+    """As rigs of this process cast it, and again with smaller batches."""
+    out = town / "out"
+    done = lidarpool("run", town / "drive.yaml", "--out", out, "--scheduler", cluster)
+    assert done.code == 0, done.err
+    report = json.loads((out / "report.json").read_text())
+    assert report["scans"] == 144
+    assert list(report["parameters"]["sensors"]) == ["roof", "nose"]
+    assert "144 scans along a trajectory of 0.2 s sent" in (out / "report.html").read_text("utf-8")
+    points = report["points_by_object"]
+    assert points["Pedestrian"] > 0 and points["Oncoming car"] > 0
+    cloud = read_cloud(out / "cloud.ply")
+    scenario = Scenario.load(town / "drive.yaml")
+    scene = scenario.build_scene()
+    survey = scenario.survey(scene)
+    batches = list(Rig(RigPlan(scene, survey, report["backend"])).cast(0, survey.scan_count))
+    for column in survey.stored_columns[3:]:
+        made = np.concatenate([column.make(batch) for batch in batches])
+        assert np.array_equal(cloud[column.name], made), column.name
+    on = cloud["object"] == len(scene.names) + 1
+    assert set(cloud["class"][on]) == {2}
+    assert set(cloud["class"][cloud["object"] < len(scene.names)]) == {0}
+    assert np.array_equal(np.unique(cloud["sensor"]), [0, 1])
+    assert (np.diff(cloud["scan"]) >= 0).all()
+
+
+def test_points_in_the_coordinates_of_the_sensor(tmp_path, lidarpool, cluster, no_pictures):
+    """The ground is a metre below the sensor, wherever that is."""
+    (tmp_path / "s.yaml").write_text(
+        "scene: {preset: seed, ground: {height_m: 0}}\nplanning: {enabled: false}\n"
+        "trajectory: {points: [" + POINTS + "]}\nsteps: 36\ncloud: {coordinates: sensor}\n"
+    )
+    out = tmp_path / "out"
+    done = lidarpool("run", tmp_path / "s.yaml", "--out", out, "--scheduler", cluster)
+    assert done.code == 0, done.err
+    cloud = read_cloud(out / "cloud.ply")
+    assert len(cloud) > 1000
+    ground = cloud["object"] == 6
+    assert np.allclose(cloud.positions[ground, 2], -1, atol=0.006)
+    assert json.loads((out / "report.json").read_text())["parameters"]["coordinates"] == "sensor"

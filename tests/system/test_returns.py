@@ -1,0 +1,106 @@
+"""Runs with all that comes back of a pulse: the same bytes on any cluster, whatever dies."""
+
+from __future__ import annotations
+
+import os
+import signal
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from distributed import Client
+from tests.clusters import thread_cluster
+
+import lidarpool.scan.driver
+from lidarpool import (
+    Cloud,
+    Frame,
+    Material,
+    Noise,
+    Returns,
+    Scene,
+    Sensor,
+    Survey,
+    load_sensor,
+    simulate,
+)
+from lidarpool.run.identity import difference, identity_of
+from lidarpool.run.job import Job
+
+SURVEY = Survey(
+    Sensor.grid(rays_per_revolution=360, layers=40, step_deg=1, max_range_m=60),
+    [(0, 0, 1), (1, 0, 2)],
+    steps=180,
+    keep_every=1,
+    columns=["range", "intensity", "return_number", "returns", "class"],
+    materials=[
+        Material("*", 0.4, semantic_class=300),
+        Material(["V*", "S*"], 0.1, transparent="pass"),
+        Material("Bowl", transparent="mirror"),
+    ],
+    returns=Returns("dual", subrays=7, divergence_mrad=20, pulse_ns=2),
+    noise=Noise(0.02, 0.001, 0.05, dropout=0.1, detection_range_m=80, seed=5),
+    visibility_km=2,
+)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(cluster_client) -> Cloud:
+    return simulate(Scene.seed(), SURVEY, client=cluster_client).cloud
+
+
+def test_another_cluster_and_other_batches_give_the_same_bytes(
+    monkeypatch, undisturbed, same_cloud
+):
+    assert set(undisturbed["returns"].tolist()) == {1, 2}
+    assert set(undisturbed["class"].tolist()) == {0, 300}
+    monkeypatch.setattr(lidarpool.scan.driver.SurveyDriver, "_wished_scans", lambda *_: 7)
+    with (
+        thread_cluster({"GPU": 2}, {"LIDAR": 5}) as cluster,
+        Client(cluster, set_as_default=False) as client,
+    ):
+        assert same_cloud(simulate(Scene.seed(), SURVEY, client=client).cloud, undisturbed)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("small_batches")
+def test_a_killed_worker_leaves_no_trace(client, undisturbed, same_cloud):
+    killed: list[int] = []
+
+    def on_frame(frame: Frame) -> None:
+        if frame.scan == 50:
+            gpu = [
+                a for a, w in client.scheduler_info()["workers"].items() if "GPU" in w["resources"]
+            ]
+            killed.append(client.run(os.getpid, workers=gpu[:1])[gpu[0]])
+            os.kill(killed[0], signal.SIGKILL)
+
+    assert same_cloud(
+        simulate(Scene.seed(), SURVEY, client=client, on_frame=on_frame).cloud, undisturbed
+    )
+    assert killed
+
+
+OTHERS = {
+    "materials": (Material("*", 0.3),),
+    "returns": Returns("all"),
+    "noise": Noise(0.02, seed=6),
+    "visibility_km": 1.0,
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_a_run_with_others_is_not_resumed(name):
+    job = Job(Scene.seed(), SURVEY)
+    other = Job(Scene.seed(), replace(SURVEY, **{name: OTHERS[name]}))
+    same = Job(Scene.seed(), replace(SURVEY, steps=180))
+    assert difference(identity_of(job), identity_of(same)) == ""
+    assert difference(identity_of(job), identity_of(other)) == "it is of another survey"
+
+
+def test_a_sensor_says_how_finely_points_are_rounded(cluster_client):
+    puck = Survey(load_sensor("velodyne/vlp16"), [(0, 0, 1)], steps=2)
+    assert puck.precision_m == 0.002
+    cells = simulate(Scene.seed(), puck, client=cluster_client).cloud.positions / 0.002
+    assert np.allclose(cells, np.rint(cells), atol=1e-4)
+    assert Survey(poses=[(0, 0, 1)]).precision_m == 0.01
