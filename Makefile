@@ -4,52 +4,54 @@ BIN := $(VENV)/bin
 OUT ?= lidarpool-out
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test slow compat chaos soak lint docs format bench clean
+.PHONY: help demo test slow sample compat chaos soak lint docs format bench clean dev
 
 help:  ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /\1\t/' | expand -t 10
+
+dev:
+	@VENV=$(VENV) sh .ci/setup dev
 
 demo:  ## run the default survey on a local cluster; results in $(OUT)/
 	@VENV=$(VENV) sh .ci/setup run
 	$(BIN)/lidarpool demo --out $(OUT)
 
-test:  ## run the test suite
-	@VENV=$(VENV) sh .ci/setup dev
-	$(BIN)/python -m pytest
+# Whole runs wait for processes and timers: three processes keep two cores busy. The tests of a
+# file stay together, for they share clusters; files come in the order of testpaths.
+PARALLEL := -n 3 --dist loadfile --no-loadscope-reorder
 
-slow:  ## the tests that take minutes, which `test` leaves out
-	@VENV=$(VENV) sh .ci/setup dev
+test: dev  ## run the test suite
+	$(BIN)/python -m pytest $(PARALLEL)
+
+slow: dev  ## the tests that take minutes, which `test` leaves out
 	$(BIN)/python -m pytest -m slow
+
+sample: dev  ## of the slow tests, one of each kind
+	$(BIN)/python -m pytest -m sample -n 2 --dist loadfile  # a browser draws with the processor
 
 compat:  ## poolpart's tests with the lowest and the newest Dask, and with Dask's main
 	@sh .ci/compat
 
-chaos:  ## 200 faults, every kind at every point of a survey; SEED=n plays them again
-	@VENV=$(VENV) sh .ci/setup dev
+chaos: dev  ## 200 faults, every kind at every point of a survey; SEED=n plays them again
 	$(BIN)/python -m tests.chaos --faults 200 $(if $(SEED),--seed $(SEED))
 
-soak:  ## 10,000 scans with a worker killed every few seconds; memory as a picture in $(OUT)/
-	@VENV=$(VENV) sh .ci/setup dev
+soak: dev  ## 10,000 scans with a worker killed every few seconds; memory as a picture in $(OUT)/
 	$(BIN)/python -m tests.chaos.soak --picture $(OUT)/soak.png
 
-lint: docs  ## format check, lint, types, layer contracts, documentation
-	@VENV=$(VENV) sh .ci/setup dev
+lint: dev docs  ## format check, lint, types, layer contracts, documentation
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-docs:  ## the documentation as a site in build/site; a warning is an error
-	@VENV=$(VENV) sh .ci/setup dev
+docs: dev  ## the documentation as a site in build/site; a warning is an error
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
-format:  ## rewrite the sources in the project's format
-	@VENV=$(VENV) sh .ci/setup dev
+format: dev  ## rewrite the sources in the project's format
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-bench:  ## benchmarks: pipeline, planning, live page, ray casting; figures of the last in build/ as JSON
-	@VENV=$(VENV) sh .ci/setup dev
+bench: dev  ## benchmarks: pipeline, planning, live page, ray casting; figures of the last in build/ as JSON
 	$(BIN)/python -m benchmarks.pipeline
 	$(BIN)/python -m benchmarks.scale
 	$(BIN)/python -m benchmarks.planning

@@ -7,25 +7,17 @@ from typing import Any
 
 import numpy as np
 
-from raybeam import Pattern, RayCaster, cuda_build
+from raybeam import Pattern, RayCaster
 from raybeam.cuda_backend import CudaBackend
 from raybeam.layout import lay_out
-from raybeam.mesh import LocalMesh, local_mesh
+from raybeam.mesh import LocalMesh
 from raybeam.scan import check_scan
 
-from .cuda_scenes import Float, city, revolution, six_objects
+from .cuda_scenes import Float, revolution, six_objects
 from .cuda_timing import milliseconds, wall_milliseconds
 
-CROSSOVER = (100, 1_000, 4_000, 16_000, 64_000)  # triangles
 
-
-def build_on_device(cupy: Any, mesh: LocalMesh, repeats: int) -> dict[str, float]:
-    """Time cuda_build.build."""
-    device = cupy.cuda.Device().id
-    return wall_milliseconds(cupy, lambda: cuda_build.build(cupy, device, mesh), repeats)
-
-
-def build_on_host(cupy: Any, mesh: LocalMesh) -> float:
+def build(cupy: Any, mesh: LocalMesh) -> float:
     """Milliseconds of a build by NumPy, the way to the device included."""
     start = time.perf_counter()
     made = lay_out(mesh)
@@ -37,25 +29,11 @@ def build_on_host(cupy: Any, mesh: LocalMesh) -> float:
     return took
 
 
-def crossover(cupy: Any) -> list[dict[str, float]]:
-    """Time both builds on small meshes."""
-    rows = []
-    for size in CROSSOVER:
-        mesh = local_mesh(*city(size))
-        host = min(build_on_host(cupy, mesh) for _ in range(3))
-        device = build_on_device(cupy, mesh, 5)["median"]
-        rows.append({"triangles": len(mesh.corners), "device_ms": device, "host_ms": host})
-    return rows
-
-
 def transfers(cupy: Any, size: int = 1 << 26) -> dict[str, float]:
     """GB/s between host and device, and on the device: what bounds a scan's way to the host."""
     array = cupy.empty(size, np.uint8)
-    block = cupy.cuda.PinnedMemory(size)
-    pinned = np.ndarray((size,), np.uint8, cupy.cuda.PinnedMemoryPointer(block, 0))
     plain = np.zeros(size, np.uint8)
     calls = {
-        "to_pinned": lambda: array.get(out=pinned),
         "to_touched": lambda: array.get(out=plain),
         "to_fresh": array.get,
         "from_plain": lambda: array.set(plain),
@@ -118,7 +96,7 @@ def attributes(engine: CudaBackend) -> dict[str, dict[str, int]]:
     """Look up registers and local memory of the kernels that walk."""
     out = {}
     for name in ("cast_table", "cast_pattern"):
-        kernel = engine._kernels.module.get_function(name)
+        kernel = engine._module.get_function(name)
         out[name] = {
             "registers": int(kernel.num_regs),
             "local_bytes": int(kernel.local_size_bytes),

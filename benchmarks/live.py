@@ -25,7 +25,7 @@ from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
 from lidarpool import Planning, Scene, Sensor, Survey
-from lidarpool.live import live_run
+from lidarpool.live.run_page import live_run
 from lidarpool.run.job import Job
 from lidarpool.run.local import local_cluster
 from lidarpool.run.run import Run

@@ -29,9 +29,8 @@ def planning_of(discs: int, **search: int) -> Planning:
 def seconds_of_evaluations(planning: Planning) -> float:
     """Seconds of as many evaluations as a trial makes, of paths in mid-search."""
     swarm = prepare_swarm(planning, PathAxes(planning.start, planning.target), seed=0)
-    costs = np.empty(swarm.groups, np.float32)
     for _ in range(min(20, planning.iterations)):
-        swarm.step(costs)
+        swarm.step()
     begun = time.thread_time()
     for _ in range(planning.iterations):
         swarm.paths.evaluate()

@@ -1,11 +1,12 @@
 """What poses cost: `python -m benchmarks.raycast_moving`.
 
-Three things are timed in turns, for lidars of several numbers of beams, each with the same rays
+Four things are timed in turns, for lidars of several numbers of beams, each with the same rays
 and one thread:
 
 - bare: directions rotated in float32 by BLAS, into an array made before, and Open3D's cast_rays;
 - still: `RayCaster.scan` from one pose with a rotation, of whose hits every fifth is kept;
-- moving: the same with a pose for each firing.
+- moving: the same with a pose for each firing;
+- late: the same with beams that are fired one after the other, from where the lidar is then.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from raybeam import Pattern, RayCaster, available_backends
+from raybeam import Motion, Pattern, RayCaster, available_backends
 from raybeam.embree_backend import EmbreeBackend
 from raybeam.mesh import local_mesh
 
@@ -27,7 +28,7 @@ from .cuda_scenes import city
 
 Float = NDArray[np.float64]
 
-BEAMS = (40, 64, 128)
+BEAMS = (16, 64, 128)
 _KEEP_EVERY = 5
 _CLOCKS = {"wall": time.perf_counter, "cpu": time.process_time}
 _LIMITS = {"no limits": {}, "0.5 to 100 m": {"t_min": 0.5, "t_max": 100.0}}
@@ -104,14 +105,19 @@ def _measured(
     pattern, (positions, rotations) = Pattern(directions), track(len(directions) // beams)
     middle = len(positions) // 2
     one, more = (positions[middle], rotations[middle]), {"keep_every": _KEEP_EVERY, **_LIMITS[kind]}
+    speeds = np.gradient(positions, 1e-4, axis=0)
+    motion = Motion(np.linspace(0, 5e-5, beams), speeds, np.full_like(speeds, 0.3))
     calls: dict[str, Callable[[], Any]] = {
         "bare": lambda: bare(*one),
         "still": lambda: caster.scan(pattern, *one, **more),
         "moving": lambda: caster.scan(pattern, positions, rotations, rays_per_pose=beams, **more),
+        "late": lambda: caster.scan(
+            pattern, positions, rotations, rays_per_pose=beams, motion=motion, **more
+        ),
     }
     seconds: dict[str, list[float]] = {name: [] for name in calls}
     for turn in range(rounds + 1):
-        names = list(calls)[turn % 3 :] + list(calls)[: turn % 3]
+        names = list(calls)[turn % 4 :] + list(calls)[: turn % 4]
         for name in names:
             start = clock()
             calls[name]()
@@ -127,6 +133,7 @@ def _measured(
         "seconds": seconds,
         "still_to_bare": _ratio(seconds, "still", "bare"),
         "moving_to_still": _ratio(seconds, "moving", "still"),
+        "late_to_still": _ratio(seconds, "late", "still"),
     }
 
 
@@ -141,7 +148,8 @@ def show(row: dict[str, Any]) -> None:
     print(
         f"{row['beams']:>4} beams, {row['rays']:,} rays, {row['triangles']:,} triangles, "
         f"{row['limits']}, hits {100 * row['hit_share']:.0f} %: bare {ms['bare']:.2f} ms; "
-        f"still {row['still_to_bare']:.3f} x bare; moving {row['moving_to_still']:.3f} x still"
+        f"still {row['still_to_bare']:.3f} x bare; moving {row['moving_to_still']:.3f} x still; "
+        f"late {row['late_to_still']:.3f} x still"
     )
 
 

@@ -1,0 +1,94 @@
+"""The peers' side of benchmarks/sensors.py, in their Python: needs NumPy and the one that is named.
+
+It builds its tree, says "ready" and its version, then casts once for each line that comes in.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+Job = dict[str, Any]
+
+
+def mujoco_caster(job: Job) -> Callable[[], int]:
+    """Cast the rays of each firing with one call: they all leave from one place."""
+    import mujoco
+
+    spec = mujoco.MjSpec()
+    spec.add_mesh(
+        name="scene",
+        uservert=job["vertices"].astype(np.float32).ravel(),
+        userface=job["faces"].astype(np.int32).ravel(),
+        inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
+    )
+    mesh = mujoco.mjtGeom.mjGEOM_MESH
+    spec.worldbody.add_geom(type=mesh, meshname="scene", contype=0, conaffinity=0)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    origins = np.ascontiguousarray(job["origins"])
+    beams = len(job["directions"]) // len(origins)
+    rays = np.ascontiguousarray(job["directions"].reshape(len(origins), 3 * beams))
+    geom, distance = np.empty((len(origins), beams), np.int32), np.empty((len(origins), beams))
+
+    def cast() -> int:
+        for k in range(len(origins)):
+            mujoco.mj_multiRay(
+                model, data, origins[k], rays[k], None, True, -1, geom[k], distance[k], None,
+                beams, 1e10,
+            )  # fmt: skip
+        return int((distance >= 0).sum())
+
+    return cast
+
+
+def helios_caster(job: Job) -> Callable[[], int]:
+    """Let it make a spinning scan of its own, with as many rays, on the same way."""
+    from pyhelios import Context, LiDARCloud
+
+    context, cloud = Context(), LiDARCloud()
+    context.addTrianglesFromArrays(
+        job["vertices"].astype(np.float32), job["faces"].astype(np.int32)
+    )
+    cloud.disableMessages()
+    firings, seconds = len(job["origins"]), float(job["seconds"])
+    cloud.addScanSpinning(
+        job["elevations"].tolist(),
+        2 * np.pi * float(job["turned"]) / firings,
+        len(job["directions"]) / seconds,
+        [0.0, seconds],
+        job["way"].tolist(),
+        [[0, 0, 0, 1], [0, 0, 0, 1]],
+    )
+
+    def cast() -> int:
+        cloud.syntheticScan(context, record_misses=False)
+        return int(cloud.getHitCount())
+
+    return cast
+
+
+CASTERS = {"mujoco": mujoco_caster, "pyhelios3d": helios_caster}
+
+
+def main() -> None:
+    """Answer each line on standard input with the time of one turn."""
+    name, path, clock = sys.argv[1:]
+    now = {"wall": time.perf_counter, "cpu": time.process_time}[clock]
+    cast = CASTERS[name](dict(np.load(path)))
+    print("ready", version(name), flush=True)
+    for _ in sys.stdin:
+        start = now()
+        hits = cast()
+        print(json.dumps({"seconds": now() - start, "hits": hits}), flush=True)
+
+
+if __name__ == "__main__":
+    main()
