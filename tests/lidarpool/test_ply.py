@@ -17,6 +17,7 @@ from lidarpool.columns.cloud import Cloud
 from lidarpool.columns.table import Column
 from lidarpool.export import ply
 from lidarpool.export.ply import read_cloud, save_cloud
+from raybeam.open3d_module import load_open3d
 
 
 def sample(count, *, offset=0.0, seed=1):
@@ -69,7 +70,7 @@ def test_georeferenced_points_are_kept_in_double_precision(tmp_path):
 
 
 def test_open3d_reads_it_and_an_empty_one_has_the_same_properties(tmp_path):
-    open3d = pytest.importorskip("open3d")
+    open3d = load_open3d()
     given = sample(7)
     save_cloud(tmp_path / "c.ply", given)
     cloud = open3d.t.io.read_point_cloud(str(tmp_path / "c.ply"))
