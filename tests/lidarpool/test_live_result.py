@@ -12,7 +12,7 @@ from lidarpool.columns.table import CHANNEL, OBJECT, SCAN
 from lidarpool.export.ply_format import header, row_type
 from lidarpool.live.page import live_page
 from lidarpool.live.result_page import ResultFile, ResultView, view_result
-from lidarpool.live.surface import MeshNode, Surface, coloured_mesh
+from lidarpool.live.surface import Surface, coloured_mesh
 from lidarpool.plan import Plan
 from lidarpool.run.picture_file import PICTURE_FILE, Pictured, SensorWay
 from lidarpool.scene.actors import Actor, box
@@ -34,16 +34,13 @@ def write(path, positions, scans=100):
     return path
 
 
-# -- the points ---------------------------------------------------------------------------
-
-
 def test_scans_are_chosen_and_thinned(tmp_path):
     x = np.arange(50_000) // 500
     file = ResultFile(write(tmp_path / "a.ply", np.column_stack([x, 0 * x, 0 * x])))
     assert (len(file), file.scans) == (50_000, (0, 99))
     cloud, count = file.choose(20, 29, 10_000)
     assert count == len(cloud) == 5_000
-    assert (cloud["scan"].min(), cloud["scan"].max()) == (20, 29)
+    assert np.unique(cloud["scan"]).tolist() == list(range(20, 30))
     cloud, count = file.choose(0, 99, 4_000)
     assert (count, len(cloud)) == (50_000, 4_000)
     assert np.bincount(cloud["scan"]).min() >= 35
@@ -60,17 +57,15 @@ def test_no_points_and_points_that_are_nowhere_are_no_reason_to_fail(tmp_path):
 
 def test_columns_that_nobody_knows_are_in_the_menu(tmp_path, page):
     """A cloud of another program, without scans."""
-    row = np.dtype([(a, "<f4") for a in "xyz"] + [("nx", "<f4"), ("2-a", "|u1"), ("ring", "<u2")])
-    lines = ["property float x", "property float y", "property float z", "property float nx"]
-    lines += ["property uchar 2-a", "property ushort ring"]
-    rows = np.zeros(20, row)
+    rows = np.zeros(20, [*((a, "<f4") for a in ("x", "y", "z", "nx")), ("2-a", "|u1")])
     rows["x"] = rows["nx"] = np.arange(20)
+    lines = [*(f"property float {a}" for a in ("x", "y", "z", "nx")), "property uchar 2-a"]
     head = ["ply", "format binary_little_endian 1.0", "element vertex 20", *lines, "end_header", ""]
     (tmp_path / "theirs.ply").write_bytes("\n".join(head).encode() + rows.tobytes())
     file = ResultFile(tmp_path / "theirs.ply")
     view = ResultView(page, file)
     view.draw()
-    assert view._view._colour.options == ("z", "channel", "nx")
+    assert view._view._colour.options == ("z", "nx")
     assert view._scans is None
     assert file.choose(*file.scans, 100)[0]["nx"].tolist() == list(range(20))
 
@@ -84,9 +79,6 @@ def test_what_is_no_result_is_refused(tmp_path):
         (tmp_path / "cut.ply").write_bytes(b"ply\n")
         with pytest.raises(LidarpoolError, match=words):
             view_result(tmp_path / name, port=0, browser=False)
-
-
-# -- the page -----------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -226,9 +218,6 @@ def test_damaged_pictures_are_noted_and_the_cloud_is_shown(cloud, capsys, monkey
     assert "shows 10,000 points" in said
 
 
-# -- the scene ----------------------------------------------------------------------------
-
-
 def test_triangles_come_back_from_their_file_in_their_colours():
     corners = np.random.default_rng(0).random((7, 3, 3)).astype(np.float32)
     colours = np.arange(21, dtype=np.uint8).reshape(7, 3) * 12
@@ -257,36 +246,3 @@ def test_many_triangles_become_few_that_keep_shape_and_hits():
     assert not vivid[~there].any()
     assert "hits per square metre" in legend
     assert len(Surface(scene).corners) == len(scene.faces)  # few enough
-
-
-def test_what_rises_above_the_cut_is_pressed_down_to_it():
-    surface = Surface(Scene.seed())
-    corners, kept = surface.below(1.5)
-    assert corners[:, :, 2].max() == 1.5
-    assert kept.sum() == len(corners) < len(surface.corners)
-    assert np.array_equal(corners[:, :, :2], surface.corners[kept][:, :, :2])
-    assert surface.below(None)[1].all()
-    assert surface.corners[:, :, 2].max() > 1.5
-
-
-def test_floor_and_roof_are_found_and_the_sky_is_none(pictured):
-    local = pictured.sensors[0].positions
-    assert Surface(pictured.scene).around(local) == pytest.approx((0, 3))
-    assert Surface(Scene.seed()).around(np.array([[0.0, 0, 1]])) == (None, None)
-
-
-def test_a_mesh_is_never_gone_while_another_comes_and_none_is_left_over(page):
-    node = MeshNode(page, "/scene")
-    corners = np.random.default_rng(0).random((3, 3, 3)).astype(np.float32)
-    shown = []
-    for number in range(4):
-        node.show(corners, np.full((3, 3), 10 * number, np.uint8), True)
-        shown.append(scenes(page))
-        node.settle()
-    assert [len(meshes) for meshes in shown] == [1, 2, 2, 2]
-    assert set(shown[1]) & set(shown[2])
-    node._alone_at = 0.0
-    node.settle()
-    assert len(scenes(page)) == 1
-    node.show(corners[:0], np.zeros((0, 3), np.uint8), True)
-    assert scenes(page) == []

@@ -1,9 +1,8 @@
 import hashlib
 import os
-import pickle
 import subprocess
 import sys
-import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,16 +10,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from lidarpool.base.errors import LidarpoolError
-from lidarpool.plan import (
-    Plan,
-    Planning,
-    Trial,
-    best,
-    run_trial,
-    shortest_path_length,
-)
-from lidarpool.plan.geometry import clearance, path_length, segment_distances
-from lidarpool.plan.randoms import Randoms, Windows
+from lidarpool.plan import Planning, Trial, best, run_trial, shortest_path_length
+from lidarpool.plan.geometry import clearance, segment_distances
 
 SEED_SCENE = [(-20, -20), (20, -20), (-20, 20), (20, 20), (-10, -5), (5, 5)]
 DEFAULT = Planning((25, 25), (-30, -20), SEED_SCENE, 2.0)
@@ -34,9 +25,6 @@ def bits(trial):
 def fingerprint():
     """Of a few trials; run by this test in other processes too, so it imports nothing local."""
     return hashlib.sha256(b"".join(bits(run_trial(SMALL, n)) for n in range(3))).hexdigest()
-
-
-# --- the default problem
 
 
 def test_default_problem_for_many_seeds():
@@ -88,14 +76,6 @@ def test_georeferenced_and_tiny_scenes_give_the_same_plan():
         assert plan.length == pytest.approx(scale * 71.2034, rel=1e-3)
 
 
-def test_without_discs_the_path_is_straight():
-    planning = Planning((0, 0), (3, 4), particles=100, iterations=200)
-    plan = best([run_trial(planning, 0)], planning)
-    assert plan.collision_free
-    assert plan.clearance == np.inf
-    assert plan.length == pytest.approx(5, rel=1e-5)
-
-
 @pytest.mark.parametrize("particles", [1, 2, 19, 97, 100])
 @pytest.mark.parametrize("waypoints", [1, 4])
 def test_any_number_of_particles_runs(particles, waypoints):
@@ -105,19 +85,6 @@ def test_any_number_of_particles_runs(particles, waypoints):
     trial = run_trial(planning, 0)
     assert trial.waypoints.shape == (waypoints, 2)
     assert np.isfinite(trial.waypoints).all()
-
-
-# --- what a trial says
-
-
-def test_a_trial_says_what_it_found():
-    trial = run_trial(SMALL, 4)
-    path = np.vstack([SMALL.start, trial.waypoints, SMALL.target])
-    assert trial.trial == 4
-    assert trial.length == path_length(path)
-    assert trial.collision_free == (clearance(path, SMALL.centres, SMALL.radii) >= 0)
-    assert trial.seconds > 0
-    assert len(pickle.dumps(trial)) < 2000
 
 
 def test_a_trial_does_not_claim_a_path_that_collides():
@@ -133,45 +100,12 @@ def test_a_trial_does_not_claim_a_path_that_collides():
     assert any(-0.5 < room < 0 for room in rooms)
 
 
-# --- the same seeds, the same bits
-
-
 def test_trials_differ_and_repeat():
-    trials = [run_trial(SMALL, number) for number in range(4)]
-    assert len({trial.seed for trial in trials}) == 4
-    assert len({bits(trial) for trial in trials}) == 4
-    assert [bits(run_trial(SMALL, number)) for number in range(4)] == [bits(t) for t in trials]
-
-
-def test_a_seed_changes_every_trial():
-    other = Planning(
-        SMALL.start, SMALL.target, SEED_SCENE, 2.0, particles=60, iterations=40, seed=8
-    )
-    assert bits(run_trial(other, 0)) != bits(run_trial(SMALL, 0))
-
-
-def test_global_random_state_is_neither_read_nor_written():
+    trials = [bits(run_trial(SMALL, number)) for number in range(4)]
+    trials.append(bits(run_trial(replace(SMALL, seed=8), 0)))
+    assert len(set(trials)) == 5
     np.random.seed(1)  # noqa: NPY002
-    before = pickle.dumps(np.random.get_state())  # noqa: NPY002
-    first = bits(run_trial(SMALL, 0))
-    assert pickle.dumps(np.random.get_state()) == before  # noqa: NPY002
-    np.random.seed(2)  # noqa: NPY002
-    assert bits(run_trial(SMALL, 0)) == first
-
-
-def test_trials_side_by_side_in_threads_do_not_meet():
-    alone = [bits(run_trial(SMALL, number)) for number in range(6)]
-    together = [b""] * 6
-
-    def work(number):
-        together[number] = bits(run_trial(pickle.loads(pickle.dumps(SMALL)), number))
-
-    threads = [threading.Thread(target=work, args=(number,)) for number in range(6)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert together == alone
+    assert [bits(run_trial(SMALL, number)) for number in range(4)] == trials[:4]
 
 
 def test_another_process_without_wide_vector_instructions_gives_the_same_bits():
@@ -197,42 +131,6 @@ def test_the_bits_are_these():
     assert first == ["0x1.c55f991800000p+3", "0x1.31abf2fc00000p+4"]
 
 
-# --- random numbers
-
-
-def test_uniform_numbers():
-    numbers = Randoms(5).uniform(100_000)
-    assert numbers.dtype == np.float32
-    assert numbers.min() >= 0
-    assert numbers.max() < 1
-    assert numbers.mean() == pytest.approx(0.5, abs=0.005)
-    assert numbers.var() == pytest.approx(1 / 12, rel=0.02)
-
-
-def test_normal_numbers():
-    numbers = Randoms(5).normal(100_000)
-    assert numbers.dtype == np.float32
-    assert abs(numbers).max() < 3.5
-    assert numbers.mean() == pytest.approx(0, abs=0.02)
-    assert numbers.var() == pytest.approx(1, rel=0.02)
-    # The fourth moment of four uniform numbers: 3 - 1.2 / 4; a uniform one's is 1.8.
-    assert (numbers.astype(float) ** 4).mean() == pytest.approx(2.7, abs=0.05)
-
-
-def test_windows_lie_in_the_table_and_reach_both_its_ends():
-    table = np.arange(13, dtype=np.float32)
-    windows = Windows(table, 10, Randoms(1))
-    starts = set()
-    for _ in range(200):
-        window = windows.draw()
-        assert np.array_equal(window, np.arange(window[0], window[0] + 10))
-        starts.add(int(window[0]))
-    assert starts == {0, 1, 2, 3}
-
-
-# --- the best of the trials
-
-
 def trial_of(number, waypoints):
     return Trial(
         trial=number, seed=0, length=-1.0, waypoints=np.array(waypoints, float),
@@ -251,30 +149,19 @@ def test_the_shortest_free_path_wins_whatever_the_order():
     trials = [trial_of(n, w) for n, w in enumerate([CROSSES, FREE_AND_LONG, FREE, GRAZES, FREE])]
     for order in (trials, trials[::-1]):
         plan = best(order, ONE_DISC)
-        assert isinstance(plan, Plan)
-        assert plan.trial == 2
-        assert plan.trials == 5
-        assert plan.collision_free
+        assert (plan.trial, plan.trials, plan.collision_free) == (2, 5, True)
         assert plan.path.tolist() == [[0, 0], [2, 3], [8, 3], [10, 0]]
         assert plan.length == pytest.approx(6 + 2 * np.sqrt(13))
-        assert plan.clearance == pytest.approx(
-            (segment_distances(plan.path[:-1], plan.path[1:], np.array([[5, 0]])) - 2).min()
-        )
+        assert plan.clearance == pytest.approx(1)
         assert plan.excess == pytest.approx(plan.length / plan.shortest_possible - 1)
-        assert plan.excess > 0
-
-
-def test_trials_are_not_taken_at_their_word():
-    """`collision_free` and `length` of a trial are worked out again."""
-    plan = best([trial_of(0, CROSSES), trial_of(1, FREE)], ONE_DISC)
-    assert plan.trial == 1
 
 
 def test_where_no_path_is_free_the_plan_says_so():
     plan = best([trial_of(0, CROSSES), trial_of(1, GRAZES)], ONE_DISC)
-    assert plan.trial == 1
-    assert not plan.collision_free
+    assert (plan.trial, plan.collision_free) == (1, False)
     assert plan.clearance == pytest.approx(-0.5)
+    with pytest.raises(LidarpoolError, match="No planning trial was finished"):
+        best([], ONE_DISC)
 
 
 def test_an_enclosed_start_ends_in_an_honest_plan():
@@ -288,21 +175,10 @@ def test_an_enclosed_start_ends_in_an_honest_plan():
     assert np.isfinite(plan.path).all()
 
 
-def test_no_trials_is_an_error():
-    with pytest.raises(LidarpoolError, match="No planning trial was finished"):
-        best([], ONE_DISC)
-
-
-# --- the benchmark
-
-
 def test_the_benchmark_runs(capsys):
     from benchmarks import planning as benchmark
 
     options = "--repeats 2 --particles 40 --iterations 5 --discs 0 6 8 --waypoints 2"
     benchmark.main(options.split())
-    lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 4
-    assert lines[0].split()[:2] == ["discs", "waypoints"]
-    assert [line.split()[0] for line in lines[1:]] == ["0", "6", "8"]
-    assert all(float(line.split()[4]) > 0 for line in lines[1:])
+    lines = capsys.readouterr().out.splitlines()[1:]
+    assert [line.split()[0] for line in lines] == ["0", "6", "8"]

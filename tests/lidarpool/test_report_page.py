@@ -6,13 +6,13 @@ import base64
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
+from lxml import html
 
 from lidarpool import Cloud, Planning, Result, Scene, Survey
 from lidarpool.base.task_book import TaskBook
@@ -29,61 +29,14 @@ from lidarpool.scene.mesh import Mesh
 from lidarpool.sensor import Sensor
 from poolpart import TaskRecord
 
-VOID = {"meta", "img", "br", "link", "input"}
 EVIL = (
     "\"'><script>alert(1)</script><img src=//evil.test/x onerror=y>&amp;{{ 7*7 }}\u202e\x00\udc80"
 )
 PICTURES = ["scene.png", "intensity.png", "cloud.png", "path.png"]
 SCENARIO = Scenario.from_data({"steps": 35}, source="surveys/hall.yaml")
-EPOCH = 1.7e9
-
-
-class Page(HTMLParser):
-    """A page as its parser sees it; every element has to be closed."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.elements: list[tuple[str, dict[str, str]]] = []
-        self.text: list[str] = []  # of each element, by its number
-        self._open: list[int] = []
-        self.feed(text)
-        self.close()
-        assert not self._open
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.elements.append((tag, {name: value or "" for name, value in attrs}))
-        self.text.append("")
-        if tag not in VOID:
-            self._open.append(len(self.elements) - 1)
-
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.elements.append((tag, {name: value or "" for name, value in attrs}))
-        self.text.append("")
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.elements[self._open.pop()][0] == tag
-
-    def handle_data(self, data: str) -> None:
-        for number in self._open:
-            self.text[number] += data
-
-    def all(self, tag: str, class_: str | None = None) -> list[int]:
-        """Numbers of the elements of a kind."""
-        return [
-            number
-            for number, (name, attributes) in enumerate(self.elements)
-            if name == tag and (class_ is None or class_ in attributes.get("class", "").split())
-        ]
-
-    def texts(self, tag: str, class_: str | None = None) -> list[str]:
-        return [" ".join(self.text[number].split()) for number in self.all(tag, class_)]
-
-    def attributes(self, tag: str, name: str) -> list[str]:
-        return [self.elements[n][1][name] for n in self.all(tag) if name in self.elements[n][1]]
-
-    def pairs(self) -> dict[str, str]:
-        """All descriptions with what they describe."""
-        return dict(zip(self.texts("dt"), self.texts("dd"), strict=True))
+PLANNING = Planning((0, 0), (10, 0), [(5, 0)], 2.0, trials=3, particles=20, iterations=30)
+RING = [(10 + 3 * np.cos(a), 3 * np.sin(a)) for a in np.arange(0, 6.28, 0.5)]
+ENCLOSED = Planning((0, 0), (10, 0), RING, 1.5, trials=2, particles=10, iterations=5)
 
 
 def records(workers: int = 1, tasks: int = 20, prefix: str = "") -> list[TaskRecord]:
@@ -91,9 +44,7 @@ def records(workers: int = 1, tasks: int = 20, prefix: str = "") -> list[TaskRec
 
     def record(stage: str, partition: str, worker: str, start: float, stop: float) -> TaskRecord:
         name, items = f"{prefix}{partition}-{worker}", 1 if stage == TRIAL else 6
-        return TaskRecord(
-            stage, partition, name, (partition,), EPOCH + start, EPOCH + stop, items=items
-        )
+        return TaskRecord(stage, partition, name, (partition,), start, stop, items=items)
 
     long = [(GENERATE, 1, 5), (SORT, 1.5, 6), (COLLECT, 1.6, 6.1), (COLLECT, 1.7, 6.2)]
     of = np.random.default_rng(3).integers(0, workers, tasks)
@@ -104,11 +55,6 @@ def records(workers: int = 1, tasks: int = 20, prefix: str = "") -> list[TaskRec
         at = 10 * number / tasks
         made.append(record(TRIAL, "OTHER", str(of[number]), at, at + 9 / tasks))
     return made
-
-
-@pytest.fixture(scope="module")
-def planning() -> Planning:
-    return Planning((0, 0), (10, 0), [(5, 0)], 2.0, trials=3, particles=20, iterations=30)
 
 
 def scene_of(names: Sequence[str]) -> Scene:
@@ -136,14 +82,14 @@ def cloud_of(points: int, objects: int, scans: int, layers: int) -> Cloud:
 
 
 @pytest.fixture
-def write(tmp_path: Path, planning: Planning) -> Callable[..., tuple[str, dict[str, Any]]]:
+def write(tmp_path: Path) -> Callable[..., tuple[str, dict[str, Any]]]:
     """Make a result up and write its page; returns the page and the report."""
 
     def write(
         names: Sequence[str] = ("Tower", "Wall"),
         points: int = 500,
         tasks: Sequence[TaskRecord] = tuple(records()),
-        plan: Planning | None = planning,
+        plan: Planning | None = PLANNING,
         scenario: Scenario | None = SCENARIO,
         origin: tuple[float, float, float] = (0, 0, 0),
         **changes: Any,
@@ -188,43 +134,20 @@ def write(tmp_path: Path, planning: Planning) -> Callable[..., tuple[str, dict[s
     return write
 
 
-# -- it needs nothing and nobody -----------------------------------------------------------------
-
-
-def test_the_page_refers_to_nothing_outside(write):
+def test_the_page_refers_to_nothing_outside_and_has_its_pictures_within(write, tmp_path):
     text, _ = write()
-    page = Page(text)
-    references = [
-        value
-        for _, attributes in page.elements
-        for name, value in attributes.items()
-        if name in ("src", "href", "srcset", "action", "xlink:href", "poster", "data")
-    ]
-    assert len(references) == len(PICTURES)
-    assert all(reference.startswith(("data:", "#")) for reference in references)
-    assert not {"script", "link", "iframe", "object", "embed", "base"} & {
-        t for t, _ in page.elements
-    }
-    assert not [name for _, attributes in page.elements for name in attributes if name[:2] == "on"]
-    assert not re.search(r"url\(|@import|https?://", text)
-    policy = next(a["content"] for _, a in page.elements if "http-equiv" in a)
-    assert "default-src 'none'" in policy
-
-
-def test_pictures_are_within_with_captions_and_words(write, tmp_path):
-    page = Page(write()[0])
-    data = [base64.b64decode(uri.split(",")[1]) for uri in page.attributes("img", "src")]
+    page = html.fromstring(text)
+    assert not page.xpath("//script | //link | //iframe | //object | //embed | //base")
+    assert not page.xpath("//@href | //@srcset | //@action | //@poster | //@data")
+    assert not re.search(r"url\(|@import|https?://|\son\w+=", text)
+    assert "default-src 'none'" in page.xpath("//meta[@http-equiv]/@content")[0]
+    data = [base64.b64decode(uri.removeprefix("data:image/png;base64,"), validate=True)
+            for uri in page.xpath("//@src")]  # fmt: skip
     assert data == [(tmp_path / name).read_bytes() for name in PICTURES]
-    assert all(len(words) > 30 for words in page.attributes("img", "alt"))
-    assert len(page.all("figcaption")) == len(PICTURES)
 
 
 def test_names_are_words_and_never_markup(write):
-    def shape(page: Page) -> list[tuple[str, list[str]]]:
-        return [(tag, sorted(attributes)) for tag, attributes in page.elements]
-
-    notes = ("a note",)
-    tame, _ = write(("Tower", "Wall"), tasks=records(), notes=notes)
+    tame, _ = write(notes=("a note",))
     evil, _ = write(
         (EVIL, "Wall"),
         tasks=records(prefix=EVIL),
@@ -232,59 +155,41 @@ def test_names_are_words_and_never_markup(write):
         notes=(EVIL,),
         backend=EVIL,
     )
-    assert shape(Page(evil)) == shape(Page(tame))
-    page = Page(evil)
-    assert page.texts("h1")[0].startswith("Lidar survey: x onerror=y>&amp;{{ 7*7 }}")
-    assert any(text.startswith("\"'><script>alert(1)") for text in page.texts("th"))
+    shapes = [
+        [(element.tag, *sorted(element.keys())) for element in html.fromstring(text).iter()]
+        for text in (tame, evil)
+    ]
+    assert shapes[0] == shapes[1]
+    assert html.fromstring(evil).findtext(".//h1").startswith("Lidar survey: x onerror=y>&amp;{{ 7")
     assert not set("\u202e\x00\udc80") & set(evil)
-
-
-# -- its numbers are the report's ----------------------------------------------------------------
 
 
 def test_numbers_are_those_of_the_report(write):
     text, report = write()
-    page = Page(text)
-    pairs = page.pairs()
+    page = html.fromstring(text)
+    pairs = {dt.text: dt.getnext().text for dt in page.xpath("//dl[@class='pairs']//dt")}
     assert pairs["batches offered again because a worker was lost"] == "3"
     assert pairs["scans that came twice, and were dropped"] == "17"
     assert pairs["tasks outside their partition"] == "0"
-    assert pairs["best length"] == f"{report['planning']['best_length']:.2f} m"
     assert pairs["shortest possible"] == f"{report['planning']['shortest_possible']:.2f} m"
-    assert pairs["triangles"] == str(report["parameters"]["triangles"])
-    assert pairs["numpy"] == report["versions"]["numpy"]
-    (lead,) = page.texts("p", "lead")
+    lead = page.xpath("//p[@class='lead']")[0].text_content()
     assert lead.startswith(f"120 scans from 2 positions sent {report['rays']:,} rays at 2 objects")
     assert "2,500 hit, and 500 points of them are in the cloud; 3 particle swarms" in lead
-
-
-def test_the_table_of_stages(write):
-    text, report = write()
-    rows = re.findall(r'<tr data-stage="(\w+)">(.*?)</tr>', text, re.DOTALL)
-    assert [stage for stage, _ in rows] == list(report["stages"])
-    for stage, row in rows:
-        cells, told = Page(f"<table>{row}</table>").texts("td"), report["stages"][stage]
+    rows = {row.get("data-stage"): row for row in page.xpath("//tr[@data-stage]")}
+    assert list(rows) == list(report["stages"])
+    for stage, told in report["stages"].items():
+        cells = [cell.text_content() for cell in rows[stage].findall("td")]
         assert cells[:3] == [told["partition"], str(len(told["workers"])), str(told["tasks"])]
-        assert cells[3].split() == [str(told["items"]), "trials" if stage == TRIAL else "scans"]
 
 
 def test_points_by_object_are_all_accounted_for(write):
     names = [f"Part {k}" for k in range(300)]
     text, report = write(names, points=3000)
-    rows = re.findall(
-        r'<th scope="row" title="(Part \d+)">\d+</th>'  # without what all names begin with
-        r'<td><b style="width: ([\d.]+)%"></b></td><td>([\d,]+)',
-        text,
-    )
+    rows = re.findall(r'title="(Part \d+)">\d+</th><td>.*?</td><td>([\d,]+)', text)
     assert len(rows) == OBJECTS_MOST
-    counts = [int(count.replace(",", "")) for _, _, count in rows]
+    counts = [int(count.replace(",", "")) for _, count in rows]
     assert counts == sorted(report["points_by_object"].values(), reverse=True)[:OBJECTS_MOST]
-    assert all(
-        report["points_by_object"][name] == n for (name, *_), n in zip(rows, counts, strict=True)
-    )
-    assert [float(width) for _, width, _ in rows] == [
-        pytest.approx(100 * count / counts[0], abs=0.06) for count in counts
-    ]
+    assert counts == [report["points_by_object"][name] for name, _ in rows]
     more = re.search(r"(\d+) more objects with ([\d,]+) points", text)
     missed = re.search(r"(\d+) objects? without points", text)
     assert int(more[2].replace(",", "")) == report["points"] - sum(counts)
@@ -310,124 +215,56 @@ def test_the_cloud_is_counted_in_parts():
     assert found.by_object.tolist() == np.bincount(cloud["object"]).tolist()
     for name in ("scan", "channel", "object"):
         assert found.limits[name] == (cloud[name].min(), cloud[name].max())
-    np.testing.assert_array_equal(found.bounds, cloud.bounds)
 
 
-# -- the timeline --------------------------------------------------------------------------------
+def lanes(text: str) -> list[str]:
+    """What is said of each lane of the timeline."""
+    return html.fromstring(text).xpath("//path[contains(@class, 'lane')]/title/text()")
 
 
-def lanes(page: Page) -> dict[str, list[str]]:
-    """{heading: what is said of each of its lanes}."""
-    said: dict[str, list[str]] = {}
-    for number, (tag, attributes) in enumerate(page.elements):
-        if tag == "svg" and "tasks over time" in attributes.get("aria-label", ""):
-            heading = said.setdefault(attributes["aria-label"].split(":")[0], [])
-        elif tag == "title" and page.elements[number - 1][0] == "path":
-            heading.append(page.text[number])
-    return said
-
-
-def test_rows_of_the_timeline(write):
-    page = Page(write()[0])
-    said = lanes(page)
-    assert list(said) == ["Stages", "GPU", "LIDAR", "OTHER"]
-    assert len(said["Stages"]) == 5 and said["Stages"][1].startswith("intersect: 20 tasks")
-    assert said["GPU"] == ["GPU-0: intersect, 20 tasks, 2 s"]
-    assert said["OTHER"] == ["OTHER-0: plan path, 20 tasks, 9 s"]
-    assert said["LIDAR"] == [
+def test_the_timeline_shows_who_worked_when_and_is_bounded(write):
+    text, _ = write()
+    assert lanes(text)[5:] == [
+        "GPU-0: intersect, 20 tasks, 2 s",
         "LIDAR-0: generate, 1 task, 4 s", "LIDAR-0: sort frames, 1 task, 4.5 s",
         "LIDAR-0: collect points, 2 tasks, 9 s",
+        "OTHER-0: plan path, 20 tasks, 9 s",
     ]  # fmt: skip
-
-
-def test_bars_are_where_their_tasks_were(write):
-    text, _ = write()
-    bars = re.findall(r'class="lane s-generate".*?d="([^"]*)"', text)
-    begin, end = 1 / 9.95, 5 / 9.95  # of the time from first start to last stop
+    bars = re.findall(r'class="lane s-generate".*?d="M([\d.]+) 9H([\d.]+)"', text)
+    assert len(bars) == 2  # of the stage and of its worker, between first start and last stop
     for bar in bars:
-        low, high = (float(x) for x in re.fullmatch(r"M([\d.]+) 9H([\d.]+)", bar).groups())
-        assert (low, high) == (
-            pytest.approx(1000 * begin, abs=0.1),
-            pytest.approx(1000 * end, abs=0.1),
-        )
-
-
-def test_hundreds_of_workers_and_tens_of_thousands_of_tasks(write):
+        assert [float(x) for x in bar] == pytest.approx([1000 / 9.95, 5000 / 9.95], abs=0.1)
     text, _ = write(tasks=records(workers=200, tasks=10_000))
-    page = Page(text)
-    assert len(text) < 2_000_000 and len(page.elements) < 3000
-    said = lanes(page)
-    assert {name: len(rows) for name, rows in said.items()} == {
-        "Stages": 5, "GPU": ROWS_MOST, "LIDAR": 3, "OTHER": ROWS_MOST,
-    }  # fmt: skip
-    headings = page.texts("div", "group")
-    assert headings[0] == "Stages while at least one task ran"
-    assert headings[1].startswith("GPU 200 workers, 10,000 tasks, of which 2,5")
-    assert headings[1].endswith("; the busiest 24 of 200 rows")
-    assert headings[2] == "LIDAR 1 worker, 4 tasks"
-    assert f"{20_004:,} tasks in" in text
+    assert len(text) < 2_000_000
+    assert len(lanes(text)) == 5 + 3 + 2 * ROWS_MOST
+    assert "; the busiest 24 of 200 rows" in text and f"{20_004:,} tasks in" in text
 
 
-# -- what there may not be -----------------------------------------------------------------------
+STRAY = TaskRecord(TRIAL, "OTHER", "GPU-0", ("GPU",), 0, 1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"points": 0, "hits": 0}, "has no points: no ray hit anything within range."),
+        ({"points": 1}, "1 point of them is in the cloud"),
+        ({"tasks": (), "resumed": 120}, "No task ran"),
+        ({"plan": ENCLOSED}, "none, the obstacles leave no way"),
+        ({"plan": Planning((0, 0), (10, 0), trials=1, particles=5, iterations=1)}, "there are non"),
+        ({"tasks": [*records(), STRAY]}, "A task of trial ran on GPU-0, which is not in OTHER."),
+        ({}, "has left no record"),
+    ],
+)
+def test_what_is_unusual_is_told(write, changes, words):
+    assert words in write(**changes)[0]
 
 
 def test_without_planning(write):
     text, _ = write(plan=None, tasks=[task for task in records() if task.stage != TRIAL])
-    page = Page(text)
-    assert "The path" not in page.texts("h2") and "swarm" not in text
-    assert len(page.all("img")) == 3
-    assert "at the same time" not in text
+    assert "The path" not in text and "swarm" not in text and text.count("<img") == 3
 
 
-def test_an_empty_cloud(write):
-    page = Page(write(points=0, hits=0)[0])
-    assert "The cloud has no points: no ray hit anything within range." in page.texts("p", "aside")
-
-
-def test_nothing_ran_because_an_earlier_run_had_done_all(write):
-    page = Page(write(tasks=(), resumed=120)[0])
-    assert page.pairs()["scans of an earlier run that this one went on with"] == "120"
-    assert any(text.startswith("No task ran") for text in page.texts("p", "aside"))
-
-
-def test_a_single_point(write):
-    page = Page(write(points=1)[0])
-    assert "1 point of them is in the cloud" in page.texts("p", "lead")[0]
-
-
-def test_no_way_to_the_target(write):
-    ring = [(10 + 3 * np.cos(a), 3 * np.sin(a)) for a in np.arange(0, 6.28, 0.5)]
-    closed = Planning((0, 0), (10, 0), ring, 1.5, trials=2, particles=10, iterations=5)
-    page = Page(write(plan=closed)[0])
-    assert page.pairs()["shortest possible"] == "none, the obstacles leave no way"
-    assert page.pairs()["collisions"] == "enters an obstacle"
-
-
-def test_the_straight_line_is_the_shortest(write):
-    page = Page(write(plan=Planning((0, 0), (10, 0), trials=1, particles=5, iterations=1))[0])
-    assert page.pairs()["obstacles"] == "0"
-    assert page.pairs()["least distance to an obstacle"] == "there are none"
-
-
-def test_tasks_in_the_wrong_place_are_told(write):
-    stray = TaskRecord(TRIAL, "OTHER", "GPU-0", ("GPU",), EPOCH, EPOCH + 1)
-    page = Page(write(tasks=[*records(), stray])[0])
-    (note,) = page.texts("section", "notes")
-    assert note == "A task of trial ran on GPU-0, which is not in OTHER."
-    assert "GPU-0: plan path, 1 task, 1 s" in lanes(page)["GPU"]
-
-
-@pytest.mark.parametrize("replayed", [0, 3])
-def test_tasks_of_lost_workers_are_told_to_be_missing(write, replayed):
-    text, _ = write(replayed=replayed)
-    assert ("has left no record" in text) == (replayed > 0)
-
-
-def test_the_same_run_gives_the_same_page(write):
-    assert write()[0] == write()[0]
-
-
-def test_a_path_far_from_zero_is_told_in_world_coordinates(write, planning):
+def test_a_path_far_from_zero_is_told_in_world_coordinates(write):
     _, near = write()
     _, far = write(origin=(500_000.0, 4_000_000.0, 100.0))
     for place in ("start", "target"):
@@ -437,29 +274,15 @@ def test_a_path_far_from_zero_is_told_in_world_coordinates(write, planning):
     assert far["planning"]["best_length"] == near["planning"]["best_length"]
 
 
-# -- what it was made from ----------------------------------------------------------------------
-
-
 def test_the_scenario_on_the_page_is_the_scenario(write):
-    files = [{"file": "hall.glb", "matrix": np.eye(4).tolist()}, "part <1>.stl"]
-    data = {
-        "scene": {"files": files},
-        "poses": [{"position": [1, 2, 3], "yaw_deg": 5}],
-        "planning": {
-            "start": [0, 0],
-            "target": [9, 9],
-            "obstacles": [{"centre": [1, 1], "radius_m": 1}],
-        },
-    }
-    scenario = Scenario.from_data(data)
-    page = Page(write(scenario=scenario)[0])
-    (shown,) = page.all("code")
-    assert (
-        Scenario.from_data(yaml.safe_load(page.text[shown])).model_dump() == scenario.model_dump()
+    scenario = Scenario.from_data(
+        {
+            "scene": {"files": ["part <1>.stl"]},
+            "poses": [{"position": [1, 2, 3], "yaw_deg": 5}],
+            "planning": {"start": [0, 0], "target": [9, 9], "obstacles": []},
+        }
     )
-    assert not Page(write(scenario=Scenario())[0]).all("code")
-
-
-def test_a_million_poses_are_cut_short(write):
-    scenario = Scenario.from_data({"poses": [{"position": [k, 0, 1]} for k in range(5000)]})
-    assert len(write(scenario=scenario)[0]) < len(write()[0]) + 60_000
+    (shown,) = html.fromstring(write(scenario=scenario)[0]).xpath("//code/text()")
+    assert Scenario.from_data(yaml.safe_load(shown)).model_dump() == scenario.model_dump()
+    many = Scenario.from_data({"poses": [{"position": [k, 0, 1]} for k in range(5000)]})
+    assert len(write(scenario=many)[0]) < len(write()[0]) + 60_000

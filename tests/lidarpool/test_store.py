@@ -68,9 +68,6 @@ def unfinished(folder):
     return folder
 
 
-# -- one run --------------------------------------------------------------------------------------
-
-
 def test_a_run_from_its_beginning_to_its_end(folder):
     store = RunStore(JOB, folder)
     assert (store.kept, store.complete, store.resumed) == ("", False, 0)
@@ -92,17 +89,11 @@ def test_a_run_from_its_beginning_to_its_end(folder):
     rays = store.sample_rays()
     assert rays.shape[1:] == (2, 3) and set(rays[:, 1, 0]) == {0, 2}
     assert set(map(tuple, rays[:, 0].tolist())) == {(0, 0, 1)}
+    store.storage.write("stray.npz", b"of a collector that died")
+    store.tidy()
+    assert store.storage.sizes().keys() == {"0-0.npz", "2-0.npz"}
     store.remove()
     assert not folder.exists()
-
-
-def test_parts_that_no_receipt_names_are_removed_in_the_end(folder):
-    store = RunStore(JOB, folder)
-    add(store, 0, 2)
-    store.storage.write("stray.npz", b"of a collector that died")
-    store.storage.write("notes.txt", b"somebody else's")
-    store.tidy()
-    assert store.storage.sizes().keys() == {"0-0.npz", "notes.txt"}
 
 
 def test_without_a_folder_all_goes_with_the_last_user_of_the_points():
@@ -117,35 +108,13 @@ def test_without_a_folder_all_goes_with_the_last_user_of_the_points():
     assert not folder.exists()
 
 
-def test_a_folder_whose_parent_is_not_there(tmp_path):
-    with pytest.raises(LidarpoolError, match="make the one that it lies in first"):
-        RunStore(JOB, tmp_path / "none" / "run")
-
-
-# -- a later run ----------------------------------------------------------------------------------
-
-
-def test_an_unfinished_run_is_not_run_over(unfinished):
-    before = names(unfinished)
-    with pytest.raises(LidarpoolError) as refused:
-        RunStore(JOB, unfinished)
-    assert str(refused.value) == (
-        f"{unfinished} holds an unfinished run, 4 of 6 scans: continue it with --resume (in Python "
-        "resume=True), or drop it with --fresh (in Python remove_run)."
-    )
-    assert names(unfinished) == before
-
-
 def test_it_is_gone_on_with(unfinished):
-    store = RunStore(replace(JOB, backend="auto"), unfinished, resume=True)
+    again = replace(JOB, backend="auto", collectors=5, queue_capacity=3, patience_s=1.0)
+    store = RunStore(again, unfinished, resume=True)
     assert (store.resumed, store.backend, store.notes) == (4, "numpy", [])
     assert store.db.missing(0, 6) == [(2, 3), (5, 6)]
     assert "were cast with it" in store.advice
     store.db.close()
-    RunStore(replace(JOB, backend="numpy"), unfinished, resume=True).db.close()
-
-
-def test_another_backend_cannot_go_on(unfinished):
     with pytest.raises(LidarpoolError, match=r"'embree' is asked for, .* cast with 'numpy'"):
         RunStore(replace(JOB, backend="embree"), unfinished, resume=True)
 
@@ -181,11 +150,6 @@ def test_a_run_that_has_kept_nothing_is_in_nobodys_way(folder):
     RunStore(OTHERS["scene"], folder).db.close()
 
 
-def test_how_jobs_are_run_is_no_part_of_what_they_are(unfinished):
-    other = replace(JOB, collectors=5, queue_capacity=3, patience_s=1.0)
-    RunStore(other, unfinished, resume=True).db.close()
-
-
 def test_trials_are_gone_on_with_too(folder):
     job = replace(JOB, planning=PLANNING)
     store = RunStore(job, folder)
@@ -218,9 +182,6 @@ def test_parts_that_are_not_whole_are_made_again(damage, unfinished):
     assert set(store.points().names) == store.storage.sizes().keys()
 
 
-# -- parts in another place -----------------------------------------------------------------------
-
-
 @pytest.fixture(params=["folder", "memory"])
 def place(request, tmp_path):
     if request.param == "folder":
@@ -245,27 +206,18 @@ def test_a_run_is_gone_on_with_where_its_parts_are(folder, place, tmp_path):
     store = RunStore(JOB, folder, place)
     add(store, 0, 4)
     store.db.close()
-    for elsewhere in (None, place, tmp_path / "other"):
-        again = RunStore(JOB, folder, elsewhere, resume=True)
-        assert again.resumed == 4 and again.storage.url == store.storage.url
-        again.db.close()
+    again = RunStore(JOB, folder, tmp_path / "other", resume=True)
+    assert again.resumed == 4 and again.storage.url == store.storage.url
+    again.db.close()
     remove_run(folder)
     assert store.storage.sizes() == {}
 
 
-def test_parts_that_nobody_would_know_of(place):
+def test_places_that_cannot_be(tmp_path):
+    with pytest.raises(LidarpoolError, match="make the one that it lies in first"):
+        RunStore(JOB, tmp_path / "none" / "run")
     with pytest.raises(LidarpoolError, match="give a folder for the run as well"):
-        RunStore(JOB, None, place)
-
-
-def test_leftovers_in_the_runs_own_folder_are_cleared_away(folder):
-    (folder / "parts").mkdir(parents=True)
-    (folder / "parts" / "old.npz").write_bytes(b"")
-    store = RunStore(JOB, folder)
-    assert store.storage.sizes() == {}
-
-
-# -- errors ---------------------------------------------------------------------------------------
+        RunStore(JOB, None, tmp_path / "parts")
 
 
 def test_an_error_tells_how_to_go_on(folder):
@@ -287,15 +239,6 @@ def test_an_error_before_anything_was_kept_leaves_nothing(folder):
     with pytest.raises(ValueError, match="bad") as caught, store.kept_on_error():
         raise ValueError("bad")
     assert not hasattr(caught.value, "__notes__") and not folder.exists()
-
-
-def test_an_error_after_all_was_removed_is_left_alone(folder):
-    store = RunStore(JOB, folder)
-    add(store, 0, 2)
-    with pytest.raises(ValueError, match="late") as caught, store.kept_on_error():
-        store.remove()
-        raise ValueError("late")
-    assert not hasattr(caught.value, "__notes__")
 
 
 def test_removing_a_run_leaves_what_is_not_its_own(unfinished):

@@ -7,7 +7,7 @@ from PIL import Image
 
 from lidarpool import LidarpoolError
 from lidarpool.plan import Plan, Planning, best, run_trial
-from lidarpool.render.page import Page, without_common_prefix
+from lidarpool.render.page import Page
 from lidarpool.render.pictures import draw_cloud, draw_intensity, draw_scene
 from lidarpool.render.shot import take_shot
 from lidarpool.render.theme import object_colours
@@ -15,7 +15,6 @@ from lidarpool.report.path_picture import draw_path
 from lidarpool.scene.mesh import Mesh
 from lidarpool.scene.scene import Scene
 from lidarpool.scene.shapes import seed_objects
-from raybeam.embree_backend import EmbreeBackend
 
 SIZE = (320, 200)
 LEFT = slice(0, int(0.8 * SIZE[0]))  # columns beside the legend
@@ -96,40 +95,6 @@ def test_cloud_points_have_the_colour_of_their_height(pixels, scene, shot):
     assert ((green > red + 60) & (green > blue + 60)).sum() > 10
 
 
-def test_far_coordinates_give_the_same_picture_but_for_the_labels():
-    far = np.array([500_000.0, 5_400_000.0, 250.0])
-    corners, pose = np.array([[0, 0, 0], [40, 0, 0], [0, 40, 12.0]]), np.array([5.0, 5.0, 2.0])
-    near, there = (
-        take_shot(
-            Scene.from_meshes([Mesh("T", corners + at, np.array([[0, 1, 2]]))]), [pose + at],
-            size=SIZE, backend="numpy",
-        ).depth
-        for at in (np.zeros(3), far)
-    )  # fmt: skip
-    both = np.isfinite(near) & np.isfinite(there)
-    assert (np.isfinite(near) == np.isfinite(there)).mean() > 0.99
-    np.testing.assert_allclose(np.median(np.abs(near[both] - there[both])), 0, atol=0.04)
-
-
-def test_the_same_input_gives_the_same_bytes(tmp_path, scene):
-    rays = np.array([[[0, 0, 2], [20, -20, 2]]])
-    for name in ("a", "b"):
-        shot = take_shot(scene, POSES, size=SIZE, backend="numpy")
-        draw_scene(tmp_path / f"{name}1.png", shot)
-        draw_intensity(tmp_path / f"{name}2.png", shot, np.arange(len(scene.faces)) % 7, rays)
-        draw_cloud(tmp_path / f"{name}3.png", shot, scene.vertices, 9)
-    for k in "123":
-        assert (tmp_path / f"a{k}.png").read_bytes() == (tmp_path / f"b{k}.png").read_bytes()
-
-
-def test_backends_draw_the_same_picture(scene, shot):
-    if EmbreeBackend.missing():
-        pytest.skip("needs Open3D")
-    other = take_shot(scene, POSES, size=SIZE, backend="embree")
-    same = np.isclose(shot.depth, other.depth, rtol=1e-4)  # also where both are infinite
-    assert same.mean() > 0.998
-
-
 @pytest.mark.parametrize(
     ("corners", "poses"),
     [
@@ -172,16 +137,6 @@ def test_names_from_files_are_words_and_nothing_else(tmp_path, figures, name):
     first, second, _ = (text.get_text() for text in figures[0].legends[0].get_texts())
     assert (len(first), second) == (len(name), "plain")
     assert first.isprintable()
-
-
-def test_words_that_all_names_begin_with_are_left_out():
-    assert without_common_prefix([f"hall_Shelf{k}" for k in "ABC"]) == [
-        "ShelfA",
-        "ShelfB",
-        "ShelfC",
-    ]
-    for names in (["a_1", "a_2"], ["ab", "ab_c", "ab_d"], ["x"]):
-        assert without_common_prefix(names) == names
 
 
 @pytest.fixture(scope="module")
