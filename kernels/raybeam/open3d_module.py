@@ -5,7 +5,10 @@ from __future__ import annotations
 import sys
 from importlib import import_module
 from importlib.util import find_spec, module_from_spec
+from threading import Lock
 from typing import Any
+
+_LOCK = Lock()  # a second thread would find the package that is to be taken away
 
 
 def load_open3d() -> Any:
@@ -21,11 +24,12 @@ def load_open3d() -> Any:
         If Open3D is not installed, or lacks a library of the system.
     """
     name = "open3d.pybind"
-    spec = None if {"open3d", name} & sys.modules.keys() else find_spec("open3d")
-    if spec is None:
-        return import_module(name)
-    sys.modules["open3d"] = module_from_spec(spec)
-    try:
-        return import_module(name)
-    finally:
-        del sys.modules["open3d"]
+    with _LOCK:
+        spec = None if {"open3d", name} & sys.modules.keys() else find_spec("open3d")
+        if spec is None:
+            return import_module(name)
+        sys.modules["open3d"] = module_from_spec(spec)
+        try:
+            return import_module(name)
+        finally:
+            del sys.modules["open3d"]

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from PIL import Image, ImageDraw
 
 from poolpart.wording import counted
 
@@ -38,6 +40,17 @@ class Samples:
     position: Reals  # (n, 3) metres, NaN for the sky
     normal: Reals  # (n, 3) unit length, NaN for the sky
     light: Reals  # (n,) brightness: 1 on open ground
+
+    def among(self, which: NDArray[np.int64], count: int) -> Samples:
+        """Put the samples in places `which` (n,) of so many, the others of which are sky."""
+        whole = Samples(
+            np.full(count, SKY), np.full(count, np.inf, np.float32),
+            np.full((count, 3), np.nan, np.float32), np.full((count, 3), np.nan, np.float32),
+            np.ones(count, np.float32),
+        )  # fmt: skip
+        for field in fields(self):
+            getattr(whole, field.name)[which] = getattr(self, field.name)
+        return whole
 
     def paint(self, face_colours: Floats, contrast: float) -> Reals:
         """Colours (n, 3) of the samples; see `Shot.paint`."""
@@ -190,7 +203,8 @@ def take_shot(
     width, height = size
     grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
     centres = np.asarray(grid.reshape(-1, 2) + 0.5)
-    whole = see(centres)
+    inside = np.flatnonzero(_outline(stage, camera))
+    whole = see(centres[inside]).among(inside, len(centres))
     coarse = (slice(STRIDE // 2, None, STRIDE),) * 2
     light = make_light_map(
         surface, cutaway, camera, whole.position.reshape(height, width, 3)[coarse],
@@ -230,6 +244,17 @@ def _camera(stage: Stage, size: tuple[int, int], elevation_deg: float) -> Camera
     return fit_camera(corners, size, FRAME, -62.0 if wide else -28.0, elevation_deg)
 
 
+def _outline(stage: Stage, camera: Camera) -> Bools:
+    """Whether the stage's box can be seen through each pixel, (pixels,)."""
+    ends = (*stage.ground.T, (stage.level, stage.bounds[1, 2]))
+    flat, _ = camera.project(list(product(*ends)))
+    image = Image.new("1", camera.size)
+    for side in (0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5):
+        corners = [(float(x), float(y)) for x, y in flat[list(side)]]
+        ImageDraw.Draw(image).polygon(corners, fill=1, outline=1, width=3)
+    return np.asarray(image).ravel()
+
+
 def _ground_distance(stage: Stage, eye: Floats, directions: Floats) -> Floats:
     """Metres (n,) from the eye to the ground's rectangle along directions (n, 3)."""
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -245,9 +270,11 @@ def _edges(whole: Samples, scene: Scene, camera: Camera) -> Bools:
     kind = np.append(scene.face_object, [GROUND, SKY])[whole.triangle]
     number = np.arange(width * height).reshape(height, width)
     edge = np.zeros(width * height, np.bool_)
+    surface = whole.triangle != SKY
     tolerance = plane_tolerance(camera, whole.position, 1)
     for here, beside in ((number[:, :-1], number[:, 1:]), (number[:-1], number[1:])):
-        a, b = here.ravel(), beside.ravel()
+        some = surface[here] | surface[beside]
+        a, b = here[some], beside[some]
         spot = whole.position[b], whole.normal[b], tolerance[a]
         same = alike(whole.position[a], whole.normal[a], *spot) > 0.3
         differs = (kind[a] != kind[b]) | ~same & (kind[a] != SKY)

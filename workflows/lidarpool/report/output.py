@@ -10,6 +10,7 @@ import secrets
 import shutil
 import tempfile
 from collections.abc import Callable, Collection, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,7 @@ from .report import make_report
 ROOM_BYTES = 32 << 20  # what pictures and report may take
 
 CLOUD, PAGE, REPORT = "cloud.ply", "report.html", "report.json"
+OF_CLOUD = "cloud.png"  # the picture that is drawn from the cloud's file
 _IMAGES = tuple(f"{name}.png" for name in PICTURES)
 FILES = (CLOUD, *_IMAGES, PICTURE_FILE, PAGE, REPORT)
 _WRITING = ".writing-"  # folder of a result being made; one of a killed run goes at the next
@@ -99,6 +101,8 @@ def write_result(
     staged = folder / f"{_WRITING}{secrets.token_hex(4)}"
     counted = CountedCloud(result.points, len(scene.all_names))
     makers: dict[str, Callable[[Path], object]] = {}
+    # Pictures are drawn beside the writing of the cloud, which keeps one core busy.
+    beside = ThreadPoolExecutor(1, "pictures")
     if not only_cloud:
         # Matplotlib is as much to import as all that a cloud takes.
         from .page.page import write_page
@@ -106,16 +110,20 @@ def write_result(
 
         shown = Pictured.of(result, scene, survey, planning)
         # The cloud is drawn from its file, as by `lidarpool plot`, so that both draw the same.
-        drawn = picture_makers(shown, staged / CLOUD)
-        makers = {f"{name}.png": draw for name, draw in drawn.items()} | {PICTURE_FILE: shown.save}
+        pictures = picture_makers(shown, staged / CLOUD)
+        makers = {f"{name}.png": draw for name, draw in pictures.items()} | {
+            PICTURE_FILE: shown.save
+        }
     files = [CLOUD, *makers, *([] if only_cloud else [PAGE]), REPORT]
     try:
         staged.mkdir()
+        drawn = [beside.submit(make, staged / n) for n, make in makers.items() if n != OF_CLOUD]
         save_cloud(staged / CLOUD, counted, precision_m=survey.precision_m)
         report = make_report(result, scene, survey, planning, files, counted)
-        for name, make in makers.items():
-            make(staged / name)
         if not only_cloud:
+            drawn.append(beside.submit(makers[OF_CLOUD], staged / OF_CLOUD))
+            for each in drawn:
+                each.result()
             write_page(staged / PAGE, report, result, counted, scenario)
         text = json.dumps(report, indent=1, allow_nan=False) + "\n"
         (staged / REPORT).write_text(text, encoding="utf-8")
@@ -132,6 +140,7 @@ def write_result(
             "give another folder with --out."
         ) from error
     finally:
+        beside.shutdown(cancel_futures=True)
         shutil.rmtree(staged, ignore_errors=True)
     return report
 
