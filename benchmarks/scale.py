@@ -4,7 +4,7 @@ Scheduler, driver and workers are three processes, so that what each takes can b
 all the workers are threads of one process, and the tasks do nothing. The workers are divided
 into four partitions.
 
-- `submit`: one task a message; `submit_many`: all of a partition in one; `map`: results one by
+- `submit`: one task a message; `client_map`: Dask's own map, all in one; `map`: results one by
   one, a bounded number of tasks under way. `map_small` puts several items into a task, as
   `Partition.map` does by itself, and its figures are for an item: at least two tasks for each
   slot are needed, so that they grow with the cluster.
@@ -95,8 +95,10 @@ def by_submit(partition: Partition, tasks: int) -> list[str]:
     return list(partition.client.gather(futures))
 
 
-def by_submit_many(partition: Partition, tasks: int) -> list[str]:
-    return list(partition.client.gather(partition.submit_many(name_of_worker, [None] * tasks)))
+def by_client_map(partition: Partition, tasks: int) -> list[str]:
+    with partition:
+        futures = partition.client.map(name_of_worker, [None] * tasks, pure=False)
+    return list(partition.client.gather(futures))
 
 
 def by_map(partition: Partition, tasks: int) -> list[str]:
@@ -110,7 +112,7 @@ def by_map_small(partition: Partition, tasks: int) -> list[str]:
 # {name: function, how many tasks compared with `--tasks`}
 WAYS = {
     "submit": (by_submit, 0.25),
-    "submit_many": (by_submit_many, 1),
+    "client_map": (by_client_map, 1),
     "map": (by_map, 0.25),
     "map_small": (by_map_small, 5),
 }

@@ -13,7 +13,6 @@ from .rules import Rule, n_workers, named, per_gpu, per_host, rest
 from .stats import PartitionStats, StageStats
 from .task_context import WorkerLeft, own_client, telling_departure
 from .task_locations import TaskPlace, Whereabouts, look_for_tasks
-from .tracing import trace, trace_to
 from .workers import WorkerInfo, ask_workers, worker_identities
 
 __all__ = [
@@ -53,7 +52,5 @@ __all__ = [
     "take_held",
     "take_news",
     "telling_departure",
-    "trace",
-    "trace_to",
     "worker_identities",
 ]

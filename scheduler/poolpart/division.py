@@ -16,12 +16,11 @@ from distributed import Client
 from .errors import PoolError
 from .fence import enclose, lower
 from .inherit import begin_inheritance, end_inheritance
-from .internals import asks_for, held_by, lift_restrictions
+from .internals import asks_for, lift_restrictions
 from .page import close_page
 from .rules import Rule
 from .stats import forget_statistics, statistics_of
 from .steward import Seat, Steward, names_of, steward_of
-from .wording import counted
 from .workers import WorkerInfo, on_scheduler
 
 PATIENCE_S = 60.0  # for a worker to answer
@@ -63,24 +62,12 @@ def declare(
     rules: Mapping[str, Rule],
     chosen: Mapping[str, Sequence[WorkerInfo]],
     pool: Sequence[WorkerInfo],
+    seen: Collection[str],
 ) -> str:
     """Make partitions, and have the scheduler follow their rules from now on; all or none.
 
-    Parameters
-    ----------
-    client
-        Client of their cluster.
-    rules
-        Rules by partition.
-    chosen
-        Workers to begin with, by partition.
-    pool
-        All workers, as the client saw them when it chose.
-
-    Returns
-    -------
-    note
-        What a user should know of all of them; empty for nothing.
+    `chosen` are workers to begin with, of those in `pool`; `seen` are the partitions that the
+    client saw when it chose. Returns what a user should know of all of them, "" for nothing.
 
     Raises
     ------
@@ -93,7 +80,7 @@ def declare(
         _declare,
         rules=dict(rules),
         chosen={name: [worker.address for worker in chosen[name]] for name in rules},
-        seen=sorted({name for worker in pool for name in worker.partitions}),
+        seen=sorted(seen),
         gpus={worker.address: worker.gpus for worker in pool},
     )
     return note
@@ -230,8 +217,7 @@ async def _grow(
         place = f"partition {lender!r}, beyond its minimum," if source else "the remainder"
         raise PoolError(
             f"Partition {name!r} cannot grow by {count}: {place} has "
-            f"{counted(len(there), 'worker')} to spare. Start more, or "
-            "shrink another partition first."
+            f"{len(there)} workers to spare. Start more, or shrink another partition first."
         )
     return await _move(steward, _by_load(steward, there)[:count], name, timeout_s)
 
@@ -241,8 +227,8 @@ async def _shrink(steward: Steward, name: str, count: int, timeout_s: float) -> 
     members, least = _arrived(steward, name), steward.rules[name].minimum
     if len(members) - count < least:
         raise PoolError(
-            f"Partition {name!r} cannot shrink by {count}: it has "
-            f"{counted(len(members), 'worker')} and needs at least {least}."
+            f"Partition {name!r} cannot shrink by {count}: it has {len(members)} workers and "
+            f"needs at least {least}."
         )
     target = steward.remainder()
     return await _move(steward, members[:count], None if target == name else target, timeout_s)
@@ -266,11 +252,10 @@ async def _move(
         steward.resize(origin, 1)
         steward.put(seat, origin, slots)
     if late:
-        leaving = [name for name, _ in (before[seat] for seat in late) if name]
         steward.settle(late)
         raise PoolError(
-            f"{len(late)} of {counted(len(seats), 'worker')} could not be moved within "
-            f"{timeout_s:g} s; left in place: {names_of(late)}{_held(steward, late, leaving)}."
+            f"{len(late)} of {len(seats)} workers could not be moved within "
+            f"{timeout_s:g} s, for their tasks have not ended; left in place: {names_of(late)}."
         )
     # Whoever else moves workers waits until they have arrived; dissolving does not.
     if target is not None and target not in steward.rules:
@@ -295,16 +280,6 @@ def _by_load(steward: Steward, seats: Sequence[Seat]) -> list[Seat]:
     return sorted(seats, key=load)
 
 
-def _held(steward: Steward, seats: Sequence[Seat], names: Sequence[str]) -> str:
-    """Say what keeps workers from leaving, for messages."""
-    workers: list[Any] = [steward.scheduler.workers.get(seat.info.address) for seat in seats]
-    keys = [k for w in workers if w for k in held_by(steward.scheduler, w, names)]
-    if not keys:
-        return ""
-    more = f" and {len(keys) - 3} more" if len(keys) > 3 else ""
-    return f", because of {', '.join(map(str, keys[:3]))}{more}"
-
-
 # -- undoing it ------------------------------------------------------------------------
 
 
@@ -327,7 +302,7 @@ async def _dissolve(steward: Steward, names: list[str] | None, timeout_s: float)
     while tasks := _unfinished(scheduler, those()):
         if time.monotonic() >= deadline:
             raise PoolError(
-                f"After {timeout_s:g} s {counted(len(tasks), 'task')} of {' and '.join(those())} "
+                f"After {timeout_s:g} s {len(tasks)} tasks of {' and '.join(those())} "
                 f"had not ended, such as {tasks[0].key}: wait or cancel, then dissolve."
             )
         await asyncio.sleep(_LOOK_EVERY_S)

@@ -36,9 +36,7 @@ def usable_cores() -> int:
 def local_cluster(
     partitions: Mapping[str, tuple[int, int]],
     *,
-    host: str = LOOPBACK,
     dashboard_port: int | None = 0,
-    environment: Mapping[str, str] | None = None,
     security: Security | bool = False,
 ) -> SpecCluster:
     """Start a Dask cluster on this machine, divided into partitions.
@@ -52,12 +50,8 @@ def local_cluster(
     partitions
         {name: (workers, slots of each worker)}. A worker has as many threads as slots. Workers
         are named after their partition: ``GPU-0``, ``GPU-1``. A partition of 0 workers is left out.
-    host
-        Address to listen on.
     dashboard_port
         Port of Dask's dashboard, 0 for any free one, None for none.
-    environment
-        Variables to set in the workers.
     security
         True encrypts what the processes say to each other, with a certificate that is made
         for this cluster and kept in memory; nobody without it can connect. A
@@ -89,19 +83,19 @@ def local_cluster(
     if not isinstance(security, Security):
         security = Security.temporary() if security else Security()
     workers = {
-        f"{name}-{number}": _worker_spec(host, environment or {}, security, name, slots)
+        f"{name}-{number}": _worker_spec(name, slots, security)
         for name, (count, slots) in partitions.items()
         for number in range(count)
     }
     scheduler = {
         "cls": Scheduler,
         "options": {
-            "host": host,
+            "host": LOOPBACK,
             "port": 0,
             "security": security,
             "dashboard": dashboard_port is not None,
             # Also without a dashboard there is an HTTP server, else on port 8787.
-            "dashboard_address": f"{host}:{dashboard_port or 0}",
+            "dashboard_address": f"{LOOPBACK}:{dashboard_port or 0}",
         },
     }
     try:
@@ -117,20 +111,17 @@ def local_cluster(
         ) from error
 
 
-def _worker_spec(
-    host: str, environment: Mapping[str, str], security: Security, partition: str, slots: int
-) -> dict[str, Any]:
+def _worker_spec(partition: str, slots: int, security: Security) -> dict[str, Any]:
     """Describe a worker of a partition as SpecCluster wants it."""
-    # One thread for each worker's numerical libraries: the processes share the cores.
-    env = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
     options = {
         "nthreads": slots,
         "resources": {partition: slots},
-        "host": host,
+        "host": LOOPBACK,
         "security": security,
         "dashboard": False,
         "memory_limit": "auto",
-        "env": {**env, **environment},
+        # One thread for each worker's numerical libraries: the processes share the cores.
+        "env": dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"),
         "silence_logs": logging.ERROR,
     }
     return {"cls": Nanny, "options": options}

@@ -182,40 +182,17 @@ class Stage:
 
     def send(self, patience_s: float, *columns: Sequence[Any]) -> list[Future]:
         """Submit a task for each row of columns."""
-        return send(
-            self.client,
-            {self.partition: self.slots},
+        # One message costs the scheduler less than one for each.
+        futures: list[Future] = self.client.map(
             partial(run_chunk, self.function, patience_s, self.at),
-            columns,
+            *columns,
             key=f"map-{funcname(self.function)}",
+            pure=False,
             priority=self.priority,
-            retries=self.retries,
+            retries=self.retries or None,
+            resources={self.partition: self.slots},
         )
-
-
-def send(
-    client: Client,
-    resources: dict[str, int],
-    function: Callable[..., Any],
-    columns: Sequence[Sequence[Any]],
-    *,
-    key: str,
-    priority: int,
-    retries: int,
-) -> list[Future]:
-    """Submit a task for each row; one message costs the scheduler less than one for each."""
-    if not columns or not columns[0]:
-        return []
-    futures: list[Future] = client.map(
-        function,
-        *columns,
-        key=key,
-        pure=False,
-        priority=priority,
-        retries=retries or None,
-        resources=resources,
-    )
-    return futures
+        return futures
 
 
 class Results(Iterator[Any]):
@@ -348,6 +325,8 @@ class Results(Iterator[Any]):
 
     def _run(self, chunks: Sequence[Chunk], done: list[Future] | None = None) -> None:
         """Send chunks through all stages, or through the last where those before are `done`."""
+        if not chunks:
+            return
         firsts = [chunk.first for chunk in chunks]
         stages = list(enumerate(self._stages))
         futures = done

@@ -2,36 +2,24 @@
 
 from __future__ import annotations
 
-import inspect
-import time
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from contextvars import ContextVar
 from typing import Any, Self
 
 import dask
-from dask.utils import funcname
 from distributed import Client, Future
 
 from . import division
 from .errors import PoolError
 from .inherit import keep_shuffles_in
-from .mapping import Results, Stage, send
+from .mapping import Results, Stage
 from .stats import PartitionStats, partition_stats
 from .task_context import own_client
-from .wording import counted
 from .workers import WorkerInfo, all_workers
 
 # What `with partition:` has to undo, innermost last; of this thread or coroutine.
 _entered: ContextVar[tuple[ExitStack, ...]] = ContextVar("_entered", default=())
-
-# `Client.submit` keeps these for itself; a function that has one of them would not get it.
-_OPTIONS_OF_SUBMIT = frozenset(
-    parameter.name
-    for parameter in inspect.signature(Client.submit).parameters.values()
-    if parameter.kind is inspect.Parameter.KEYWORD_ONLY
-    or parameter.default is not inspect.Parameter.empty
-)
 
 
 class Partition:
@@ -91,25 +79,6 @@ class Partition:
         """How busy it is and what it has done, whoever submitted the tasks."""
         return partition_stats(self.client, self.name)
 
-    def wait(self, n_workers: int = 1, timeout_s: float | None = None) -> None:
-        """Wait until the partition has so many workers.
-
-        Dask itself waits silently, and for ever, with a task that no worker may take.
-
-        Raises
-        ------
-        PoolError
-            If it has fewer after so many seconds.
-        """
-        deadline = time.monotonic() + (float("inf") if timeout_s is None else timeout_s)
-        while (there := len(self)) < n_workers:
-            if time.monotonic() >= deadline:
-                raise PoolError(
-                    f"Partition {self.name!r} has {there} of {counted(n_workers, 'worker')} after "
-                    f'{timeout_s} s: start some with dask worker … --resources "{self.name}=1"'
-                )
-            time.sleep(0.05)
-
     # -- tasks -------------------------------------------------------------------------
 
     def submit(
@@ -129,9 +98,8 @@ class Partition:
         Parameters
         ----------
         function, args, kwargs
-            What to call. Arguments named like an option of `Client.submit`, such as `key` or
-            `workers`, are not passed on by name: give them by position, or bind them with
-            `functools.partial`.
+            What to call. Give arguments that are named like an option of `Client.submit`, such
+            as `key` or `workers`, by position, or bind them with `functools.partial`.
         key
             The task's key; by default a new one, so that equal calls run each by itself.
         priority
@@ -150,17 +118,9 @@ class Partition:
 
         Raises
         ------
-        TypeError
-            If a keyword is another option of `Client.submit`.
         ValueError
             If `slots` is below 1.
         """
-        if taken := sorted(_OPTIONS_OF_SUBMIT & kwargs.keys()):
-            raise TypeError(
-                f"{', '.join(taken)}: Client.submit has options of this name, so that "
-                f"{function} would not get it: bind it with functools.partial. To give Dask the "
-                f"option, use Client.submit(…, resources={{{self.name!r}: 1}})."
-            )
         return self.client.submit(
             function,
             *args,
@@ -171,36 +131,6 @@ class Partition:
             resources=self._taking(slots),
             workers=None if worker is None else [worker],
             **kwargs,
-        )
-
-    def submit_many(
-        self,
-        function: Callable[..., Any],
-        /,
-        *iterables: Iterable[Any],
-        priority: int = 0,
-        retries: int = 0,
-        slots: int = 1,
-    ) -> list[Future]:
-        """Submit one task for each item, in one message; see `map` for many or endless items.
-
-        Dask does not hold back tasks that need a resource: what has run stays in the workers'
-        memory as long as its future is held.
-
-        Returns
-        -------
-        list of Future
-            In the order of the items, as many as the shortest iterable has.
-        """
-        columns = list(zip(*zip(*iterables, strict=False), strict=True))
-        return send(
-            self.client,
-            self._taking(slots),
-            function,
-            columns,
-            key=funcname(function),
-            priority=priority,
-            retries=retries,
         )
 
     def _taking(self, slots: int) -> dict[str, int]:

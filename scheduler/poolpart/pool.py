@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import replace
+from typing import Any
 
 from distributed import Client
 
@@ -14,8 +15,7 @@ from .errors import PoolError
 from .page import partitions_page
 from .partition import Partition
 from .probe import probe_worker
-from .rules import Named, Rule, by_name, check_rules, divide, rule_of
-from .wording import counted
+from .rules import Count, PerGpu, PerHost, Rule, check_rules, divide, named
 from .workers import WorkerInfo, all_workers, ask_workers
 
 logger = logging.getLogger(__name__)
@@ -94,8 +94,7 @@ class Pool:
         gpus = {gpu for worker in self.workers for gpu in worker.gpus}
         declared = Counter(name for worker in self.workers for name in worker.partitions)
         parts = "".join(f", {name} {count}" for name, count in sorted(declared.items()))
-        size = f"{counted(len(self), 'worker')} on {counted(len(hosts), 'host')}"
-        return f"<Pool of {size} with {counted(len(gpus), 'GPU')}{parts}>"
+        return f"<Pool: workers {len(self)}, hosts {len(hosts)}, GPUs {len(gpus)}{parts}>"
 
     @property
     def names(self) -> list[str]:
@@ -136,7 +135,7 @@ class Pool:
                 reason = f" ({purpose[name]})" if purpose and name in purpose else ""
                 raise PoolError(
                     f"Partition {name!r} has {there} of the "
-                    f"{counted(needed, 'slot')} needed{reason}: "
+                    f"{needed} slots needed{reason}: "
                     f'start workers with --resources "{name}=1" or one with --nthreads {needed} '
                     f'--resources "{name}={needed}".'
                 )
@@ -179,10 +178,7 @@ class Pool:
         1024
         """
         check_rules(rules)
-        cluster = self._cluster_now()
-        mine = self._mine(cluster)
-        chosen, notes = divide(rules, mine)
-        return self._make(rules, chosen, notes, cluster)
+        return self._divide(rules, rules)[0]
 
     def partition(
         self,
@@ -236,26 +232,27 @@ class Pool:
             If the selectors are not exactly one, a worker is not in this pool or belongs to
             another partition, there are too few, or other workers have this partition.
         """
-        selectors = {
-            "max_workers_per_gpu": max_workers_per_gpu,
-            "max_workers_per_host": max_workers_per_host,
-            "n_workers": n_workers,
-            "workers": workers,
-        }
-        rule = rule_of(name, selectors, slots=slots, minimum=minimum, exclusive=exclusive)
-        cluster = self._cluster_now()
-        mine = self._mine(cluster)
-        notes: dict[str, str] = {}
-        if isinstance(rule, Named):
-            chosen = {name: by_name(name, mine, rule.names)}
-            rule = replace(rule, names=tuple(worker.name for worker in chosen[name]))
-        else:
-            wanted = replace(rule, minimum=n_workers or max(1, minimum))
-            chosen, notes = divide({name: wanted}, mine)
-        made = self._make({name: rule}, chosen, notes, cluster)
-        taken = {worker.address for worker in chosen[name]}
-        rest = Pool(self.client, [worker for worker in mine if worker.address not in taken])
-        return made[name], rest
+        common: dict[str, Any] = {"slots": slots, "minimum": minimum, "exclusive": exclusive}
+        given: list[Rule] = []
+        if max_workers_per_gpu is not None:
+            given.append(PerGpu(most=max_workers_per_gpu, **common))
+        if max_workers_per_host is not None:
+            given.append(PerHost(most=max_workers_per_host, **common))
+        if n_workers is not None:
+            given.append(Count(workers=n_workers, **common))
+        if workers is not None:
+            given.append(named(*workers, **common))
+        if len(given) != 1:
+            raise PoolError(
+                "Give exactly one of max_workers_per_gpu, max_workers_per_host, n_workers and "
+                f"workers to partition {name!r}, not {len(given)}."
+            )
+        [rule] = given
+        check_rules({name: rule})
+        # All that were asked for are to be there now, though it may have fewer later.
+        needed = n_workers or len(workers or ()) or max(1, minimum)
+        made, remainder = self._divide({name: rule}, {name: replace(rule, minimum=needed)})
+        return made[name], remainder
 
     def page(self) -> str:
         """Add a page of partitions to Dask's dashboard, see `partitions_page`; returns its URL."""
@@ -285,35 +282,23 @@ class Pool:
         """
         return dissolve(self.client, None, timeout_s)
 
-    def _make(
-        self,
-        rules: Mapping[str, Rule],
-        chosen: Mapping[str, Sequence[WorkerInfo]],
-        notes: Mapping[str, str],
-        cluster: Sequence[WorkerInfo],
-    ) -> dict[str, Partition]:
-        """Make partitions of the workers chosen for them, all or none; see `declare`."""
-        for name, note in notes.items():
-            if note:
-                logger.warning("Partition %r: %s", name, note)
-        common = declare(self.client, rules, chosen, cluster)
-        told = {name: "; ".join(filter(None, (notes.get(name), common))) for name in rules}
-        return {name: Partition(name, self.client, told[name]) for name in rules}
+    def _divide(
+        self, rules: Mapping[str, Rule], now: Mapping[str, Rule]
+    ) -> tuple[dict[str, Partition], Pool]:
+        """Make partitions, all or none; `now` are the rules by which workers are chosen at first.
 
-    def _cluster_now(self) -> list[WorkerInfo]:
-        """Every worker of the cluster; the GPUs of those in this pool are known."""
-        gpus = {worker.name: worker.gpus for worker in self.workers}
-        gpus |= {worker.address: worker.gpus for worker in self.workers}
-        workers = all_workers(self.client)
-        return [w.with_gpus(gpus.get(w.address, gpus.get(w.name, ()))) for w in workers]
-
-    def _mine(self, cluster: Iterable[WorkerInfo]) -> list[WorkerInfo]:
-        """Those of the workers that are in this pool, also those that were restarted since.
-
-        By address, since two workers may have one name as it is written here, 0 and "0".
+        Returns also a pool of the workers that are left.
         """
-        known = {worker.address for worker in self.workers}
-        here = {worker.address: worker for worker in cluster}
-        restarted = {w.name: w for w in cluster if w.address not in known}
-        found = (here.get(w.address, restarted.get(w.name)) for w in self.workers)
-        return [worker for worker in found if worker is not None]
+        cluster = all_workers(self.client)
+        # By name: the address of a worker that was restarted meanwhile is another one.
+        gpus = {worker.name: worker.gpus for worker in self.workers}
+        mine = [w.with_gpus(gpus[w.name]) for w in cluster if w.name in gpus]
+        chosen, notes = divide(now, mine)
+        for name, note in notes.items():
+            logger.warning("Partition %r: %s", name, note)
+        seen = {name for worker in cluster for name in worker.partitions}
+        common = declare(self.client, rules, chosen, mine, seen)
+        told = {name: "; ".join(filter(None, (notes.get(name), common))) for name in rules}
+        parts = {name: Partition(name, self.client, told[name]) for name in rules}
+        taken = {worker.address for group in chosen.values() for worker in group}
+        return parts, Pool(self.client, [w for w in mine if w.address not in taken])

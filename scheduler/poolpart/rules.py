@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from .errors import PoolError
-from .wording import counted
 from .workers import WorkerInfo
 
 NO_GPU = "no GPU in the pool: CPU workers instead"
@@ -197,70 +196,13 @@ def divide(
         taken |= {worker.address for worker in chosen[name]}
         if len(chosen[name]) < rule.minimum:
             raise PoolError(
-                f"Partition {name!r} would have {counted(len(chosen[name]), 'worker')} of the "
-                f"{rule.minimum} that it needs: {len(free)} of {len(pool)} are left for it. "
-                f"Start more workers, or put it before others.{_left_alone(name, pool)}"
+                f"Partition {name!r} would have {len(chosen[name])} workers, of the {rule.minimum} "
+                f"that it needs: {len(free)} of {len(pool)} are left for it. Start more, or put it "
+                "before others. Workers that declare another resource are not taken."
             )
-        told = []
         if isinstance(rule, PerGpu) and free and not any(worker.gpus for worker in free):
-            told.append(NO_GPU)
-        if declaring:
-            told.append(f"{counted(len(declaring), 'worker')} declared {name!r} already")
-        if not chosen[name] and (left := _left_alone(name, pool)):
-            told.append(f"it has no workers.{left}")
-        if told:
-            notes[name] = "; ".join(told)
+            notes[name] = NO_GPU
     return chosen, notes
-
-
-def _left_alone(partition: str, pool: Sequence[WorkerInfo]) -> str:
-    """Say, for a message, which workers cannot be had because of what they declare."""
-    others = Counter(name for worker in pool for name in worker.partitions - {partition})
-    if not others:
-        return ""
-    declare = ", ".join(f"{name} by {count}" for name, count in sorted(others.items()))
-    return f" A worker that declares another resource is not taken: {declare}."
-
-
-def by_name(partition: str, pool: Sequence[WorkerInfo], wanted: Sequence[str]) -> list[WorkerInfo]:
-    """Take these workers, by name or address; PoolError if one cannot be had."""
-    names = set(map(str, wanted))
-    if unknown := sorted(names - {known for w in pool for known in (w.name, w.address)}):
-        raise PoolError(
-            f"Partition {partition!r}: {', '.join(unknown)} not in this pool, which has "
-            f"{', '.join(worker.name for worker in pool) or 'no workers'}."
-        )
-    chosen = [worker for worker in pool if names & {worker.name, worker.address}]
-    for worker in chosen:
-        if others := sorted(worker.partitions - {partition}):
-            raise PoolError(
-                f"Worker {worker.name} already declares {', '.join(others)}; a worker belongs "
-                "to one partition."
-            )
-    return chosen
-
-
-def rule_of(partition: str, selectors: Mapping[str, Any], **common: Any) -> Rule:
-    """Make the rule of a selector of `Pool.partition`; PoolError if it makes no sense."""
-    given = {key: value for key, value in selectors.items() if value is not None}
-    if len(given) != 1:
-        raise PoolError(
-            f"Give exactly one of {', '.join(selectors)} to partition {partition!r}, "
-            f"not {' and '.join(given) or 'none'}."
-        )
-    [(key, value)] = given.items()
-    if key == "workers" and (isinstance(value, str) or not value):
-        raise PoolError(f"workers is {value!r}; give a list of names or addresses, 1 or more.")
-    if key == "workers":
-        return named(*value, **common)
-    rules: dict[str, Callable[..., Rule]] = {
-        "max_workers_per_gpu": per_gpu,
-        "max_workers_per_host": per_host,
-        "n_workers": n_workers,
-    }
-    rule = rules[key](value, **common)
-    check_rules({partition: rule})
-    return rule
 
 
 def partition_for(

@@ -39,7 +39,6 @@ from .internals import (
 )
 from .probe import probe_worker
 from .rules import Count, Declared, PerGpu, Rest, Rule, partition_for
-from .tracing import trace
 from .workers import WorkerInfo
 
 logger = logging.getLogger(__name__)
@@ -323,12 +322,10 @@ class Steward(SchedulerPlugin):
             hand_off(self.scheduler, worker, leaving, asked)
             if held_by(self.scheduler, worker, leaving):
                 return False
-            trace("partition.drained", worker=worker.address, leaves=sorted(leaving))
         if not await call(self.scheduler, worker.address, declare_on_worker, resources=wanted):
             return False
         if self.scheduler.workers.get(worker.address) is worker:
             seat.declared = wanted
-            trace("partition.worker_told", worker=worker.address, declares=dict(wanted))
             if self.wanted(seat) == wanted:
                 self._show(seat, worker, wanted)
                 for name in leaving:  # those that took over tasks

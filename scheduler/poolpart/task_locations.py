@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 from distributed import Client
@@ -71,11 +71,6 @@ class Whereabouts:
     def runs_for_long(self, key: str) -> bool:
         """Whether a task runs and has seceded."""
         return key in self.tasks and self.tasks[key].long_running
-
-    def without(self, addresses: Collection[str]) -> Whereabouts:
-        """Leave out what is free on some workers."""
-        free = {address: count for address, count in self.free.items() if address not in addresses}
-        return replace(self, free=free)
 
 
 def look_for_tasks(client: Client, partition: str, keys: Collection[str] = ()) -> Whereabouts:

@@ -12,7 +12,8 @@ from pathlib import Path
 from distributed import Client
 
 from lidarpool import Planning, Survey, simulate
-from poolpart import placement_violations, trace_to
+from lidarpool.base.tracing import trace_to
+from poolpart import placement_violations
 
 from .events import Board, Sink
 from .survey import Reference, room

@@ -24,7 +24,7 @@ from typing import Any
 from distributed.diagnostics.plugin import WorkerPlugin
 from distributed.worker import thread_state
 
-from poolpart import trace_to
+from lidarpool.base.tracing import trace_to
 
 Event = dict[str, Any]
 
@@ -169,7 +169,7 @@ class Board:
 
 
 class Sink:
-    """What `poolpart.trace_to` is given: it logs a point, slows it down, strikes there.
+    """What `trace_to` is given: it logs a point, slows it down, strikes there.
 
     Parameters
     ----------

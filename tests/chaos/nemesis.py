@@ -15,7 +15,7 @@ from functools import partial
 
 import psutil
 
-from poolpart import trace_to
+from lidarpool.base.tracing import trace_to
 
 from .arena import TIME_TO_LIVE_S, Arena
 from .events import KINDS, RESTART, RETIRE, SIGNALS, STOP, Fired, Order, Sink

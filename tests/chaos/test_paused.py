@@ -19,8 +19,8 @@ from tests.chaos.survey import PLANNING, Reference, disturbed, room
 
 import poolpart.task_locations
 from lidarpool import simulate
+from lidarpool.base.tracing import trace_to
 from lidarpool.scan import SurveyDriver
-from poolpart import trace_to
 
 JOIN_S = 300.0
 STOP_S = 2.0  # for others to take over

@@ -85,14 +85,14 @@ def test_live_late_killed_and_undone(command_line, wait_until):
         command_line.worker("--no-nanny")
         wait_until(lambda: sorted(map(str, declared(client).values())) == before, LONG_S)
         command_line.worker("--name", "late")
-        parts["C"].wait(2, timeout_s=LONG_S)
+        wait_until(lambda: len(parts["C"]) == 2)
         # Moved while it runs, and killed after: its nanny knows.
         assert len(parts["B"].grow(2)) == 2
         address = next(w.address for w in parts["B"].workers if w.name == "late")
         os.kill(client.run(os.getpid, workers=[address])[address], signal.SIGKILL)
         waiting = [parts["B"].submit(here) for _ in range(9)]
         wait_until(lambda: address not in worker_identities(client), LONG_S)
-        parts["B"].wait(3, timeout_s=LONG_S)
+        wait_until(lambda: len(parts["B"]) == 3)
         assert {future.result(LONG_S) for future in waiting} <= {w.name for w in parts["B"].workers}
         assert "late" in {worker.name for worker in parts["B"].workers}
     with Client(command_line.address) as client:

@@ -185,7 +185,7 @@ def test_a_worker_without_a_name_that_its_nanny_starts_again(nameless, wait_unti
         victim = next(address for address, held in now.items() if held == device)
         os.kill(client.run(os.getpid, workers=[victim])[victim], signal.SIGKILL)
         wait_until(lambda victim=victim: victim not in client.cluster.scheduler.workers)
-        part.wait(2, timeout_s=LONG_S)
+        wait_until(lambda: len(part) == 2)
         (newcomer,) = {worker.address for worker in part.workers} - now.keys()
         # Both of its slots at once, and by a task of its own rather than by the client.
         asked = [part.submit(own_device, worker=newcomer) for _ in range(4)]

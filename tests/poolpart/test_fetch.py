@@ -36,7 +36,8 @@ def wait_for(event):
 def test_only_what_is_finished_comes(client):
     gate = Event(f"gate-{uuid.uuid4().hex}", client=client)
     part = Partition("A", client)
-    done, pending = part.submit_many(twice, range(5)), part.submit(wait_for, gate.name)
+    done = [part.submit(twice, number) for number in range(5)]
+    pending = part.submit(wait_for, gate.name)
     wait(done, timeout=120)
     keys = [future.key for future in done]
     fetched = fetch_available(client, [*keys, pending.key, "never-submitted"], LONG_S)

@@ -1,7 +1,5 @@
 """Drivers that are killed in the middle of what they ask: it is done whole, and can be undone."""
 
-import os
-import signal
 import subprocess
 import sys
 import time
@@ -9,7 +7,7 @@ import time
 import pytest
 from distributed import Client, Scheduler, SpecCluster, Worker
 
-from poolpart import Partition, Pool, n_workers, rest, trace_to
+from poolpart import Partition, Pool, n_workers, rest, steward
 
 LONG_S = 120.0
 QUIET = 50
@@ -57,7 +55,6 @@ def driver(cluster):
         return drivers[-1]
 
     yield start
-    trace_to(None)
     for process in drivers:
         process.kill()
         process.communicate()
@@ -91,17 +88,18 @@ def sizes(client):
     return sorted("".join(name for name, slots in w.resources.items() if slots) for w in workers)
 
 
-def kill_at(point, process):
-    """Kill the driver when the scheduler, which is in this process, passes a point."""
-    killed = []
+def kill_when_told(process, monkeypatch):
+    """Kill the driver when the scheduler, which is in this process, first tells a worker."""
+    killed, call = [], steward.call
 
-    def sink(name, fields):
-        if name == f"partition.{point}" and not killed:
-            killed.append(name)
-            os.kill(process.pid, signal.SIGKILL)
+    async def kill_and_call(*args, **kwargs):
+        if not killed:
+            killed.append(process.pid)
+            process.kill()
             process.wait(LONG_S)
+        return await call(*args, **kwargs)
 
-    trace_to(sink)
+    monkeypatch.setattr(steward, "call", kill_and_call)
     return killed
 
 
@@ -119,21 +117,21 @@ def await_state(client, expected):
 
 
 @pytest.mark.parametrize(
-    ("what", "point", "after"),
+    ("what", "after"),
     [
-        (f"pool.divide({RULES})", "worker_told", ["A", "A", "B", "B"]),
-        ("Partition('A', client).grow(1, source='B')", "drained", ["A", "A", "A", "B"]),
-        ("pool.dissolve()", "worker_told", ["", "", "", ""]),
+        (f"pool.divide({RULES})", ["A", "A", "B", "B"]),
+        ("Partition('A', client).grow(1, source='B')", ["A", "A", "A", "B"]),
+        ("pool.dissolve()", ["", "", "", ""]),
     ],
 )
-def test_what_was_asked_is_done_whole(cluster, driver, wait_until, what, point, after):
+def test_what_was_asked_is_done_whole(cluster, driver, wait_until, monkeypatch, what, after):
     before = known(cluster)
     if "divide" not in what:
         Pool.from_client(cluster).divide(
             {"A": n_workers(2, exclusive=True), "B": rest(exclusive=True)}
         )
     process = driver(what)
-    killed = kill_at(point, process)
+    killed = kill_when_told(process, monkeypatch)
     tell(process)
     wait_until(lambda: killed)
     await_that_it_is_gone(cluster, wait_until)

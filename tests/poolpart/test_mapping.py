@@ -128,7 +128,7 @@ def test_several_iterables_end_with_the_shortest(a):
 
 
 def test_futures_are_items(a, b):
-    halves = b.submit_many(twice, range(5))
+    halves = [b.submit(twice, number) for number in range(5)]
     assert list(a.map(twice, halves)) == [0, 4, 8, 12, 16]
     assert list(a.map(add, halves, [1] * 5, chunk=3)) == [1, 3, 5, 7, 9]
 

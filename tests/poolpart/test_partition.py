@@ -22,10 +22,6 @@ def twice(x):
     return 2 * x
 
 
-def ident(_):
-    return uuid.uuid4()
-
-
 def options(key=None, priority=None, workers=None):
     return key, priority, workers
 
@@ -34,7 +30,7 @@ def wait_for(event):
     return Event(event).wait(120)
 
 
-def stamp(_):
+def stamp():
     return time.monotonic()
 
 
@@ -49,7 +45,7 @@ def b(client):
 
 
 def test_tasks_run_on_its_workers_and_on_all_of_them(a, b):
-    in_a, in_b = a.submit_many(here, range(200)), b.submit_many(here, range(200))
+    in_a, in_b = ([part.submit(here) for _ in range(200)] for part in (a, b))
     assert {future.result() for future in in_a} == {"A-0", "A-1"}
     assert {future.result() for future in in_b} == {"B-0"}
 
@@ -73,12 +69,6 @@ def test_futures_are_arguments_across_partitions(a, b):
     assert b.submit(twice, a.submit(twice, 5)).result() == 20
 
 
-@pytest.mark.parametrize("option", ["workers", "resources", "pure", "actor"])
-def test_options_of_dask_do_not_swallow_arguments(a, option):
-    with pytest.raises(TypeError, match=f"{option}: Client.submit has options of this name"):
-        a.submit(options, **{option: 1})
-
-
 def test_arguments_named_like_options_can_be_bound(a):
     task = a.submit(partial(options, workers=3, key=1, priority=2), key="bound")
     assert (task.key, task.result()) == ("bound", (1, 2, 3))
@@ -88,23 +78,13 @@ def test_arguments_named_like_options_can_be_bound(a):
 def test_higher_priority_runs_first(b, client, wait_until):
     gate = f"gate-{uuid.uuid4().hex}"
     blocker = b.submit(wait_for, gate, priority=100)
-    low = b.submit_many(stamp, range(3))
-    high = b.submit_many(stamp, range(3), priority=5)
+    low = [b.submit(stamp) for _ in range(3)]
+    high = [b.submit(stamp, priority=5) for _ in range(3)]
     keys = {future.key for future in (blocker, *low, *high)}
     wait_until(lambda: keys <= client.cluster.workers["B-0"].state.tasks.keys())
     Event(gate, client=client).set()
     assert blocker.result()
     assert max(future.result() for future in high) < min(future.result() for future in low)
-
-
-def test_submit_many_takes_iterators_and_runs_equal_calls_each_by_itself(a):
-    futures = a.submit_many(ident, iter([1] * 20))
-    assert len({future.result() for future in futures}) == 20
-
-
-def test_wait_names_what_is_missing(client):
-    with pytest.raises(PoolError, match=r"'C' has 0 of 2 workers after 0.05 s: .*C=1"):
-        Partition("C", client).wait(2, timeout_s=0.05)
 
 
 # -- from inside tasks, again, and by clients that cannot ------------------------------
@@ -143,8 +123,6 @@ def counted(client):
 
 def test_tasks_that_fail_run_again(a, counted):
     assert a.submit(fail_at_first, counted, 0, retries=2).result() == 0
-    again = a.submit_many(fail_at_first, [counted] * 2, [3, 6], retries=2)
-    assert [future.result() for future in again] == [3, 6]
     with pytest.raises(ValueError, match="item 9, try 2"):
         a.submit(fail_at_first, counted, 9, retries=1).result()
 
@@ -207,8 +185,7 @@ def test_a_task_may_take_several_slots(a, client, wait_until):
     assert client.gather(tasks) == [True, True]
     assert behind.result() in ("A-0", "A-1")
     assert list(a.map(abs, range(5), slots=2)) == list(range(5))
-    assert [f.result() for f in a.submit_many(abs, range(3), slots=2)] == [0, 1, 2]
-    for call in (a.submit, a.submit_many, a.map):
+    for call in (a.submit, a.map):
         with pytest.raises(ValueError, match="slots is 0; give a whole number, 1 or more"):
             call(abs, [1], slots=0)
 

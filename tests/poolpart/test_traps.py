@@ -94,7 +94,7 @@ def test_two_deaths_condemn_a_pile_of_innocent_tasks_and_not_a_window(
     count = 40
     # What has ended is lost with the worker, but is not to blame: most are not to end before.
     gate = Event("innocent", nannies)
-    pile = partition.submit_many(slowly_after, range(count), [gate.name] * count)
+    pile = [partition.submit(slowly_after, number, gate.name) for number in range(count)]
     for _ in range(2):
         wait_until(lambda: any(future.done() for future in pile))
         kill_and_wait(nannies, "1", wait_until)

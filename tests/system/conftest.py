@@ -23,9 +23,10 @@ from tests.clusters import thread_cluster
 import lidarpool.report.pictures
 import lidarpool.scan.driver
 from lidarpool import Cloud
+from lidarpool.base.tracing import trace_to
 from lidarpool.cli.commands import main
 from lidarpool.run.local import local_cluster
-from poolpart import fetch_available, trace_to
+from poolpart import fetch_available
 
 
 @pytest.fixture(scope="session")

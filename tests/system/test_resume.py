@@ -43,7 +43,7 @@ import lidarpool.cli.run_command, lidarpool.report.output, lidarpool.report.pict
 from lidarpool.__main__ import main
 from lidarpool.scan.database import RunDatabase
 from lidarpool.scan.driver import SurveyDriver
-from poolpart import trace_to
+from lidarpool.base.tracing import trace_to
 
 pictures.take_shot = lambda *_, **__: None
 def draw(path, *_, **__): path.write_bytes(b"x")

@@ -10,14 +10,14 @@ REST_S = 3.0  # Dask's Active Memory Manager looks every two seconds
 
 
 def _count_builds(dask_worker=None) -> None:
-    from poolpart import trace_to  # these functions travel by value
+    from lidarpool.base.tracing import trace_to  # these functions travel by value
 
     dask_worker.builds = builds = []
     trace_to(lambda point, fields: builds.append(point) if point == "intersect.built" else None)
 
 
 def _builds(dask_worker=None) -> int:
-    from poolpart import trace_to
+    from lidarpool.base.tracing import trace_to
 
     trace_to(None)
     return len(dask_worker.builds)

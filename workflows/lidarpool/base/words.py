@@ -17,3 +17,8 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     lower = {name.lower(): name for name in known}
     near = difflib.get_close_matches(word.lower(), lower, n=1, cutoff=0.6)
     return f" Did you mean {lower[near[0]]!r}?" if near else ""
+
+
+def counted(number: float, what: str, several: str = "") -> str:
+    """Return number and noun: «1 worker», «1,200 workers»."""
+    return f"{number:,} {what if number == 1 else several or what + 's'}"

@@ -75,7 +75,7 @@ def told(job: Job, found: dict[str, Any]) -> Iterator[str]:
     """Tell of a forecast in lines for people."""
     from dask.utils import format_bytes
 
-    from poolpart.wording import counted
+    from ..base.words import counted
 
     sensor, estimate, disk = job.survey.sensor, found["estimate"], found["disk"]
     turn = f"{sensor.channels:,} a firing"

@@ -203,7 +203,7 @@ def info(scheduler: str | None, files: TlsFiles) -> None:
 
 
 def _tell_workers(pool: Pool) -> None:
-    from poolpart.wording import counted
+    from ..base.words import counted
 
     hosts = {worker.host for worker in pool}
     click.echo(f"cluster: {counted(len(pool), 'worker')} on {counted(len(hosts), 'host')}")

@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Any
 import click
 from distributed import Client
 
-from poolpart.wording import counted
-
 from ..base.vocabulary import PATIENCE_S, WAIT_S
+from ..base.words import counted
 from ..report.output import result_folder, write_result
 from ..report.report import summary
 from ..run.checks import check_backend_here

@@ -66,8 +66,7 @@ def terrain(out: Path, triangles: int, seed: int, side: float) -> None:
 
 
 def _write(out: Path, make: Callable[[], Scene]) -> None:
-    from poolpart.wording import counted
-
+    from ..base.words import counted
     from ..scene.scene_file import check_target, write_scene
 
     check_target(out)

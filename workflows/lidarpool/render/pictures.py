@@ -8,8 +8,7 @@ import numpy as np
 from matplotlib.colors import LogNorm, Normalize
 from numpy.typing import NDArray
 
-from poolpart.wording import counted
-
+from ..base.words import counted
 from ..scene.scene import Scene
 from . import theme
 from .intensity import density_colours, density_range, hit_density

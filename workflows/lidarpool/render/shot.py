@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw
 
-from poolpart.wording import counted
-
+from ..base.words import counted
 from ..scene.scene import Scene
 from . import theme
 from .camera import Camera, fit_camera

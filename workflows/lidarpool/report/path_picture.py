@@ -14,9 +14,8 @@ from matplotlib.patches import Circle
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
-from poolpart.wording import counted
-
 from ..base.choice import one_of_each_part
+from ..base.words import counted
 from ..plan import Plan, Planning
 from ..render import theme
 from ..render.page import FONT, Page

@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from poolpart.wording import counted
-
 from ..base.errors import LidarpoolError
+from ..base.words import counted
 from ..plan import Plan, Planning
 from ..scene.actors import Actor
 from ..scene.mesh import Mesh

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from poolpart import Recorder, TaskRecord, trace
+from poolpart import Recorder, TaskRecord
 
+from ..base.tracing import trace
 from ..columns.parts import PartColumns
 from .failures import naming_scans
 from .messages import samples_of_scan, summary_type

@@ -29,11 +29,11 @@ from poolpart import (
     forget_pipes,
     take_held,
     take_news,
-    trace,
 )
 
 from ..base.errors import LidarpoolError
 from ..base.task_book import TaskBook
+from ..base.tracing import trace
 from ..columns.cloud import Cloud
 from ..columns.parts import SUFFIX
 from ..columns.storage import Storage

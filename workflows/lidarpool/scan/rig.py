@@ -18,9 +18,10 @@ import cloudpickle
 import numpy as np
 from distributed import get_worker
 
-from poolpart import own_device, trace
+from poolpart import own_device
 from raybeam import Pattern, ScanReturns
 
+from ..base.tracing import trace
 from ..scene.scene import Scene
 from ..sensor import ScanSpec, Survey
 from .echoes import PATTERN_RAYS, EchoCaster

@@ -22,9 +22,9 @@ from poolpart import (
     hold_for_driver,
     own_client,
     telling_departure,
-    trace,
 )
 
+from ..base.tracing import trace
 from ..columns.parts import pack
 from ..columns.storage import Storage
 from ..sensor import Survey

@@ -14,8 +14,7 @@ import yaml
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from poolpart.wording import counted
-
+from ...base.words import counted
 from ...render.page import shortened, without_common_prefix
 from ...run.result import Result
 from ...run.trials import TRIAL

@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from poolpart import TaskRecord
-from poolpart.wording import counted
 
 from ...base.task_book import StageTotals, union
+from ...base.words import counted
 from ...render.stage import nice_step
 from .words import duration
 
