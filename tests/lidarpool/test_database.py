@@ -117,7 +117,9 @@ def test_parts_that_are_dropped_are_missing_again(db):
         assert found.missing(0, SCANS) == [(4, 8)]
         assert (found.scans_done, found.point_count, found.hits) == (16, 14, 42)
     assert again.commit([receipt(4, 6), receipt(6, 8)]) == [receipt(4, 6), receipt(6, 8)]
-    assert again.missing(0, SCANS) == []
+    assert again.missing(0, SCANS) == [] and not again.complete
+    again.frames = SCANS
+    assert again.complete
     again.close()
 
 
@@ -141,13 +143,6 @@ def test_frames_that_were_handed_out_are_kept_with_the_next_commit(db):
     assert last.part_of(0).summaries == b"", "of those that are out nobody needs them in memory"
     assert last.summaries_of([13, 0, 1, 9]) == [(0, b"summary"), (8, b"summary"), (12, b"summary")]
     last.close()
-
-
-def test_it_is_complete_when_all_is_committed_and_handed_out(db):
-    db.commit([receipt(0, 20)])
-    assert not db.complete
-    db.frames = 20
-    assert db.complete
 
 
 def test_the_cells_of_all_parts(db):

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 from collections import namedtuple
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
 import lidarpool.base.fingerprint
-from lidarpool import Beams, Column, LidarpoolError, Sensor, Spin, Survey
+from lidarpool import Beams, LidarpoolError, Sensor, Spin
 from lidarpool.base.fingerprint import fingerprint
 from lidarpool.sensor import Head
 
@@ -194,14 +194,6 @@ def test_a_function_that_ran_has_the_same():
     assert fingerprint(thing) == before
 
 
-def test_a_sensor_of_another_class_is_another():
-    plain = made("class C(Sensor): pass")
-    other = made("class C(Sensor):\n  def origins(self, f): return None")
-    assert len({fingerprint(s) for s in (Sensor(), plain, other)}) == 3
-    assert fingerprint(Sensor.grid()) == fingerprint(Sensor.grid())
-    assert fingerprint(Sensor.grid()) != fingerprint(replace(Sensor.grid(), max_range_m=99.0))
-
-
 SCRIPT = """
 import numpy as np
 from lidarpool import Beams, Column, Pose, Sensor, Spin, Survey
@@ -252,11 +244,3 @@ def test_what_has_none_is_refused_by_name(thing, name):
     for outer in (thing, [thing], Box({"a": thing})):
         with pytest.raises(LidarpoolError, match=f"of type {name} has no fingerprint.*keep num"):
             fingerprint(outer)
-
-
-def test_a_survey_with_something_that_has_none_is_refused():
-    lock = threading.Lock()
-    column = Column("locked", "uint8", "", "", lambda returns: lock)
-    survey = Survey(poses=[(0, 0, 1)], columns=[column])
-    with pytest.raises(LidarpoolError, match="of type lock has no fingerprint"):
-        fingerprint(survey.columns)

@@ -29,7 +29,6 @@ from lidarpool.sensor.optics import Returns
 WALL_M = 8.0
 PRECISION_M = 0.001
 SECONDS = np.linspace(0, 0.5, 6)
-HALF = np.radians(30) * SECONDS / 2
 # 20 m/s, and 30 degrees a second to the left.
 DRIVE = Track(
     SECONDS,
@@ -188,16 +187,6 @@ def test_an_actor_behind_glass_is_where_it_is_without(street, backend):
     assert np.array_equal(plain["time"], seen["time"])
     assert np.allclose(plain["range"], seen["range"], atol=1e-4)
     assert (seen["intensity"] < 0.93 * plain["intensity"]).all()
-
-
-def test_actors_that_cannot_be_met_are_not_asked(street, monkeypatch):
-    far = Actor(box("Far", (1, 1, 1)), way((0, 500, 0, 0, 0), (9, 500, 0, 0, 0)))
-    behind = Actor(box("Above", (1, 1, 1)), way((0, 0, 0, 60, 0), (9, 0, 0, 60, 0)))
-    scene = replace(street, actors=(far, behind))
-    rig = Rig(RigPlan(scene, Survey(load_sensor("velodyne/vlp16"), poses=[(0, 0, 1)]), "numpy"))
-    for actor in rig._caster._actors:
-        monkeypatch.setattr(actor, "_caster", None)
-    assert sum(len(batch) for batch in rig.cast(0, 36)) > 1000
 
 
 def test_however_scans_are_batched_actors_have_the_same_bits(street):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import pickle
 
 import numpy as np
 import pytest
@@ -38,41 +37,22 @@ def part_of(first, counts, seed=0, columns=COLUMNS):
     return PartColumns(first, counts, made, triangles, np.arange(1, len(triangles) + 1))
 
 
-def equal(one, other):
-    return (
-        (one.first, one.stop, len(one)) == (other.first, other.stop, len(other))
-        and list(one.columns) == list(other.columns)
-        and all(
-            a.dtype == b.dtype and np.array_equal(a, b)
-            for a, b in (
-                (one.counts, other.counts),
-                (one.triangles, other.triangles),
-                (one.hits, other.hits),
-                *((one.columns[name], other.columns[name]) for name in one.columns),
-            )
-        )
-    )
-
-
-# -- files ----------------------------------------------------------------------------------------
-
-
 @settings(max_examples=50)
 @given(st.integers(0, 10**6), st.lists(st.integers(0, 7), min_size=1, max_size=6))
 def test_what_is_packed_comes_back(first, counts):
     part = part_of(first, counts)
     data = bytes(pack(part))
-    assert equal(unpack(data), part)
-    assert bytes(pack(unpack(data))) == data
-    assert part.stop == first + len(counts)
-    scans = part.scan_column()
+    again = unpack(data)
+    assert pack(again) == data
+    assert (again.first, again.stop) == (first, first + len(counts))
+    scans = again.scan_column()
     assert scans.dtype == np.int32
     assert scans.tolist() == [s for s, n in enumerate(counts, first) for _ in range(n)]
     if len(part):
         axes = np.stack([part.columns[axis] for axis in "xyz"], axis=1)
-        assert part.cells.tolist() == [axes.min(axis=0).tolist(), axes.max(axis=0).tolist()]
+        assert again.cells.tolist() == [axes.min(axis=0).tolist(), axes.max(axis=0).tolist()]
     else:
-        assert part.cells is None
+        assert again.cells is None
 
 
 def test_numpy_opens_a_part():
@@ -82,7 +62,9 @@ def test_numpy_opens_a_part():
         assert archive.files == names
         assert archive[".scans"].tolist() == [7, 10]
         assert archive[".counts"].tolist() == [2, 0, 3]
-        assert archive["time"].dtype == np.int64
+        for column in COLUMNS:
+            assert archive[column.name].dtype == np.dtype(column.dtype)
+            assert np.array_equal(archive[column.name], part.columns[column.name])
 
 
 def test_columns_that_are_not_contiguous_are_packed_as_they_read():
@@ -104,7 +86,7 @@ def test_damage_at_any_place_is_noticed_or_changes_nothing():
         damaged = bytearray(data)
         damaged[place] ^= flip
         try:
-            assert equal(unpack(bytes(damaged)), SMALL), (place, flip)
+            assert pack(unpack(bytes(damaged))) == data, (place, flip)
         except LidarpoolError as error:
             noticed += 1
             assert str(error).startswith("it is damaged (")
@@ -156,7 +138,7 @@ def storage(request, tmp_path):
 
 def test_a_part_in_storage(storage):
     storage.write("a.npz", pack(SMALL))
-    assert equal(read_part(storage, "a.npz"), SMALL)
+    assert pack(read_part(storage, "a.npz")) == pack(SMALL)
     triangles, hits = read_tally(storage, "a.npz")
     assert np.array_equal(triangles, SMALL.triangles) and np.array_equal(hits, SMALL.hits)
 
@@ -168,9 +150,6 @@ def test_a_part_that_cannot_be_read_is_named(storage, read):
     storage.write("cut.npz", bytes(pack(SMALL))[:-30])
     with pytest.raises(LidarpoolError, match=r"The part .*cut\.npz cannot be used.*start it anew"):
         read(storage, "cut.npz")
-
-
-# -- clouds ---------------------------------------------------------------------------------------
 
 
 def stored_cloud(storage, counts):
@@ -227,13 +206,6 @@ def test_a_cloud_is_the_same_however_it_is_divided(tmp_path_factory, counts, poi
     assert not chunks or same(Cloud.joined(chunks), whole)
 
 
-def test_a_cloud_in_parts_is_small_to_send(storage):
-    cloud, _ = stored_cloud(storage, [[3, 4], [2]])
-    data = pickle.dumps(cloud)
-    assert len(data) < 5000
-    assert same(pickle.loads(data).load(), cloud.load())
-
-
 def test_a_sample_is_of_the_cloud_and_in_its_order(storage):
     cloud, _ = stored_cloud(storage, [[40], [0, 0], [7, 90], [1], [0], [62]])
     whole = cloud.load()
@@ -253,13 +225,6 @@ def test_a_sample_is_of_the_cloud_and_in_its_order(storage):
     assert 0 < len(found) <= 50 and len(set(opened)) <= 2
     none = stored_cloud(storage, [[0], [0, 0]])[0].sample(10, 256)
     assert len(none) == 0 and none.table[0].name == "scan"
-
-
-def test_a_cloud_whose_part_is_lost_says_so(storage):
-    cloud, _ = stored_cloud(storage, [[3], [4]])
-    storage.remove(["1.npz"])
-    with pytest.raises(LidarpoolError, match=r"1\.npz cannot be read"):
-        cloud.load()
 
 
 @pytest.mark.parametrize("precision", [1e-6, 1e-3, 0.01, 0.05, 0.07, 0.25, 1.0, 1000.0])

@@ -9,7 +9,6 @@ import pytest
 
 from raybeam import Motion, Pattern, RayCaster, workspace
 from raybeam.rays import Rays, unit_directions
-from raybeam.scan import Collector, check_scan
 
 TRIANGLE = [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]
 
@@ -255,19 +254,6 @@ def test_nothing_to_scan(caster, shapes):
     assert (len(away), away.hits.tolist(), away.tally.sum()) == (0, [0], 0)
 
 
-def test_groups_are_counted_across_chunks():
-    groups = [0, 4, 4, 9]
-    scan = check_scan(Pattern(np.eye(3)), [0, 0, 0], window=(0, 12), keep_every=2, groups=groups)
-    ray = np.array([0, 1, 2, 3, 5, 6, 7, 8, 9, 11])
-    for cut in range(1, 13):
-        collector, kept = Collector(scan, 1), []
-        for start in range(0, 12, cut):
-            part = ray[(ray >= start) & (ray < start + cut)]
-            kept.extend(part[collector.keep(part - start, start, min(start + cut, 12))].tolist())
-        assert kept == [0, 2, 5, 7, 9]
-        assert collector.result().hits.tolist() == [4, 0, 4, 2]
-
-
 # ---- what is refused ----
 
 
@@ -304,17 +290,6 @@ def test_scan_refused(change, words):
         caster.scan(**{"pattern": Pattern(np.eye(3)), "positions": [0, 0, 0], **change})
 
 
-@pytest.mark.parametrize(
-    "change",
-    [{"window": (0, 1.0)}, {"rays_per_pose": 1.5}, {"keep_every": 1.0}, {"t_min": None}],
-    ids=str,
-)
-def test_what_is_no_number(change):
-    caster = RayCaster(*TRIANGLE, "numpy")
-    with pytest.raises(TypeError):
-        caster.scan(Pattern(np.eye(3)), [0, 0, 0], **change)
-
-
 # ---- the pattern itself ----
 
 
@@ -328,15 +303,6 @@ def test_pattern_refused():
     for table in ("directions", "origins"):
         with pytest.raises(ValueError, match="read-only"):
             getattr(Pattern(np.eye(3), np.eye(3)), table)[0] = 1
-
-
-def test_pattern_is_what_was_given():
-    pattern = Pattern(2 * np.eye(3), [1, 2, 3])
-    np.testing.assert_array_equal(pattern.directions, np.eye(3))
-    np.testing.assert_array_equal(pattern.origins, np.tile([1, 2, 3], (3, 1)))
-    assert repr(pattern) == "Pattern(3 directions, origins)"
-    assert repr(Pattern(np.eye(3))) == "Pattern(3 directions)"
-    assert Pattern(np.eye(3)).origins is None
 
 
 @pytest.mark.parametrize(
