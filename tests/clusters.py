@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 from distributed import Scheduler, SpecCluster, Worker
 
 
-def thread_cluster(*resources: Mapping[str, int], **options: Any) -> SpecCluster:
-    """Start a cluster with a worker for each mapping of resources: {partition: slots}.
+@contextmanager
+def thread_cluster(*resources: Mapping[str, int], **options: Any) -> Iterator[SpecCluster]:
+    """A cluster with a worker for each mapping of resources: {partition: slots}.
 
     Each worker has one thread: stages 1, 3 and 4 give it away while they wait. It is named after
     its resources, which have to differ. `options` are for scheduler and workers.
@@ -24,4 +26,13 @@ def thread_cluster(*resources: Mapping[str, int], **options: Any) -> SpecCluster
     }
     own = {"port": 0, "dashboard_address": "127.0.0.1:0"}
     scheduler = {"cls": Scheduler, "options": {**common, **own}}
-    return SpecCluster(workers, scheduler, security=options.get("security"), silence_logs=50)
+    security = options.get("security")
+    with SpecCluster(workers, scheduler, security=security, silence_logs=50) as cluster:
+        try:
+            yield cluster
+        finally:
+            # Dask does that when the last worker of the process closes. Until then a client asks
+            # by the connections of a worker that is gone: "ConnectionPool is closed".
+            for client in list(Worker._initialized_clients):
+                if client.scheduler and client.scheduler.address == cluster.scheduler_address:
+                    client.close()

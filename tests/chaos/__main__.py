@@ -16,27 +16,22 @@ from collections import Counter
 from lidarpool import Survey
 
 from .arena import Arena
-from .events import KILL, KINDS
-from .nemesis import Fault, make_plan
-from .points import DRIVER_POINTS, STAGE_POINTS
+from .events import KILL, KINDS, RANDOM, Fault
+from .nemesis import make_plan
+from .points import DRIVER_POINTS, RARE_POINTS, WORKER_POINTS
 from .survey import PAUSES, Outcome, Reference, disturbed, reference, survey
 
 FAULTS_PER_RUN = 8
 SPARE_FAULTS = 0.05  # part that may find nobody to strike
 VAIN_RUNS_MOST = 2  # one after the other in which nothing that was left to do could be done
 
-# Points that many a run does not come to: what is to happen there waits for one that does.
-RARE_POINTS = ("driver.duplicate", "driver.stale", "driver.replay")
-WORKER_POINTS = tuple(point for points in STAGE_POINTS.values() for point in points)
-
 
 class Campaign:
     """Runs of one seed, one after the other."""
 
-    def __init__(self, faults: int, seed: int, what: Survey, crossed: bool = True) -> None:
+    def __init__(self, faults: int, seed: int, what: Survey) -> None:
         self.what = what
-        usual = [point for point in DRIVER_POINTS if point not in RARE_POINTS]
-        self.waiting = make_plan(seed, faults, WORKER_POINTS, usual, what.scan_count, crossed)
+        self.waiting = make_plan(seed, faults, WORKER_POINTS, DRIVER_POINTS, what.scan_count)
         self.lurking = [
             Fault(len(self.waiting) + number, KILL, point, partition="LIDAR")
             for number, point in enumerate(RARE_POINTS)
@@ -72,7 +67,8 @@ class Campaign:
     def table(self) -> str:
         """Faults carried out, by kind and point."""
         done = self.done
-        points = sorted({point for _, point in done}, key=_rank)
+        order = (*WORKER_POINTS, *DRIVER_POINTS, *RARE_POINTS, RANDOM)
+        points = sorted({point for _, point in done}, key=order.index)
         width = max(map(len, points), default=0)
         lines = [" " * width + "".join(f"{kind:>9}" for kind in KINDS)]
         for point in points:
@@ -88,11 +84,6 @@ class Campaign:
         identical = "yes" if all(outcome.identical for outcome in self.outcomes) else "no"
         faults = sum(self.done.values())
         return f"faults {faults} lost {lost} duplicated {duplicated} identical {identical}"
-
-
-def _rank(point: str) -> tuple[int, str]:
-    order = (*WORKER_POINTS, *DRIVER_POINTS)
-    return (order.index(point) if point in order else len(order)), point
 
 
 def _tell(number: int, outcome: Outcome, faults: int) -> None:

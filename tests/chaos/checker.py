@@ -1,50 +1,23 @@
 """Verdicts on a run, from what was written down and what was delivered.
 
-Nothing here knows how the run works: which points mean that a scan was asked for, sent,
-delivered or let go of is in a table, and the delivered cloud is compared with what another,
-undisturbed run had in it. So a fault of the code under test cannot hide in the checker.
+Nothing here knows how the run works but for the points that say that a scan was asked for,
+delivered or let go of, and the delivered cloud is compared with what another, undisturbed run
+had in it. So a fault of the code under test cannot hide in the checker.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-
-@dataclass(frozen=True)
-class Words:
-    """Which points say what.
-
-    Parameters
-    ----------
-    asked
-        The scan was described: from here on it must arrive.
-    delivered
-        The scan arrived, in each of these ways once.
-    ordered
-        The ways in which scans arrive in order.
-    released
-        The scan was let go of: it had arrived in every way.
-    tried
-        Work on the scan began or was handed on; the second time is another attempt.
-    """
-
-    asked: str
-    delivered: Mapping[str, str]  # {way: point}
-    ordered: Collection[str]
-    released: str
-    tried: Collection[str]
-
-
-SURVEY = Words(
-    asked="generate.put",
-    delivered={"frame": "driver.frame", "points": "driver.points"},
-    ordered=("frame",),
-    released="driver.release",
-    tried=("generate.put", "intersect.start", "driver.handon", "driver.replay"),
-)
+ASKED = "generate.put"  # the scan was described: from here on it must arrive
+DELIVERED = {"frame": "driver.frame", "points": "driver.points"}  # each way once
+ORDERED = ("frame",)  # the ways in which scans arrive in order
+RELEASED = "driver.release"  # the scan was let go of: it had arrived in every way
+# Work on the scan began or was handed on; the second time is another attempt.
+TRIED = ("generate.put", "intersect.start", "driver.handon", "driver.replay")
 
 
 @dataclass(frozen=True)
@@ -98,7 +71,6 @@ def judge(
     scans: int,
     rows: Sequence[int],
     expected_rows: Sequence[int],
-    words: Words = SURVEY,
 ) -> Verdict:
     """Judge one run.
 
@@ -112,26 +84,24 @@ def judge(
         Scan of each row of the delivered cloud.
     expected_rows
         Scan of each row of the cloud as it should be.
-    words
-        Which points say what.
     """
     log = list(events)
     every = set(range(scans))
-    asked = {scan for event in log if event["point"] == words.asked for scan in event["scans"]}
+    asked = {scan for event in log if event["point"] == ASKED for scan in event["scans"]}
     lost = [f"scan {scan} was never described" for scan in sorted(every - asked)]
     duplicated: list[str] = []
     unexpected: list[str] = []
     counts: dict[str, Counter[int]] = {}
-    for way, point in words.delivered.items():
+    for way, point in DELIVERED.items():
         order = [scan for event in log if event["point"] == point for scan in event["scans"]]
         counts[way] = Counter(order)
         lost += [f"scan {s} ({way})" for s in sorted(every - counts[way].keys())]
         duplicated += [f"scan {s} ({way})" for s, n in sorted(counts[way].items()) if n > 1]
         strangers = sorted(counts[way].keys() - (asked & every))
         unexpected += [f"scan {s} ({way}, never asked for)" for s in strangers]
-        if way in words.ordered:
+        if way in ORDERED:
             unexpected += [f"scan {s} ({way}, out of order)" for s in _out_of_order(order)]
-    unexpected += _released_early(log, words)
+    unexpected += _released_early(log)
     _compare_rows(rows, expected_rows, lost, duplicated, unexpected)
     arrived = {s for s in every if all(count[s] == 1 for count in counts.values())}
     return Verdict(
@@ -139,7 +109,7 @@ def judge(
         tuple(lost),
         tuple(duplicated),
         tuple(unexpected),
-        tuple(sorted(arrived & _tried_again(log, words))),
+        tuple(sorted(arrived & _tried_again(log))),
     )
 
 
@@ -153,24 +123,24 @@ def _out_of_order(order: Sequence[int]) -> list[int]:
     return found
 
 
-def _released_early(log: Iterable[Mapping[str, Any]], words: Words) -> list[str]:
+def _released_early(log: Iterable[Mapping[str, Any]]) -> list[str]:
     """Scans that were let go of when they had not arrived in every way."""
-    here: dict[str, set[int]] = {point: set() for point in words.delivered.values()}
+    here: dict[str, set[int]] = {point: set() for point in DELIVERED.values()}
     found = []
     for event in log:
         if event["point"] in here:
             here[event["point"]].update(event["scans"])
-        elif event["point"] == words.released:
+        elif event["point"] == RELEASED:
             early = [s for s in event["scans"] if not all(s in there for there in here.values())]
             found += [f"scan {scan} (released before it had arrived)" for scan in early]
     return found
 
 
-def _tried_again(log: Iterable[Mapping[str, Any]], words: Words) -> set[int]:
+def _tried_again(log: Iterable[Mapping[str, Any]]) -> set[int]:
     tries = Counter(
         (scan, event["point"], event.get("stage", ""))
         for event in log
-        if event["point"] in words.tried
+        if event["point"] in TRIED
         for scan in event["scans"]
     )
     return {scan for (scan, _, _), count in tries.items() if count > 1}

@@ -43,26 +43,38 @@ SIGNALS = {
     STOP: signal.SIGSTOP,
 }
 
+RANDOM = "random time"  # in place of a point
 HOLD_S = 5.0  # longest time that a point is held for somebody else to carry a fault out
 _EVENTS, _ARMED, _FIRED = "events", "armed", "fired"
 
 
 @dataclass(frozen=True)
-class Order:
-    """A fault that waits for a process to come to a point.
+class Fault:
+    """One thing to go wrong.
 
     Parameters
     ----------
     number
-        Tells faults apart.
+        Tells faults apart; their order in the plan.
     kind
         One of `KINDS`.
     point
-        Where to carry it out.
+        Named point at which it happens, or `RANDOM`.
     scan
-        At the first pass there that is about this scan or a later one.
+        At a named point: at the first pass that is about this scan or a later one.
     worker
-        Whose pass; "" for anybody's.
+        At a named point: the worker that is to come to it; "" for any.
+    partition
+        Whose worker, unless the one that passes the point is meant; "" for that one.
+    pick
+        Which of the workers, from 0 to 1.
+    after_s
+        At a random time: seconds after the one before.
+    stop_s
+        Until SIGCONT.
+    given_up
+        Whether the scheduler is to give up the stopped worker meanwhile, at once: its time to
+        live can then be so long that no other worker is given up for being slow.
     """
 
     number: int
@@ -70,72 +82,64 @@ class Order:
     point: str
     scan: int = 0
     worker: str = ""
-
-    @property
-    def file_name(self) -> str:
-        """The order as the name of its file: nothing has to be read."""
-        return f"{self.number:05d}~{self.kind}~{self.point}~{self.scan}~{self.worker}"
-
-    @classmethod
-    def parse(cls, name: str) -> Order:
-        """Inverse of `file_name`; anything may follow."""
-        number, kind, point, scan, worker = name.split("~")[:5]
-        return cls(int(number), kind, point, int(scan), worker)
+    partition: str = ""
+    pick: float = 0.0
+    after_s: float = 0.0
+    stop_s: float = 0.5
+    given_up: bool = False
 
 
 @dataclass(frozen=True)
 class Fired:
-    """An order that a process has taken.
+    """A fault that a process has taken, by its number.
 
     `path` can be removed to tell the process, which may be waiting, to go on.
     """
 
-    order: Order
+    number: int
+    kind: str
     pid: int
     worker: str
     path: Path
 
 
 class Board:
-    """The folder that all processes share: events that happened, orders that wait."""
+    """The folder that all processes share: events that happened, faults that wait."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         for name in (_EVENTS, _ARMED, _FIRED):
             (folder / name).mkdir(parents=True, exist_ok=True)
 
-    def arm(self, order: Order) -> None:
-        """Have the next process that comes to the point carry it out."""
-        (self.folder / _ARMED / order.file_name).touch()
+    def arm(self, fault: Fault) -> None:
+        """Have the next process that comes to the point carry it out.
 
-    def disarm(self) -> list[Order]:
-        """Take back the orders that nobody has come to."""
-        left = []
-        for path in sorted((self.folder / _ARMED).iterdir()):
-            with suppress(FileNotFoundError):  # taken at this moment
-                path.unlink()
-                left.append(Order.parse(path.name))
-        return left
+        All that it has to know is the name of a file: nothing has to be read.
+        """
+        name = f"{fault.number:05d}~{fault.kind}~{fault.point}~{fault.scan}~{fault.worker}"
+        (self.folder / _ARMED / name).touch()
+
+    def disarm(self) -> None:
+        """Take back the faults that nobody has come to."""
+        for path in (self.folder / _ARMED).iterdir():
+            path.unlink(missing_ok=True)  # it may be taken at this moment
 
     def claim(self, point: str, scan: int, worker: str) -> Fired | None:
-        """Take an order for this point, if there is one that nobody else takes."""
+        """Take a fault for this point, if there is one that nobody else takes."""
         for name in sorted(path.name for path in (self.folder / _ARMED).iterdir()):
-            order = Order.parse(name)
-            mine = order.worker in ("", worker)
-            if mine and order.point == point and scan >= order.scan:
-                path = self.folder / _FIRED / f"{name}~{os.getpid()}~{worker}"
-                try:
+            number, kind, where, first, whose = name.split("~")
+            if where == point and scan >= int(first) and whose in ("", worker):
+                path = self.folder / _FIRED / f"{number}~{kind}~{os.getpid()}~{worker}"
+                with suppress(FileNotFoundError):
                     (self.folder / _ARMED / name).rename(path)
-                except FileNotFoundError:
-                    continue
-                return Fired(order, os.getpid(), worker, path)
+                    return Fired(int(number), kind, os.getpid(), worker, path)
         return None
 
     def fired(self) -> Iterator[Fired]:
-        """Orders that were taken and whose files are still there."""
+        """Faults that were taken and whose files are still there."""
         for path in sorted((self.folder / _FIRED).iterdir()):
-            *_, pid, worker = path.name.split("~")
-            yield Fired(Order.parse(path.name), int(pid), worker, path)
+            number, kind, pid, worker = path.name.split("~")
+            yield Fired(int(number), kind, int(pid), worker, path)
 
     def log(self, event: Event) -> None:
         """Append an event to this process's file."""
@@ -147,15 +151,15 @@ class Board:
         finally:
             os.close(descriptor)
 
-    def events(self, run: str | None = None) -> list[Event]:
-        """All events so far, or those of a run: by process, in the order they happened there."""
+    def events(self, run: str) -> list[Event]:
+        """Events of a run so far: by process, in the order they happened there."""
         lines = (
             line
             for path in sorted((self.folder / _EVENTS).iterdir())
             for line in path.read_text().splitlines()
         )
-        events = [json.loads(line) for line in lines if run is None or run in line]
-        return [event for event in events if run is None or event.get("run") == run]
+        events = [json.loads(line) for line in lines if run in line]
+        return [event for event in events if event.get("run") == run]
 
     @property
     def has_events(self) -> bool:
@@ -174,11 +178,11 @@ class Sink:
     Parameters
     ----------
     board
-        Where to log, and where orders are.
+        Where to log, and where faults are.
     worker
         Name of the worker, or of whoever else this process is.
     strike
-        Carries an order out that was taken here.
+        Carries a fault out that was taken here.
     pauses
         Seconds to hold the thread at some points, by name, for each scan that it is about: it
         paces a run that would be over before anything could happen to it.
@@ -213,20 +217,19 @@ class Sink:
 
 
 def strike_self(fired: Fired) -> None:
-    """End or stop this process, or hold this thread until somebody has done what is ordered."""
-    kind = fired.order.kind
-    if kind == SEGV:
+    """End or stop this process, or hold this thread until somebody has done what is to be done."""
+    if fired.kind == SEGV:
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         ctypes.string_at(0)
-    elif kind in SIGNALS:
-        os.kill(os.getpid(), SIGNALS[kind])
+    elif fired.kind in SIGNALS:
+        os.kill(os.getpid(), SIGNALS[fired.kind])
     deadline = time.monotonic() + HOLD_S
     while fired.path.exists() and time.monotonic() < deadline:
         time.sleep(0.005)
 
 
 class ChaosPlugin(WorkerPlugin):
-    """Has every worker, also one that joins later, log its points and obey orders."""
+    """Has every worker, also one that joins later, log its points and carry faults out."""
 
     name = "chaos"
 

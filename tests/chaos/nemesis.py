@@ -10,17 +10,15 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
-from functools import partial
+from itertools import chain, cycle
 
 import psutil
 
 from lidarpool.base.tracing import trace_to
 
 from .arena import TIME_TO_LIVE_S, Arena
-from .events import KINDS, RESTART, RETIRE, SIGNALS, STOP, Fired, Order, Sink
+from .events import KINDS, RANDOM, RESTART, RETIRE, SIGNALS, STOP, Fault, Fired, Sink
 
-RANDOM = "random time"  # in place of a point
 PARTITIONS = ("GPU", "LIDAR", "OTHER")
 ALL_AT_ONCE = 0.15  # part of the faults at random times that come together with the one before
 SHORT_STOPS_S = 0.1, 2.0
@@ -30,89 +28,49 @@ LOOK_EVERY_S = 0.005
 WAKE_MOST_S = 30.0  # for those who are to stop to have stopped, when all is over
 
 
-@dataclass(frozen=True)
-class Fault:
-    """One thing to go wrong.
-
-    Parameters
-    ----------
-    number
-        Tells faults apart; their order in the plan.
-    kind
-        One of `events.KINDS`.
-    point
-        Named point at which it happens, or `RANDOM`.
-    scan
-        At a named point: at the first pass that is about this scan or a later one.
-    after_s
-        At a random time: seconds after the one before.
-    partition
-        Whose worker, unless the one that passes the point is meant; "" for that one.
-    pick
-        Which of the workers, from 0 to 1.
-    stop_s
-        Until SIGCONT.
-    given_up
-        Whether the scheduler is to give up the stopped worker meanwhile, at once: its time to
-        live can then be so long that no other worker is given up for being slow.
-    worker
-        At a named point: the worker that is to come to it; "" for any.
-    """
-
-    number: int
-    kind: str
-    point: str
-    scan: int = 0
-    after_s: float = 0.0
-    partition: str = ""
-    pick: float = 0.0
-    stop_s: float = 0.5
-    worker: str = ""
-    given_up: bool = False
-
-    @property
-    def order(self) -> Order:
-        """What the board is told."""
-        return Order(self.number, self.kind, self.point, self.scan, self.worker)
-
-
 def make_plan(
     seed: int,
     count: int,
     worker_points: Sequence[str],
     driver_points: Sequence[str],
     scans: int,
-    crossed: bool = True,
 ) -> list[Fault]:
     """Choose faults: the same for the same arguments.
+
+    First every point, every kind among them, then every kind at every point of the workers, and
+    for the rest faults at random times.
 
     Parameters
     ----------
     seed
         Where all choices come from.
     count
-        How many; more if the points need more.
+        How many.
     worker_points
         Points that workers pass, which strike themselves there.
     driver_points
         Points that the driver passes; it strikes some worker.
     scans
         Number of scans of a run.
-    crossed
-        Every kind of fault at every point of the workers, rather than one.
     """
     chance = random.Random(seed)
-    fault = partial(_fault, chance, scans)
-    at: list[tuple[str, str, str]] = []  # (kind, point, partition)
-    for index, point in enumerate(worker_points):
-        kinds = KINDS if crossed else (KINDS[index % len(KINDS)],)
-        at += [(kind, point, "") for kind in kinds]
-    for point in driver_points:
-        at += [(chance.choice(KINDS), point, name) for name in PARTITIONS[: 1 + crossed]]
+    turned = [KINDS[turn:] + KINDS[:turn] for turn in range(len(KINDS))]
+    first, *others = [
+        [(kind, point, "") for kind, point in zip(cycle(kinds), worker_points, strict=False)]
+        for kinds in turned
+    ]
+    at = [  # (kind, point, partition)
+        *first,
+        *((chance.choice(KINDS), point, "GPU") for point in driver_points),
+        *((chance.choice(KINDS), RANDOM, partition) for partition in PARTITIONS),
+        *chain.from_iterable(others),
+        *((chance.choice(KINDS), point, "LIDAR") for point in driver_points),
+    ]
     while len(at) < count:
         at.append((KINDS[len(at) % len(KINDS)], RANDOM, chance.choice(PARTITIONS)))
+    at = at[:count]
     chance.shuffle(at)
-    return [fault(number, *choice) for number, choice in enumerate(at)]
+    return [_fault(chance, scans, number, *choice) for number, choice in enumerate(at)]
 
 
 def _fault(
@@ -134,7 +92,7 @@ def _fault(
 
 
 class Nemesis:
-    """Carries out faults during a run; a context manager around it.
+    """Carries out faults during a run whose driver is in this process; a context manager around it.
 
     Parameters
     ----------
@@ -143,12 +101,10 @@ class Nemesis:
     faults
         What is to happen. Faults at points are armed at once; those at random times follow
         one another, from when anybody passes a point.
-    drives
-        Whether the driver is in this process, and passes its points here.
     """
 
-    def __init__(self, arena: Arena, faults: Sequence[Fault], drives: bool = True) -> None:
-        self.arena, self._drives = arena, drives
+    def __init__(self, arena: Arena, faults: Sequence[Fault]) -> None:
+        self.arena = arena
         self.faults = {fault.number: fault for fault in faults}
         self.done: Counter[tuple[str, str]] = Counter()  # {(kind, point): times}
         self.left: list[Fault] = []  # afterwards: those that were not carried out
@@ -163,9 +119,8 @@ class Nemesis:
     def __enter__(self) -> Nemesis:
         for fault in self.faults.values():
             if fault.point != RANDOM:
-                self.arena.board.arm(fault.order)
-        if self._drives:
-            trace_to(_DriverSink(self))
+                self.arena.board.arm(fault)
+        trace_to(_DriverSink(self))
         self._looker.start()
         return self
 
@@ -175,7 +130,7 @@ class Nemesis:
         self._looker.join()
         self.arena.board.disarm()
         for fired in self.arena.board.fired():
-            fault = self.faults[fired.order.number]
+            fault = self.faults[fired.number]
             if not fault.given_up:  # nobody has done that
                 self._note(fault)
             fired.path.unlink()
@@ -208,7 +163,7 @@ class Nemesis:
 
     def _answer(self, fired: Fired) -> None:
         """Do what a process that has come to a point cannot do by itself."""
-        fault = self.faults[fired.order.number]
+        fault = self.faults[fired.number]
         if fault.partition:  # the driver does that in its own thread
             return
         self._note(fault)
@@ -302,7 +257,7 @@ class _DriverSink(Sink):
 
     def _strike(self, fired: Fired) -> None:
         fired.path.unlink(missing_ok=True)
-        self._nemesis.strike(self._nemesis.faults[fired.order.number])
+        self._nemesis.strike(self._nemesis.faults[fired.number])
 
 
 def _is_going(pid: int) -> bool:

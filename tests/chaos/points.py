@@ -37,21 +37,23 @@ driver.replay      a batch is about to be offered or handed on once more; `reaso
 
 from __future__ import annotations
 
-from lidarpool.scan.names import COLLECT, GENERATE, INTERSECT, SORT
-
-# {stage: its points, in the order in which it passes them}
-STAGE_POINTS = {
-    GENERATE: ("generate.start", "generate.put", "generate.sent"),
-    INTERSECT: ("intersect.start", "intersect.cast", "intersect.end"),
-    SORT: ("sort.start", "sort.get", "sort.put", "sort.sent"),
-    COLLECT: (
-        "collect.start",
-        "collect.get",
-        "collect.part",
-        "collect.stored",
-        "collect.sent",
-    ),
-}
+WORKER_POINTS = (
+    "generate.start",
+    "generate.put",
+    "generate.sent",
+    "intersect.start",
+    "intersect.cast",
+    "intersect.end",
+    "sort.start",
+    "sort.get",
+    "sort.put",
+    "sort.sent",
+    "collect.start",
+    "collect.get",
+    "collect.part",
+    "collect.stored",
+    "collect.sent",
+)
 
 DRIVER_POINTS = (
     "driver.take",
@@ -60,7 +62,7 @@ DRIVER_POINTS = (
     "driver.points",
     "driver.frame",
     "driver.release",
-    "driver.duplicate",
-    "driver.stale",
-    "driver.replay",
 )
+
+# Points that many a run does not come to: what is to happen there waits for one that does.
+RARE_POINTS = ("driver.duplicate", "driver.stale", "driver.replay")

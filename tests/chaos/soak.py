@@ -1,7 +1,7 @@
 """A long survey with a worker killed every few seconds: `python -m tests.chaos.soak`.
 
-The driver is a process of its own, the scheduler is in this one, so that the memory of each
-is seen. Afterwards nothing may be left on the scheduler that was not there before.
+Driver and scheduler are in this process, whose memory is seen. Afterwards nothing may be left
+on the scheduler that was not there before.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ import argparse
 import logging
 import random
 import sys
+import threading
 import time
-from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,11 +21,9 @@ import psutil
 from lidarpool import Survey
 
 from .arena import Arena
-from .checker import Verdict, judge
-from .driver import Delivered, Driver
-from .events import KILL, SEGV, TERM
-from .nemesis import PARTITIONS, RANDOM, Fault, Nemesis
-from .survey import STEPS, Reference, reference, survey
+from .events import KILL, RANDOM, SEGV, TERM, Fault
+from .nemesis import PARTITIONS
+from .survey import STEPS, Outcome, Reference, disturbed, reference, survey
 from .traces import scheduler_state, settled_differences
 
 PACE_S = 0.02  # a scan
@@ -37,80 +35,46 @@ LETHAL = (KILL, KILL, TERM, SEGV)
 
 
 @dataclass(frozen=True)
-class Sample:
-    """Resident memory at one moment, in MiB."""
-
-    seconds: float
-    driver: float
-    scheduler: float
-
-    @classmethod
-    def now(cls, seconds: float, driver: int | None) -> Sample:
-        """Look at a driver's process, and at this one."""
-        return cls(seconds, _resident(driver), _resident(None))
-
-
-def _resident(pid: int | None) -> float:
-    try:
-        return float(psutil.Process(pid).memory_info().rss) / (1 << 20)
-    except psutil.NoSuchProcess:  # it has just ended
-        return float("nan")
-
-
-@dataclass(frozen=True)
 class Soaked:
     """What a soak has shown."""
 
-    samples: list[Sample]
-    faults: Counter[str]
-    delivered: Delivered
-    verdict: Verdict
-    identical: bool
+    outcome: Outcome
+    memory: list[tuple[float, float]]  # seconds, MiB resident
     left_on_scheduler: list[str]
 
     @property
     def sound(self) -> bool:
         """Whether nothing is lost and nothing is left."""
-        return (
-            self.verdict.sound
-            and self.identical
-            and not (self.left_on_scheduler or self.delivered.misplaced)
-        )
+        return self.outcome.sound and not self.left_on_scheduler
 
-    def growth(self, who: str) -> float:
+    @property
+    def growth(self) -> float:
         """MiB by which memory grew from the second quarter of the time to the last."""
-        values = [getattr(sample, who) for sample in self.samples]
+        values = [mebibytes for _, mebibytes in self.memory]
         quarter = max(1, len(values) // 4)
-        return float(np.nanmedian(values[-quarter:]) - np.nanmedian(values[quarter : 2 * quarter]))
+        return float(np.median(values[-quarter:]) - np.median(values[quarter : 2 * quarter]))
 
 
 def soak(arena: Arena, what: Survey, expected: Reference, seed: int) -> Soaked:
     """Survey while workers are killed all the time."""
-    samples: list[Sample] = []
+    memory: list[tuple[float, float]] = []
+    over, started = threading.Event(), time.monotonic()
+
+    def watch() -> None:
+        while not over.wait(SAMPLE_EVERY_S):
+            resident = psutil.Process().memory_info().rss / (1 << 20)
+            memory.append((time.monotonic() - started, resident))
+
     arena.wait_until_whole()
-    arena.board.forget_events()
-    known = scheduler_state(arena.client)
-    with Nemesis(arena, _faults(random.Random(seed), what.scan_count), drives=False) as nemesis:
-        driver = Driver(arena.client.scheduler.address, what, None, arena.board.folder)
-        while not driver.is_done and not arena.board.has_events:
-            time.sleep(0.01)
-        started = time.monotonic()
-        while not driver.is_done:
-            samples.append(Sample.now(time.monotonic() - started, driver.process.pid))
-            time.sleep(SAMPLE_EVERY_S)
-        delivered = driver.delivered()
+    before = scheduler_state(arena.client)
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    faults = _faults(random.Random(seed), what.scan_count)
+    outcome = disturbed(arena, what, expected, faults, planning=None)
+    over.set()
+    watcher.join()
     arena.wait_until_whole()
-    left = settled_differences(arena.client, known)
-    events = arena.board.events(delivered.run)
-    rows = () if delivered.reference is None else delivered.reference.rows
-    return Soaked(
-        samples,
-        _by_kind(nemesis.done),
-        delivered,
-        judge(events, what.scan_count, rows, expected.rows),
-        delivered.reference == expected,
-        left,
-    )
+    return Soaked(outcome, memory, settled_differences(arena.client, before))
 
 
 def _faults(chance: random.Random, scans: int) -> list[Fault]:
@@ -137,26 +101,16 @@ def _faults(chance: random.Random, scans: int) -> list[Fault]:
     return timed + under_way
 
 
-def _by_kind(done: Counter[tuple[str, str]]) -> Counter[str]:
-    """Faults carried out, whatever the point."""
-    kinds: Counter[str] = Counter()
-    for (kind, _), number in done.items():
-        kinds[kind] += number
-    return kinds
-
-
 def draw(soaked: Soaked, path: Path) -> None:
-    """Draw the memory curves."""
+    """Draw the memory as a curve."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8, 4), layout="constrained")
     axes = figure.subplots()
-    seconds = [sample.seconds for sample in soaked.samples]
-    for who in ("driver", "scheduler"):
-        axes.plot(seconds, [getattr(sample, who) for sample in soaked.samples], label=who)
+    axes.plot(*zip(*soaked.memory, strict=True))
     axes.set(xlabel="seconds", ylabel="resident memory, MiB", ylim=(0, None))
-    axes.set_title(f"{soaked.verdict.expected} scans, {soaked.faults.total()} workers killed")
-    axes.legend()
+    verdict, faults = soaked.outcome.verdict, soaked.outcome.done.total()
+    axes.set_title(f"{verdict.expected} scans, {faults} workers killed")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=120)
 
@@ -172,14 +126,13 @@ def main(arguments: list[str] | None = None) -> int:
     what = survey(-(-options.scans // STEPS))
     with Arena(pauses={"generate.put": PACE_S}, time_to_live_s=TIME_TO_LIVE_S) as arena:
         soaked = soak(arena, what, reference(arena, what, None), options.seed)
-    print(" seconds   driver  scheduler (MiB)")
-    for sample in soaked.samples[:: max(1, len(soaked.samples) // 24)]:
-        print(f"{sample.seconds:8.0f} {sample.driver:8.1f} {sample.scheduler:10.1f}")
-    for who in ("driver", "scheduler"):
-        print(f"{who}: {soaked.growth(who):+.1f} MiB from the second to the last quarter")
-    print(soaked.delivered.error or soaked.verdict)
-    print(f"faults: {dict(soaked.faults)}")
-    print(f"identical: {soaked.identical}, misplaced tasks: {soaked.delivered.misplaced}")
+    outcome = soaked.outcome
+    for seconds, mebibytes in soaked.memory[:: max(1, len(soaked.memory) // 24)]:
+        print(f"{seconds:8.0f} s {mebibytes:8.1f} MiB")
+    print(f"driver and scheduler: {soaked.growth:+.1f} MiB from the second to the last quarter")
+    print(outcome.error or outcome.verdict)
+    print(f"faults: {dict(outcome.done)}")
+    print(f"identical: {outcome.identical}, misplaced tasks: {outcome.misplaced}")
     print("left on the scheduler:", soaked.left_on_scheduler or "nothing")
     if options.picture:
         draw(soaked, options.picture)

@@ -18,8 +18,8 @@ from poolpart import placement_violations
 
 from .arena import Arena
 from .checker import Verdict, judge
-from .events import Event
-from .nemesis import Fault, Nemesis
+from .events import Event, Fault
+from .nemesis import Nemesis
 
 STEPS, POSES = 360, 2
 # Seconds a scan for which the generator is held, so that there is time for things to go wrong.

@@ -13,8 +13,7 @@ import time
 from importlib import import_module
 
 import pytest
-from tests.chaos.events import STOP
-from tests.chaos.nemesis import Fault
+from tests.chaos.events import STOP, Fault
 from tests.chaos.survey import PLANNING, Reference, disturbed, room
 
 import poolpart.task_locations

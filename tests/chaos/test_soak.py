@@ -12,7 +12,7 @@ def test_scans_in_kills_leave_nothing_and_lose_nothing(arena, what, tmp_path):
     # Memory is judged in a long one.
     soaked = soak(arena, what, reference(arena, what, None), seed=1)
     assert soaked.sound, soaked
-    assert soaked.verdict.recovered
-    assert soaked.faults.total() >= 3
+    assert soaked.outcome.verdict.recovered
+    assert soaked.outcome.done.total() >= 3
     draw(soaked, tmp_path / "soak.png")
     assert (tmp_path / "soak.png").stat().st_size > 0
