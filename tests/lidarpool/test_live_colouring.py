@@ -17,10 +17,6 @@ def test_numbers_go_up_the_colours():
     assert "linear-gradient" in legend
 
 
-def test_the_middle_of_a_bar_about_zero_is_zero():
-    assert ">0<" in colours_of(np.linspace(-8, 7.98, 200), Z)[1]
-
-
 def test_what_is_unknown_is_grey():
     values = np.full(200, np.nan, np.float32)
     values[:100] = np.linspace(5, 7, 100)
@@ -42,13 +38,6 @@ def test_times_are_told_in_a_unit_that_can_be_read(span_ns, told):
     legend = colours_of(np.linspace(0, span_ns, 200).astype(np.int64), TABLE["time"])[1]
     assert told in legend
     assert ("<span>1.0</span>" in legend) == (span_ns == 2e9)
-
-
-def test_few_large_numbers_do_not_hide_many_small_ones():
-    values = np.logspace(-4, 0, 500).astype(np.float32)
-    colours, legend = colours_of(values, TABLE["intensity"])
-    assert len(np.unique(colours[:250], axis=0)) > 100
-    assert "<span>0.01</span>" in legend
 
 
 def test_objects_have_names_and_colours_of_their_own():

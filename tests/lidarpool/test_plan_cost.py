@@ -65,44 +65,6 @@ def test_the_price_of_entry_is_above_the_shortest_detour(discs):
     assert cost.entry_price > shortest or shortest == math.inf
 
 
-def test_going_deeper_costs_more():
-    """So the way out of a disc leads downhill: across it, in steps of a tenth of its radius."""
-    depths = np.linspace(0.01, 0.19, 19)
-    cost = PathCost(np.array([[0.0, 0.0]]), np.array([0.2]), waypoints=2, particles=19)
-    cost.waypoints[0, 0], cost.waypoints[1, 0] = -0.4, 0.4
-    cost.waypoints[:, 1] = 0.2 - depths
-    lengths = [path_length(path) for path in paths_of(cost)]
-    price = cost.evaluate() - np.array(lengths) - cost.entry_price
-    assert (price >= 8 * depths).all()
-    assert (price <= 16 * depths * 1.001).all()
-    assert (np.diff(cost.evaluate()) > 0).all()
-
-
-def test_all_corners_in_one_point_are_no_collision():
-    cost = PathCost(np.array([[0.0, 0.4]]), np.array([0.2]), waypoints=4, particles=3)
-    cost.waypoints[:] = 0
-    cost.waypoints[:, 0, 1] = -0.5  # all at the start
-    cost.waypoints[:, 0, 2] = 0.5  # all at the target
-    assert cost.evaluate() == pytest.approx([1, 1, 1])
-
-
-def test_discs_far_away_and_very_large_keep_their_edges():
-    """A disc a hundred times as large as the path, whose edge the path runs along."""
-    centres, radii = np.array([[0.0, -100.01]]), np.array([100.0])
-    cost = PathCost(centres, radii, waypoints=1, particles=2)
-    cost.waypoints[0, :, 0] = 0, 0
-    cost.waypoints[0, :, 1] = 0, -0.02
-    free, collides = cost.evaluate()
-    assert free == pytest.approx(1)
-    assert collides > cost.entry_price
-
-
-def test_an_end_on_the_edge_of_a_disc_may_leave_it():
-    cost = PathCost(np.array([[-0.7, 0.0]]), np.array([0.2]), waypoints=1, particles=1)
-    cost.waypoints[:] = 0
-    assert cost.evaluate() == pytest.approx([1])
-
-
 def test_the_margin_is_wider_than_rounding_and_narrower_than_a_millimetre_in_100_m():
     """Paths that pass a disc at a millionth and at a hundred-thousandth of their length."""
     centres, radii = np.array([[0.0, 0.0]]), np.array([0.1])

@@ -1,7 +1,5 @@
 """A scene keeps every triangle, name and digit of the meshes it is made of."""
 
-import pickle
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -34,13 +32,6 @@ def test_seed():
     np.testing.assert_allclose(scene.footprints[:, :2], centres, atol=1e-12)
     np.testing.assert_allclose(scene.footprints[:, 2], 2.0, atol=1e-12)
     np.testing.assert_allclose(scene.bounds, [[-22, -22, 0], [22, 22, 5.1]], atol=1e-12)
-
-
-def test_seed_is_the_same_each_time_and_through_pickle():
-    first, second = Scene.seed(), pickle.loads(pickle.dumps(Scene.seed()))
-    for name in ("vertices", "faces", "face_object", "origin"):
-        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
-    assert first.names == second.names
 
 
 def test_arrays_cannot_be_changed():
@@ -81,11 +72,6 @@ def test_meshes_are_the_inverse_of_from_meshes():
     np.testing.assert_array_equal(again.face_object, scene.face_object)
 
 
-def test_unused_vertices_do_not_count_in_bounds():
-    mesh = Mesh("T", np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [99, 99, 99]]), FACES)
-    np.testing.assert_array_equal(Scene.from_meshes([mesh]).bounds, [[0, 0, 0], [1, 1, 0]])
-
-
 @given(st.lists(st.sampled_from(["a", "b", "a.2", "a.3", "b.2.2"]), max_size=12))
 def test_unique_names(names):
     unique = unique_names(names)
@@ -122,8 +108,3 @@ def test_scenes_that_do_not_fit_together(change, message):
     Scene(**good)
     with pytest.raises(LidarpoolError, match=message):
         Scene(**(good | change))
-
-
-def test_a_scene_of_nothing():
-    with pytest.raises(LidarpoolError, match="at least one object"):
-        Scene.from_meshes([])

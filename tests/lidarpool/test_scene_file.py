@@ -80,10 +80,3 @@ def test_commands(tmp_path, monkeypatch, arguments, words):
     assert done.exit_code == 0
     assert re.fullmatch(words, done.output)
     assert len(Scene.load(arguments[1]).faces) > 700
-
-
-def test_command_checks_the_place_before_it_makes_anything(tmp_path):
-    target = str(tmp_path / "out.stl")
-    done = CliRunner().invoke(command, ["city", target, "--triangles", "100000000"])
-    assert isinstance(done.exception, LidarpoolError)
-    assert "scenes are written as" in str(done.exception)

@@ -8,12 +8,9 @@ from hypothesis import strategies as st
 
 from lidarpool.base.errors import LidarpoolError
 from lidarpool.scene.shapes import (
-    SEED_OUTLINES,
     SEED_POSITIONS,
-    resample,
     revolve,
     seed_objects,
-    smooth,
 )
 
 
@@ -47,30 +44,8 @@ def test_each_seed_object(index):
     assert local[:, 2].min() == 0.0
     assert 2.0 <= local[:, 2].max() <= 5.2
     assert volume(mesh) > 6  # outward faces
-
-
-def test_seed_objects_do_not_cross_themselves():
-    # Their profiles are simple curves: no two legs that are not neighbours meet.
-    for name, outline in SEED_OUTLINES.items():
-        line = resample(smooth(outline), 82)
-        a, b = line[:-1], line[1:]
-
-        def side(p, q, r):
-            return np.sign((q - p)[..., 0] * (r - p)[..., 1] - (q - p)[..., 1] * (r - p)[..., 0])
-
-        first, second = a[:, None], b[:, None]
-        across = side(first, second, a) * side(first, second, b) < 0
-        assert not np.any(across & across.T), name
-
-
-def test_seed_objects_differ_and_have_names():
-    meshes = seed_objects()
-    assert [mesh.name for mesh in meshes] == ["Sphere", *SEED_OUTLINES]
-    assert len({round(volume(mesh), 3) for mesh in meshes}) == 6
-
-
-def test_sphere_has_the_volume_of_a_sphere():
-    assert volume(seed_objects()[0]) == pytest.approx(4 / 3 * np.pi * 8, rel=3e-3)
+    if mesh.name == "Sphere":
+        assert volume(mesh) == pytest.approx(4 / 3 * np.pi * 8, rel=3e-3)
 
 
 @settings(max_examples=40)

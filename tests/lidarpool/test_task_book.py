@@ -42,13 +42,6 @@ def test_the_timeline_is_thinned_evenly():
     assert len(steps) == 1 and kept[0] == 0
 
 
-def test_few_records_are_all_kept():
-    book = TaskBook()
-    for number in range(100):
-        book.add(record(number))
-    assert book.records == [record(number) for number in range(100)]
-
-
 def test_a_record_that_comes_again_counts_once():
     book = TaskBook()
     assert book.add(record(1))
@@ -74,10 +67,3 @@ def test_busy_times_are_bounded_and_hardly_wrong():
     assert len(totals.busy) <= SPANS_MOST
     spans = union(totals.busy)
     assert sum(stop - start for start, stop in spans) == pytest.approx(totals.seconds, rel=1e-3)
-
-
-def test_union_merges_what_overlaps_or_lies_near():
-    spans = [(3.0, 4.0), (0.0, 1.0), (0.5, 2.0), (4.5, 5.0)]
-    assert union(spans) == [(0.0, 2.0), (3.0, 4.0), (4.5, 5.0)]
-    assert union(spans, gap=0.6) == [(0.0, 2.0), (3.0, 5.0)]
-    assert union([]) == []

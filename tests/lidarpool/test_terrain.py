@@ -25,12 +25,6 @@ def test_as_many_triangles_as_fit_a_grid(triangles):
     assert scene.names == ("terrain",)
 
 
-def test_size_and_place():
-    low, high = terrain(20_000, side_m=300).bounds
-    np.testing.assert_allclose(low, [-150, -150, 0])
-    np.testing.assert_allclose(high, [150, 150, 0.16 * 300])
-
-
 def test_same_seed_same_terrain():
     one, other, third = (terrain(5000, seed) for seed in (1, 1, 2))
     assert one.vertices.tobytes() == other.vertices.tobytes()

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidarpool.render.camera import Camera, fit_camera
+from lidarpool.render.camera import fit_camera
 
 FRAME = (0.1, 0.2, 0.8, 0.9)
 BOX = np.array([[x, y, z] for x in (-3, 5) for y in (1, 4) for z in (0, 2)], dtype=float)
@@ -45,18 +45,3 @@ def test_the_camera_stands_upright_and_is_right_handed():
     assert top[1] < foot[1]
     left, right = camera.project([[0, 0, 0], [1, 0, 0]])[0]
     assert right[0] > left[0], "seen from the south, x runs to the right"
-
-
-def test_points_behind_the_eye_are_nowhere():
-    camera = Camera(np.zeros(3), np.eye(3), 100.0, np.array([50.0, 50.0]), (100, 100))
-    pixels, distance = camera.project([[0, 0, 2], [0, 0, -2], [1, 0, 0]])
-    np.testing.assert_allclose(pixels[0], [50, 50])
-    assert np.isnan(pixels[1:]).all()
-    np.testing.assert_allclose(distance, [2, 2, 1])
-
-
-def test_an_image_is_looked_up_by_whole_pixels():
-    camera = Camera(np.zeros(3), np.eye(3), 100.0, np.zeros(2), (10, 5))
-    places = [[0, 0], [9.99, 4.99], [10, 1], [-0.01, 1], [np.nan, 1]]
-    found = camera.look_up(np.arange(50).reshape(5, 10), places, -1)
-    assert found.tolist() == [0, 49, -1, -1, -1]

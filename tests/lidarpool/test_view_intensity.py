@@ -31,11 +31,6 @@ def test_sharing_hits_keeps_their_number(counts):
     assert (density * AREA).sum() == pytest.approx(sum(counts))
 
 
-def test_even_hits_stay_even():
-    density = hit_density(SHEET, np.ones(72))
-    np.testing.assert_allclose(density, 72)
-
-
 def test_many_hits_a_triangle_are_not_smeared():
     hits = np.zeros(72)
     hits[10] = 500
