@@ -8,9 +8,10 @@ import pytest
 
 from lidarpool import Column, Scene, Track
 from lidarpool.columns.table import SCAN
+from lidarpool.export.cloud_file import CloudFile
 from lidarpool.export.ply_format import header, row_type
 from lidarpool.live.page import live_page, redrawn
-from lidarpool.live.result_page import ResultFile, ResultView
+from lidarpool.live.result_page import ResultView
 from lidarpool.run.picture_file import Pictured, SensorWay
 from lidarpool.scene.actors import Actor, box
 
@@ -36,7 +37,7 @@ def cloud(tmp_path):
 def served(cloud):
     """Return a page that shows it, at most 20,000 points at a time, and the view."""
     with live_page("a cloud", port=0) as page:
-        view = ResultView(page, ResultFile(cloud), most=20_000)
+        view = ResultView(page, CloudFile(cloud), most=20_000)
         with redrawn(view.draw, 0.1):
             yield page, view
 
@@ -67,7 +68,7 @@ def test_time_is_chosen_and_played(cloud, new_tab, tmp_path):
     hits, rays = np.zeros(scene.triangles, np.int64), np.zeros((0, 2, 3), np.float32)
     pictured = Pictured(scene, [way], hits, rays, None, None, (), 2e9)
     with live_page("a drive", port=0) as page:
-        view = ResultView(page, ResultFile(cloud), pictured)
+        view = ResultView(page, CloudFile(cloud), pictured)
         with redrawn(view.draw, 0.1):
             tab = new_tab(page.url)
             tab.wait_for(lambda text: "nose: VLP-16" in text and "time, s" in text)

@@ -4,9 +4,17 @@ import numpy as np
 import pytest
 
 from lidarpool.columns.table import CHANNEL, OBJECT, TABLE, Z
-from lidarpool.live.colouring import TURBO, as_bytes, colours_of
+from lidarpool.live.colouring import as_bytes, legend_of
+from lidarpool.render.colouring import TURBO
+from lidarpool.render.colouring import colours_of as colouring_of
 
 HEIGHTS = np.linspace(0, 10, 200)
+
+
+def colours_of(*arguments):
+    """Colours (n, 3) as bytes, and the legend as HTML."""
+    coloured = colouring_of(*arguments)
+    return as_bytes(coloured.colours), legend_of(coloured)
 
 
 def test_numbers_go_up_the_colours():

@@ -9,9 +9,10 @@ import trimesh
 
 from lidarpool import LidarpoolError, Planning, Scene, Track
 from lidarpool.columns.table import CHANNEL, OBJECT, SCAN
+from lidarpool.export.cloud_file import CloudFile
 from lidarpool.export.ply_format import header, row_type
 from lidarpool.live.page import live_page
-from lidarpool.live.result_page import ResultFile, ResultView, view_result
+from lidarpool.live.result_page import ResultView, view_result
 from lidarpool.live.surface import Surface, coloured_mesh
 from lidarpool.plan import Plan
 from lidarpool.run.picture_file import PICTURE_FILE, Pictured, SensorWay
@@ -36,12 +37,12 @@ def write(path, positions, scans=100):
 
 def test_scans_are_chosen_and_thinned(tmp_path):
     x = np.arange(50_000) // 500
-    file = ResultFile(write(tmp_path / "a.ply", np.column_stack([x, 0 * x, 0 * x])))
+    file = CloudFile(write(tmp_path / "a.ply", np.column_stack([x, 0 * x, 0 * x])))
     assert (len(file), file.scans) == (50_000, (0, 99))
-    cloud, count = file.choose(20, 29, 10_000)
+    cloud, count = file.choose(10_000, (20, 29))
     assert count == len(cloud) == 5_000
     assert np.unique(cloud["scan"]).tolist() == list(range(20, 30))
-    cloud, count = file.choose(0, 99, 4_000)
+    cloud, count = file.choose(4_000, (0, 99))
     assert (count, len(cloud)) == (50_000, 4_000)
     assert np.bincount(cloud["scan"]).min() >= 35
     assert np.bincount(cloud["channel"]).min() > 50
@@ -49,10 +50,10 @@ def test_scans_are_chosen_and_thinned(tmp_path):
 
 
 def test_no_points_and_points_that_are_nowhere_are_no_reason_to_fail(tmp_path):
-    nothing = ResultFile(write(tmp_path / "a.ply", np.zeros((0, 3))))
-    assert (len(nothing), nothing.scans, nothing.choose(0, 0, 10)[1]) == (0, (0, 0), 0)
-    nowhere = ResultFile(write(tmp_path / "b.ply", np.full((1000, 3), np.nan)))
-    assert len(nowhere.choose(0, 99, 1000)[0]) == 0
+    nothing = CloudFile(write(tmp_path / "a.ply", np.zeros((0, 3))))
+    assert (len(nothing), nothing.scans, nothing.choose(10, (0, 0))[1]) == (0, (0, 0), 0)
+    nowhere = CloudFile(write(tmp_path / "b.ply", np.full((1000, 3), np.nan)))
+    assert len(nowhere.choose(1000, (0, 99))[0]) == 0
 
 
 def test_columns_that_nobody_knows_are_in_the_menu(tmp_path, page):
@@ -62,12 +63,12 @@ def test_columns_that_nobody_knows_are_in_the_menu(tmp_path, page):
     lines = [*(f"property float {a}" for a in ("x", "y", "z", "nx")), "property uchar 2-a"]
     head = ["ply", "format binary_little_endian 1.0", "element vertex 20", *lines, "end_header", ""]
     (tmp_path / "theirs.ply").write_bytes("\n".join(head).encode() + rows.tobytes())
-    file = ResultFile(tmp_path / "theirs.ply")
+    file = CloudFile(tmp_path / "theirs.ply")
     view = ResultView(page, file)
     view.draw()
     assert view._view._colour.options == ("z", "nx")
     assert view._scans is None
-    assert file.choose(*file.scans, 100)[0]["nx"].tolist() == list(range(20))
+    assert file.choose(100)[0]["nx"].tolist() == list(range(20))
 
 
 def test_what_is_no_result_is_refused(tmp_path):
@@ -129,7 +130,7 @@ def scenes(page):
 
 
 def test_the_page_shows_scene_sensors_rays_and_planning(cloud, pictured, page):
-    view = ResultView(page, ResultFile(cloud), pictured)
+    view = ResultView(page, CloudFile(cloud), pictured)
     view.draw()
     for name in ("/poses", "/rays", "/path", "/discs/0"):
         assert page.scene.get_handle_by_name(name) is not None, name
@@ -143,7 +144,7 @@ def test_the_page_shows_scene_sensors_rays_and_planning(cloud, pictured, page):
 
 
 def test_under_a_roof_the_page_is_cut_and_can_be_made_whole(cloud, pictured, page):
-    view = ResultView(page, ResultFile(cloud), pictured)
+    view = ResultView(page, CloudFile(cloud), pictured)
     view.draw()
     assert view._view.cut == pytest.approx(2)  # halfway up from the sensors
     assert 0 < len(points(page)) < 4000
@@ -161,7 +162,7 @@ def test_under_a_roof_the_page_is_cut_and_can_be_made_whole(cloud, pictured, pag
 
 
 def test_a_colour_that_is_chosen_is_drawn_and_what_is_hidden_is_not(cloud, pictured, page):
-    view = ResultView(page, ResultFile(cloud), pictured)
+    view = ResultView(page, CloudFile(cloud), pictured)
     view._view._colour.value = "object"
     view.draw()
     assert "room" in view._view._cloud_legend.content
@@ -180,7 +181,7 @@ def test_what_moves_is_where_it_is_at_the_time_that_is_chosen_or_played(cloud, p
     track = Track([0, 2], [[1, 1, 0], [5, 1, 0]], [[0, 0, 0, 1], [0, 0, half, half]])
     scene = replace(pictured.scene, actors=(Actor(box("Cart", (1, 1, 1)), track),))
     moving = replace(pictured, scene=scene, sensors=[way], duration_ns=2e9)
-    view = ResultView(page, ResultFile(cloud), moving)
+    view = ResultView(page, CloudFile(cloud), moving)
     view.draw()
     assert "nose: VLP-16" in view._facts.content
     assert page.scene.get_handle_by_name("/ways/0") is not None
@@ -199,7 +200,7 @@ def test_what_moves_is_where_it_is_at_the_time_that_is_chosen_or_played(cloud, p
 
 
 def test_without_a_scene_the_cloud_is_shown_alone_near_zero(cloud, page):
-    view = ResultView(page, ResultFile(cloud), None, "why & what")
+    view = ResultView(page, CloudFile(cloud), None, "why & what")
     view.draw()
     assert len(points(page)) == 10_000
     assert np.abs(points(page)).max() < 200

@@ -23,9 +23,12 @@ from lidarpool import (
     Track,
 )
 from lidarpool.cli.commands import cli
-from lidarpool.export.ply import read_positions, save_cloud
+from lidarpool.columns.table import Column
+from lidarpool.export.cloud_file import CloudFile
+from lidarpool.export.ply import save_cloud
 from lidarpool.plan import best
 from lidarpool.plan.trial import run_trial
+from lidarpool.render.page import Page
 from lidarpool.run.picture_file import PICTURE_FILE, Pictured, SensorWay, sensor_ways
 from lidarpool.scene.actors import Actor, box
 from lidarpool.scene.mesh import Mesh
@@ -160,8 +163,8 @@ def test_some_of_the_points_are_of_every_channel(tmp_path):
     layers, rays = 40, 500  # a ray's points follow those of the ray beside it, channel by channel
     ring = np.tile(np.arange(layers), rays).astype(np.int32)
     save_cloud(path, cloud_at(np.stack([ring] * 3, axis=1).astype(float)))
-    chosen, _ = read_positions(path, len(ring) // 20)  # every 20th would be of two rings
-    assert len(np.unique(chosen[:, 2])) == layers
+    chosen, _ = CloudFile(path).choose(len(ring) // 20)  # every 20th would be of two rings
+    assert len(np.unique(chosen.positions[:, 2])) == layers
 
 
 def test_some_are_drawn_to_another_folder(result, tmp_path):
@@ -170,6 +173,26 @@ def test_some_are_drawn_to_another_folder(result, tmp_path):
     plot(result, "--only", "path", "--only", "scene", *SMALL, "--out", out)
     assert names(out) == {"scene.png", "path.png"}
     assert names(result) == before
+
+
+def test_the_cloud_is_coloured_by_any_of_its_columns(unplanned, tmp_path, monkeypatch):
+    wet = Column("wetness", "float32", "%", "how wet it is", source="wetness")
+    shown = replace(unplanned, own=[replace(wet, source="")])
+    result = make(tmp_path / "result", shown)
+    positions = shown.scene.vertices
+    zeros = np.zeros(len(positions), np.int32)
+    wetness = np.linspace(0, 100, len(positions))
+    columns = {"scan": zeros, "channel": zeros, "object": zeros + 1, "wetness": wetness}
+    save_cloud(result / "cloud.ply", Cloud(positions, columns, [wet]))
+    figures = []
+    monkeypatch.setattr(Page, "save", lambda page, path: figures.append(page.figure))
+    for name in ("z", "wetness", "object", "ring"):
+        plot(result, "--only", "cloud", "--colour", name, *SMALL)
+    assert [figure.axes[0].get_ylabel() for figure in figures[:2]] == ["z (m)", "wetness (%)"]
+    keys = [[t.get_text() for t in figure.legends[0].get_texts()] for figure in figures[2:]]
+    assert [key[0] for key in keys] == ["a\ufffd", "channel 0"]
+    with pytest.raises(LidarpoolError, match=r"no column 'wettness'\. Did you mean 'wetness'"):
+        plot(result, "--only", "cloud", "--colour", "wettness")
 
 
 def test_the_cloud_is_needed_for_its_own_picture_only(result):

@@ -5,7 +5,7 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from lidarpool import LidarpoolError
+from lidarpool import Cloud, LidarpoolError
 from lidarpool.plan import Plan, Planning, best, run_trial
 from lidarpool.render.page import Page
 from lidarpool.render.pictures import draw_cloud, draw_intensity, draw_scene
@@ -88,8 +88,10 @@ def test_sample_rays_are_drawn(pixels, scene, shot):
 
 
 def test_cloud_points_have_the_colour_of_their_height(pixels, scene, shot):
-    assert colourful(pixels(draw_cloud, shot, np.empty((0, 3)), 0)[:, LEFT]) < 60  # the sensors
-    image = pixels(draw_cloud, shot, scene.vertices, 5)[:, LEFT]
+    assert (
+        colourful(pixels(draw_cloud, shot, Cloud(np.empty((0, 3)), {}), 0)[:, LEFT]) < 60
+    )  # the sensors
+    image = pixels(draw_cloud, shot, Cloud(scene.vertices, {}), 5)[:, LEFT]
     red, green, blue = np.moveaxis(image, -1, 0)
     assert ((blue > red + 60) & (blue > green)).sum() > 10  # low
     assert ((green > red + 60) & (green > blue + 60)).sum() > 10
@@ -111,7 +113,7 @@ def test_any_scene_and_poses_can_be_drawn(pixels, corners, poses):
     assert colourful(pixels(draw_scene, shot)) > 100
     assert colourful(pixels(draw_intensity, shot, np.array([7]), NONE)) > 100
     for points in (scene.vertices, scene.vertices[[0] * 500], np.array([[0, 0, 0], [1e7, 0, 0]])):
-        pixels(draw_cloud, shot, points, 3)
+        pixels(draw_cloud, shot, Cloud(points, {}), 3)
 
 
 def solid(k):

@@ -49,13 +49,22 @@ def _size(ctx: click.Context, param: click.Parameter, value: Any) -> tuple[int, 
     type=click.Path(path_type=Path, file_okay=False),
     help="Folder for the pictures.  [default: FOLDER]",
 )
-def plot(result: Path, only: tuple[str, ...], size: tuple[int, int], out: Path | None) -> None:
+@click.option(
+    "--colour",
+    metavar="COLUMN",
+    default="z",
+    show_default=True,
+    help="Colour the points of the cloud by this column of it.",
+)
+def plot(
+    result: Path, only: tuple[str, ...], size: tuple[int, int], out: Path | None, colour: str
+) -> None:
     """Draw the pictures of a finished result again: scene, intensity, cloud and path.
 
     \b
     Examples:
       lidarpool plot lidarpool-out
-      lidarpool plot lidarpool-out --only cloud --size 2400x1500 --out figures
+      lidarpool plot lidarpool-out --only cloud --colour intensity --size 2400x1500 --out figures
     """  # noqa: D301 - click wants the character, not its name
     from ..base.fork_server import keep_freed_memory
     from ..report.pictures import picture_makers
@@ -67,7 +76,9 @@ def plot(result: Path, only: tuple[str, ...], size: tuple[int, int], out: Path |
             "folder of a finished run (its --out)."
         )
     keep_freed_memory()
-    makers = picture_makers(Pictured.load(result / PICTURE_FILE), result / "cloud.ply", size)
+    makers = picture_makers(
+        Pictured.load(result / PICTURE_FILE), result / "cloud.ply", size, colour
+    )
     out = result if out is None else out
     try:
         out.mkdir(parents=True, exist_ok=True)

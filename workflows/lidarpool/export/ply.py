@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from raybeam.open3d_module import load_open3d
 
-from ..base.choice import one_of_each_part
 from ..base.errors import LidarpoolError
 from ..base.interrupts import deferred_interrupts
 from ..columns.cloud import Cloud, CloudLike
@@ -103,37 +102,6 @@ def read_cloud(path: str | Path) -> Cloud:
 def _narrowed(name: str, values: NDArray[Any]) -> NDArray[Any]:
     """Values in the type of their column, where the file had to hold them in another."""
     return values.astype(TABLE[name].dtype) if name in TABLE else values
-
-
-def read_positions(path: str | Path, most: int) -> tuple[NDArray[np.float64], int]:
-    """Read positions of at most so many points, evenly chosen, and how many there are.
-
-    The others stay on disk.
-
-    Returns
-    -------
-    positions
-        (k, 3) metres, world coordinates.
-    count
-        Points of the whole cloud.
-
-    Raises
-    ------
-    LidarpoolError
-        As `read_cloud`.
-    """
-    path = Path(path)
-    try:
-        start, count, dtype = layout(path)
-        if not count:  # nothing cannot be mapped
-            return np.empty((0, 3)), 0
-        rows = np.memmap(path, dtype, "r", start, (count,))
-    except OSError as error:
-        raise LidarpoolError(f"{path} cannot be read: {error.strerror or error}.") from error
-    except ValueError as error:
-        raise LidarpoolError(f"{path} is not a point cloud of lidarpool: {error}.") from error
-    chosen = rows[one_of_each_part(count, most)]
-    return np.stack([chosen[axis] for axis in "xyz"], axis=1, dtype=np.float64), count
 
 
 def real_type(bounds: NDArray[np.floating], precision_m: float) -> np.dtype[np.floating]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
@@ -13,11 +12,8 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.choice import one_of_each_part
 from ..base.errors import LidarpoolError
-from ..columns.cloud import Cloud
-from ..columns.table import TABLE, Column
-from ..export.ply_format import AXES, layout
+from ..export.cloud_file import CloudFile
 from ..run.picture_file import PICTURE_FILE, Pictured, SensorWay
 from ..run.store import RUN_FOLDER
 from ..scan.database import FILE
@@ -27,74 +23,6 @@ from .view import View, bounds_of, described, places_of
 CLOUD = "cloud.ply"
 VIEW_POINTS = 500_000  # in the browser at a time
 DRAW_EVERY_S, BUSY_SHARE = 0.1, 0.7  # of a core: nothing else is to be done
-
-
-class ResultFile:
-    """A cloud in PLY format, whose points stay on disk until they are chosen.
-
-    Parameters
-    ----------
-    path
-        The file.
-
-    Raises
-    ------
-    LidarpoolError
-        If it cannot be read, or is no point cloud of ours.
-    """
-
-    def __init__(self, path: Path) -> None:
-        try:
-            start, count, dtype = layout(path)
-            # Nothing cannot be mapped.
-            self._rows: NDArray[np.void] = (
-                np.memmap(path, dtype, "r", start, (count,)) if count else np.empty(0, dtype)
-            )
-        except OSError as error:
-            raise LidarpoolError(f"{path} cannot be read: {error.strerror or error}.") from error
-        except ValueError as error:
-            raise LidarpoolError(f"{path} is not a point cloud of lidarpool: {error}.") from error
-        self.table = _table(dtype)
-        scans = self._rows["scan"] if "scan" in (dtype.names or ()) else np.empty(0, np.int32)
-        some = scans[one_of_each_part(len(scans), 100_000)]
-        ordered = scans.dtype.kind in "iu" and bool((np.diff(some) >= 0).all())
-        # First and last scan; none where the points are not in their order.
-        self.scans = (int(scans[0]), int(scans[-1])) if ordered and len(scans) else (0, 0)
-
-    def __len__(self) -> int:
-        return len(self._rows)
-
-    def choose(self, first: int, last: int, most: int) -> tuple[Cloud, int]:
-        """Choose at most so many points of scans `first` to `last`, evenly.
-
-        Returns
-        -------
-        cloud
-            The points in order. Those without finite coordinates are left out.
-        count
-            How many there are.
-        """
-        low, high = 0, len(self)
-        if (first, last) != self.scans:
-            low = bisect_left(self._rows["scan"], first)
-            high = bisect_right(self._rows["scan"], last)
-        rows = self._rows[low + one_of_each_part(high - low, most)]
-        positions = np.stack([rows[axis] for axis in AXES], axis=1, dtype=np.float64)
-        known = np.isfinite(positions).all(axis=1)
-        columns = {column.name: rows[column.in_files][known] for column in self.table}
-        return Cloud(positions[known], columns, self.table), high - low
-
-
-def _table(row: np.dtype[np.void]) -> tuple[Column, ...]:
-    """Columns of a file with such rows: those of the table, in its order, and what else it holds.
-
-    Columns of one's own have no unit here: PLY files have no place for it.
-    """
-    names = [name for name in row.names or () if name not in AXES]
-    known = [column for column in TABLE.values() if column.in_files in names]
-    ours = {column.in_files for column in known}
-    rest = [Column(n, row[n].str, "", "") for n in names if n not in ours and n.isidentifier()]
-    return (*known, *rest)
 
 
 class ResultView:
@@ -117,7 +45,7 @@ class ResultView:
     def __init__(
         self,
         page: LivePage,
-        file: ResultFile,
+        file: CloudFile,
         pictured: Pictured | None = None,
         note: str = "",
         most: int = VIEW_POINTS,
@@ -136,7 +64,7 @@ class ResultView:
             sensors = pictured.sensors
             bounds = bounds_of(scene, places_of(sensors), pictured.planning)
         self._origin, self._sensors = origin, sensors
-        self._choose(*file.scans)
+        self._choose(file.scans)
         lasts = 0.0 if pictured is None else pictured.duration_ns
         self._view = View(page, scene, sensors, file.table, origin, bounds, lasts)
 
@@ -144,7 +72,7 @@ class ResultView:
         """Draw what has changed; returns the share of a core that this may take."""
         scans = self._scans.value if self._scans else self._file.scans
         if scans != self._chosen:
-            self._choose(*scans)
+            self._choose(scans)
         pictured = self._pictured
         if pictured is not None:
             faces = len(pictured.scene.faces)
@@ -156,9 +84,9 @@ class ResultView:
         self._view.draw_cloud(self._cloud, scans)
         return BUSY_SHARE
 
-    def _choose(self, first: int, last: int) -> None:
-        self._chosen = (first, last)
-        self._cloud, count = self._file.choose(first, last, self._most)
+    def _choose(self, scans: tuple[int, int]) -> None:
+        self._chosen = scans
+        self._cloud, count = self._file.choose(self._most, scans)
         shown = "all shown" if len(self._cloud) == count else f"{len(self._cloud):,} shown"
         lines = [f"{count:,} of {len(self._file):,} points, {shown}"]
         if self._origin.any():
@@ -169,9 +97,9 @@ class ResultView:
         self._facts.content = f'<div style="padding:0 0.8em">{"<br>".join(lines)}</div>'
 
 
-def _around(file: ResultFile) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _around(file: CloudFile) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Whole metres near the points of a file, (3,), and the box (2, 3) around them from there."""
-    positions = file.choose(*file.scans, 100_000)[0].positions
+    positions = file.choose(100_000)[0].positions
     if not len(positions):
         return np.zeros(3), np.array([[-1.0, -1.0, 0.0], [1.0, 1.0, 1.0]])
     # Nearly all of them: few strays do not count.
@@ -213,12 +141,13 @@ def view_result(path: Path, *, port: int, browser: bool = True) -> None:
             return
 
 
-def open_result(path: Path) -> tuple[ResultFile, Pictured | None, str]:
+def open_result(path: Path) -> tuple[CloudFile, Pictured | None, str]:
     """Open a cloud or the folder of a result; with the scene if there is one, and a note."""
     if not path.is_dir():
-        return ResultFile(path), None, ""
+        return CloudFile(path), None, ""
     if (path / CLOUD).exists():
-        return ResultFile(path / CLOUD), *_pictured_in(path)
+        pictured, note = _pictured_in(path)
+        return CloudFile(path / CLOUD, pictured.own if pictured else ()), pictured, note
     if (path / RUN_FOLDER / FILE).exists():
         raise LidarpoolError(
             f"{path} holds an unfinished run: continue it with lidarpool run --resume, where "

@@ -13,9 +13,10 @@ from trimesh.exchange.gltf import export_glb
 from raybeam import RayCaster
 from raybeam.open3d_module import load_open3d
 
+from ..render.colouring import TURBO
 from ..render.intensity import density_colours, density_range, hit_density
 from ..scene.scene import Scene
-from .colouring import TURBO, as_bytes, colour_bar
+from .colouring import as_bytes, colour_bar
 from .page import LivePage
 
 MOST_TRIANGLES = 100_000  # 60 bytes each, whenever their colours have changed

@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 from ..columns.cloud import Cloud
 from ..columns.table import AXES, Column, Z
 from ..plan import Planning
+from ..render.colouring import colours_of
 from ..render.theme import object_colours
 from ..run.picture_file import SensorWay
 from ..scene.scene import Scene
 from ..sensor.trajectory import quaternions_of
-from .colouring import as_bytes, colours_of
+from .colouring import as_bytes, legend_of
 from .page import LivePage
 from .surface import MeshNode, Surface
 
@@ -157,7 +158,8 @@ class View:
             names = self._scene.all_names
         elif column.name == "sensor":
             names = tuple(way.name for way in self._sensors)
-        colours, self._cloud_legend.content = colours_of(values, column, names)
+        coloured = colours_of(values, column, names)
+        colours, self._cloud_legend.content = as_bytes(coloured.colours), legend_of(coloured)
         positions = (cloud.positions - self._origin).astype(np.float32)
         if cut is not None:
             below = positions[:, 2] <= cut

@@ -16,6 +16,7 @@ from matplotlib.colors import ListedColormap, LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
+from matplotlib.ticker import LogLocator
 from numpy.typing import NDArray
 
 from ..base.errors import LidarpoolError
@@ -210,6 +211,8 @@ class Page:
             labelcolor=theme.MUTED, labelfontfamily=FONT, length=2.5 * self.unit,
         )  # fmt: skip
         if isinstance(norm, LogNorm):
+            few = norm.vmax < 1000 * norm.vmin  # type: ignore[operator]  # both are given
+            axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if few else (1,)))
             axes.yaxis.set_major_formatter(lambda value, _: f"{value:,.12g}")
             axes.yaxis.set_minor_formatter(lambda value, _: "")
 

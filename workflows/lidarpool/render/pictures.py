@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,11 @@ from matplotlib.colors import LogNorm, Normalize
 from numpy.typing import NDArray
 
 from ..base.words import counted
+from ..columns.cloud import Cloud
+from ..columns.table import Column, Z
 from ..scene.scene import Scene
 from . import theme
+from .colouring import TURBO, colours_of
 from .intensity import density_colours, density_range, hit_density
 from .page import Page, without_common_prefix
 from .shot import Shot
@@ -19,7 +23,6 @@ Floats = NDArray[np.float64]
 
 MOST_POINTS = 1_000_000  # of a cloud are drawn; a picture has a few more pixels
 MOST_RAYS = 600
-TURBO = theme.mapped("turbo", np.linspace(0.07, 0.95, 256))  # its very ends are nearly black
 # An object that covers this much of the ground, and has the scene in it, is a floor or a hall.
 SURROUNDING = 0.6
 
@@ -72,28 +75,45 @@ def draw_intensity(
     page.save(path)
 
 
-def draw_cloud(path: Path, shot: Shot, positions: Floats, count: int) -> None:
-    """Draw points of a cloud coloured by height, over the scene drawn pale.
+def draw_cloud(
+    path: Path,
+    shot: Shot,
+    cloud: Cloud,
+    count: int,
+    column: Column = Z,
+    names: Sequence[str] = (),
+) -> None:
+    """Draw points of a cloud coloured by a column, over the scene drawn pale.
 
     Parameters
     ----------
-    positions
-        (n, 3) metres, world coordinates; those that the scene hides are left out.
+    cloud
+        The points; those that the scene hides are left out.
     count
-        Points of the whole cloud, of which `positions` are a choice.
+        Points of the whole cloud, of which these are a choice.
+    column
+        What they are coloured by.
+    names
+        Names of the values 0, 1, 2, … of that, where it is a label.
     """
     image = shot.paint(np.tile(theme.rgb(theme.CLAY), (len(shot.scene.faces), 1)), 0.55)
     page = Page(shot.camera.size)
-    if len(positions):
-        low, high = np.percentile(positions[:, 2], [0.5, 99.5])  # strays are left out
-        high = max(high, low + 1e-3 * shot.stage.size)
-        share = np.clip((positions[:, 2] - low) / (high - low), 0, 1)
-        image = with_points(
-            image, shot, positions - shot.scene.origin, TURBO[(share * 255).astype(np.int64)]
-        )
-        page.colour_bar(TURBO, Normalize(low, high), "height z (m)")
+    if len(cloud):
+        values = cloud.positions[:, 2] if column is Z else cloud[column.name]
+        coloured = colours_of(values, column, names)
+        image = with_points(image, shot, cloud.positions - shot.scene.origin, coloured.colours)
+        if coloured.limits is None:
+            page.legend(coloured.labels)
+        else:
+            unit = f" ({coloured.unit})" if coloured.unit else ""
+            low, high = coloured.limits
+            scale = LogNorm if coloured.logarithmic else Normalize
+            page.colour_bar(
+                TURBO, scale(low, high if high > low else low + 1), coloured.name + unit
+            )
     page.show(shot, image)
-    page.title("Point cloud", f"{counted(count, 'point')} · {shot.when}")
+    by = "height" if column is Z else column.name.replace("_", " ")
+    page.title(f"Point cloud by {by}", f"{counted(count, 'point')} · {shot.when}")
     page.save(path)
 
 

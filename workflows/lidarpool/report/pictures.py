@@ -8,7 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ..export.ply import read_positions
+from ..base.errors import LidarpoolError
+from ..base.words import did_you_mean
+from ..columns.table import Z
+from ..export.cloud_file import CloudFile
 from ..render.pictures import MOST_POINTS, draw_cloud, draw_intensity, draw_scene
 from ..render.shot import SIZE, Shot, take_shot
 from ..run.picture_file import Pictured
@@ -16,7 +19,7 @@ from .path_picture import draw_path
 
 
 def picture_makers(
-    shown: Pictured, cloud: Path, size: tuple[int, int] = SIZE
+    shown: Pictured, cloud: Path, size: tuple[int, int] = SIZE, colour: str = Z.name
 ) -> dict[str, Callable[[Path], object]]:
     """Functions that draw pictures to a file, which all see the scene from the same place.
 
@@ -30,6 +33,8 @@ def picture_makers(
         File of the cloud, read when it is drawn.
     size
         Width and height in pixels.
+    colour
+        Column that the cloud is coloured by.
     """
 
     @cache
@@ -47,10 +52,22 @@ def picture_makers(
             size=size,
         )
 
+    def draw_points(path: Path) -> None:
+        file = CloudFile(cloud, shown.own)
+        columns = {name: c for c in (Z, *file.table) for name in (c.name, c.in_files)}
+        if colour not in columns:
+            there = list(dict.fromkeys(c.name for c in columns.values()))
+            raise LidarpoolError(
+                f"{cloud} has no column {colour!r}."
+                + (did_you_mean(colour, columns) or f" There are {', '.join(there)}.")
+            )
+        column = columns[colour]
+        draw_cloud(path, shot(), *file.choose(MOST_POINTS), column, shown.names_of(column))
+
     makers: dict[str, Callable[[Path], object]] = {
         "scene": lambda path: draw_scene(path, shot()),
         "intensity": lambda path: draw_intensity(path, shot(), shown.hit_counts, shown.sample_rays),
-        "cloud": lambda path: draw_cloud(path, shot(), *read_positions(cloud, MOST_POINTS)),
+        "cloud": draw_points,
     }
     planning, plan = shown.planning, shown.plan
     if planning is not None and plan is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..base.errors import LidarpoolError
 from ..base.words import counted
+from ..columns.table import TABLE, Column
 from ..plan import Plan, Planning
 from ..scene.actors import Actor
 from ..scene.mesh import Mesh
@@ -25,7 +26,7 @@ from .result import Result
 PICTURE_FILE = "pictures.npz"
 
 PLACES_MOST = 1000  # of a sensor or an actor that moves
-_FORMAT = 2
+_FORMAT = 3
 _ACTOR = ("vertices", "faces", "times", "positions", "quaternions")
 _PLAN_NUMBERS = ("length", "shortest_possible", "clearance", "trial", "trials")
 
@@ -81,6 +82,8 @@ class Pictured:
         two ends, metres, local coordinates.
     duration_ns
         How long the survey lasted, by its own clock.
+    own
+        Columns of the cloud that are not in the table of columns; their values are in its file.
     """
 
     scene: Scene
@@ -91,6 +94,7 @@ class Pictured:
     plan: Plan | None
     trials: Sequence[NDArray[np.float64]]
     duration_ns: float = 0.0
+    own: Sequence[Column] = ()
 
     @classmethod
     def of(
@@ -107,6 +111,7 @@ class Pictured:
             result.plan if planning is not None else None,
             [trial.waypoints for trial in result.trials],
             survey.duration_ns,
+            [replace(c, source="") for c in survey.stored_columns if c.name not in TABLE],
         )
 
     @property
@@ -122,6 +127,12 @@ class Pictured:
         words += f" and {counted(actors, 'actor')}" if actors else ""
         return f"{words}, at {self.duration_ns / 2e9:.3g} s of {self.duration_ns / 1e9:.3g} s"
 
+    def names_of(self, column: Column) -> Sequence[str]:
+        """Names of the values 0, 1, 2, … of a column, where they have some."""
+        if column.name == "sensor":
+            return [way.name for way in self.sensors]
+        return self.scene.all_names if column.name == "object" else ()
+
     def save(self, path: Path) -> None:
         """Write it as a NumPy archive; the same content gives the same bytes.
 
@@ -134,6 +145,7 @@ class Pictured:
             "objects": self.scene.names,
             "actors": [actor.name for actor in self.scene.actors],
             "sensors": [[way.name, way.model, way.moves] for way in self.sensors],
+            "own": [asdict(column) for column in self.own],
         }
         arrays: dict[str, Any] = {
             "format": _FORMAT,
@@ -218,13 +230,14 @@ class Pictured:
         if counts.shape != (scene.triangles,):
             raise ValueError(f"hit_counts of {counts.shape} for {scene.triangles} triangles")
         rays, duration = arrays["sample_rays"], float(arrays["duration_ns"])
+        own = [Column(**column) for column in names["own"]]
         if "path" not in arrays:
-            return cls(scene, sensors, counts, rays, None, None, (), duration)
+            return cls(scene, sensors, counts, rays, None, None, (), duration, own)
         start, target = arrays["ends"]
         planning = Planning(start, target, arrays["centres"], arrays["radii"])
         numbers = {name: arrays[name].item() for name in _PLAN_NUMBERS}
         plan, trials = Plan(path=arrays["path"], **numbers), tuple(arrays["waypoints"])
-        return cls(scene, sensors, counts, rays, planning, plan, trials, duration)
+        return cls(scene, sensors, counts, rays, planning, plan, trials, duration, own)
 
 
 def sensor_ways(survey: Survey) -> list[SensorWay]:

@@ -1,0 +1,84 @@
+"""A cloud in a PLY file, whose points stay on disk until they are chosen."""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.choice import one_of_each_part
+from ..base.errors import LidarpoolError
+from ..columns.cloud import Cloud
+from ..columns.table import TABLE, Column
+from .ply_format import AXES, layout
+
+
+class CloudFile:
+    """A cloud in PLY format, whose points stay on disk until they are chosen.
+
+    Parameters
+    ----------
+    path
+        The file.
+    own
+        Descriptions of its columns that are not in the table of columns, where they are known:
+        the file has no place for a unit.
+
+    Raises
+    ------
+    LidarpoolError
+        If it cannot be read, or is no point cloud of ours.
+    """
+
+    def __init__(self, path: Path, own: Sequence[Column] = ()) -> None:
+        try:
+            start, count, dtype = layout(path)
+            # Nothing cannot be mapped.
+            self._rows: NDArray[np.void] = (
+                np.memmap(path, dtype, "r", start, (count,)) if count else np.empty(0, dtype)
+            )
+        except OSError as error:
+            raise LidarpoolError(f"{path} cannot be read: {error.strerror or error}.") from error
+        except ValueError as error:
+            raise LidarpoolError(f"{path} is not a point cloud of lidarpool: {error}.") from error
+        self.table = _table(dtype, own)
+        scans = self._rows["scan"] if "scan" in (dtype.names or ()) else np.empty(0, np.int32)
+        some = scans[one_of_each_part(len(scans), 100_000)]
+        ordered = scans.dtype.kind in "iu" and bool((np.diff(some) >= 0).all())
+        # First and last scan; none where the points are not in their order.
+        self.scans = (int(scans[0]), int(scans[-1])) if ordered and len(scans) else (0, 0)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def choose(self, most: int, scans: tuple[int, int] | None = None) -> tuple[Cloud, int]:
+        """Choose at most so many points, evenly; of the first to the last of these scans.
+
+        Returns
+        -------
+        cloud
+            The points in order. Those without finite coordinates are left out.
+        count
+            How many there are.
+        """
+        low, high = 0, len(self)
+        if scans is not None and scans != self.scans:
+            low = bisect_left(self._rows["scan"], scans[0])
+            high = bisect_right(self._rows["scan"], scans[1])
+        rows = self._rows[low + one_of_each_part(high - low, most)]
+        positions = np.stack([rows[axis] for axis in AXES], axis=1, dtype=np.float64)
+        known = np.isfinite(positions).all(axis=1)
+        columns = {column.name: rows[column.in_files][known] for column in self.table}
+        return Cloud(positions[known], columns, self.table), high - low
+
+
+def _table(row: np.dtype[np.void], own: Sequence[Column]) -> tuple[Column, ...]:
+    """Columns of a file with such rows: those of the table, in its order, then the others."""
+    names = [name for name in row.names or () if name not in AXES]
+    known = [column for column in (*TABLE.values(), *own) if column.in_files in names]
+    ours = {column.in_files for column in known}
+    rest = [Column(n, row[n].str, "", "") for n in names if n not in ours and n.isidentifier()]
+    return (*known, *rest)

@@ -1,0 +1,98 @@
+"""Colours of points by one of their columns, and what a legend says of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..columns.table import Column
+from .theme import mapped, object_colours
+
+TURBO = mapped("turbo", np.linspace(0.07, 0.95, 256))  # (256, 3); its very ends are nearly black
+MOST_ENTRIES = 12  # labels without names that have a colour each
+MOST_COLOURS = 1 << 16  # of labels
+
+_SPREAD = (0.5, 99.5)  # percentiles between which the colours of numbers are spread
+_GREY = 0.5
+_SKEWED = 0.1  # a median this low in its range: the scale is logarithmic
+_TIMES = (("s", 1e9), ("ms", 1e6), ("µs", 1e3))  # that nanoseconds are told in
+
+
+@dataclass(frozen=True, eq=False)
+class Colouring:
+    """Colours of points, and a legend: a scale between two limits, or labels.
+
+    Parameters
+    ----------
+    colours
+        float64 (n, 3) in 0 to 1.
+    name, unit, meaning
+        Of the column; the unit is that of `limits`.
+    limits
+        Lowest and highest value on the scale, whose colours are `TURBO`; None for labels.
+    logarithmic
+        Whether the scale is.
+    labels
+        (name, colour): labels there are, those of most points first where they are many.
+    """
+
+    colours: NDArray[np.float64]
+    name: str
+    unit: str
+    meaning: str
+    limits: tuple[float, float] | None = None
+    logarithmic: bool = False
+    labels: tuple[tuple[str, NDArray[np.float64]], ...] = ()
+
+
+def colours_of(values: NDArray[Any], column: Column, names: Sequence[str] = ()) -> Colouring:
+    """Colour points by the values (n,) of a column.
+
+    Labels have a colour each. Those of more values than a legend can tell, and without names,
+    are on a scale like numbers. Numbers most of which are small among large ones, as intensities
+    are, have a logarithmic scale. What is NaN is grey.
+
+    Parameters
+    ----------
+    names
+        Names of the values 0, 1, 2, … of a label.
+    """
+    spread = _SPREAD
+    if column.kind == "label" and values.dtype.kind in "iu":
+        values = values.astype(np.int64)
+        found, counts = np.unique(values, return_counts=True)
+        if names or len(found) <= MOST_ENTRIES:
+            count = max(len(names), int(found.max(initial=0)) + 1)
+            palette = object_colours(min(count, MOST_COLOURS))
+            if len(found) > MOST_ENTRIES:
+                found = found[np.argsort(-counts, kind="stable")]
+            words = [
+                names[value] if 0 <= value < len(names) else f"{column.name} {value}"
+                for value in found.tolist()
+            ]
+            labels = tuple(zip(words, palette[found % len(palette)], strict=True))
+            colours = palette[values % len(palette)]
+            return Colouring(colours, column.name, "", column.meaning, labels=labels)
+        spread = (0, 100)
+    known, numbers, unit = np.isfinite(values), values.astype(np.float64), column.unit
+    middle, low, high = 0.5, 0.0, 1.0
+    if known.any():
+        low, middle, high = np.percentile(numbers[known], [spread[0], 50, spread[1]])
+    if unit == "ns":
+        span = high - low
+        unit, size = next((entry for entry in _TIMES if span >= 0.1 * entry[1]), ("ns", 1.0))
+        numbers = numbers / size
+        low, middle, high = low / size, middle / size, high / size
+    logarithmic = bool(low > 0 and middle - low < _SKEWED * (high - low))
+    if logarithmic:
+        numbers = np.log(np.clip(numbers, low, high))
+    ends = np.log([low, high]) if logarithmic else (low, high)
+    scaled = (numbers - ends[0]) * (255 / (ends[1] - ends[0] if high > low else 1.0))
+    colours = TURBO[np.clip(np.where(known, scaled, 0), 0, 255).astype(np.uint8)]
+    colours[~known] = _GREY
+    limits = float(low), float(high)
+    return Colouring(colours, column.name, unit, column.meaning, limits, logarithmic)
