@@ -106,15 +106,6 @@ def test_values_that_do_not_fit_their_column(dtype, values, message):
         Column("a", dtype, "", "", lambda returns: values).make(Returns())
 
 
-def test_no_returns_make_no_values():
-    class Nothing:
-        def __len__(self):
-            return 0
-
-    made = Column("a", "u1", "", "", lambda returns: np.zeros(0)).make(Nothing())
-    assert made.shape == (0,) and made.dtype == np.uint8
-
-
 # -- clouds ---------------------------------------------------------------------------------------
 
 
@@ -132,24 +123,11 @@ def test_a_cloud_gives_its_columns_in_their_types():
     assert cloud.table[0] is TABLE["scan"] and cloud.table[2].dtype == "<f8"
     assert cloud.bounds.tolist() == [[0, 1, 2], [12, 13, 14]]
     again = pickle.loads(pickle.dumps(cloud))
-    assert np.array_equal(again.positions, cloud.positions) and again.scan.tolist() == [
-        0,
-        0,
-        1,
-        1,
-        2,
-    ]
-
-
-def test_a_cloud_without_points_has_bounds():
-    cloud = Cloud(np.empty((0, 3)), {"scan": []})
-    assert cloud.bounds.tolist() == [[0, 0, 0], [0, 0, 0]]
-    assert list(cloud.chunks()) == [] and cloud.scan.dtype == np.int32
-
-
-def test_positions_stay_as_precise_as_they_came():
-    assert Cloud(np.zeros((1, 3), np.float32), {}).positions.dtype == np.float32
-    assert Cloud([[1, 2, 3]], {}).positions.dtype == np.float64
+    assert np.array_equal(again.positions, cloud.positions)
+    assert again.scan.tolist() == [0, 0, 1, 1, 2]
+    empty = Cloud(np.empty((0, 3)), {"scan": []})
+    assert empty.bounds.tolist() == [[0, 0, 0], [0, 0, 0]]
+    assert list(empty.chunks()) == [] and empty.scan.dtype == np.int32
 
 
 def test_a_column_that_is_not_there():

@@ -5,7 +5,7 @@ from io import StringIO
 
 import pytest
 
-from lidarpool.cli.terminal import PlainLines, time_in_words
+from lidarpool.cli.terminal import PlainLines
 from lidarpool.run.progress import Progress
 
 
@@ -68,11 +68,3 @@ def test_time_left_is_told_when_enough_is_known(done, after_s, sure):
     show(progress(0.0, 0, 1))
     show(progress(after_s, done, 1))
     assert ("/s" in stream.getvalue(), " left" in stream.getvalue()) == (True, sure)
-
-
-@pytest.mark.parametrize(
-    ("seconds", "words"),
-    [(0, "0 s"), (99, "99 s"), (101, "2 min"), (5900, "98 min"), (7500, "2 h 05 min")],
-)
-def test_time_in_words(seconds, words):
-    assert time_in_words(seconds) == words

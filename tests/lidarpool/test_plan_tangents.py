@@ -13,8 +13,6 @@ from lidarpool.plan import shortest_path_length
 from lidarpool.plan.geometry import segment_distances
 
 CORNERS = 16
-
-
 # By symmetry twice the way to the origin, where the inner tangent crosses.
 FAR, NEAR, RADIUS = 10.0, math.hypot(5, 3.5), 4.0
 ACROSS = 2 * (
@@ -25,7 +23,7 @@ ACROSS = 2 * (
 
 
 def over(rise: float, radius: float) -> float:
-    """From (-5, y) to (5, y) over a disc at (0, y + rise) or, below, under it."""
+    """From (-5, 0) to (5, 0) over the top of a disc at (0, rise)."""
     apart = math.hypot(5, rise)
     bend = math.pi / 2 + math.atan2(rise, 5) - math.acos(radius / apart)
     return 2 * (math.sqrt(apart**2 - radius**2) + radius * bend)

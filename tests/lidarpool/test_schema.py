@@ -12,7 +12,7 @@ from jsonschema import Draft202012Validator
 
 from lidarpool import LidarpoolError
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scenario.schema import scenario_schema, schema_text
+from lidarpool.scenario.schema import schema_text
 from lidarpool.scenario.template import scenario_template
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.yaml"))
@@ -76,11 +76,3 @@ def test_the_examples_and_the_template_are_valid(validator):
     assert len(texts) >= 3
     for text in texts:
         assert list(validator.iter_errors(yaml.safe_load(text))) == []
-
-
-def test_editors_find_words_and_choices():
-    schema = scenario_schema()
-    pool = schema["$defs"]["PoolSection"]["properties"]
-    assert pool["backend"]["enum"] == ["auto", "cuda", "embree", "numpy"]
-    assert "fastest" in pool["backend"]["description"]
-    assert schema["$defs"]["SensorSection"]["properties"]["layers"]["default"] == 40

@@ -50,12 +50,6 @@ def test_another_process_may_see_the_same_place(storage):
     assert not Storage("nonsense://a/b").sees("here", b"token")
 
 
-def test_a_file_that_is_not_there(storage):
-    storage.prepare()
-    with pytest.raises(FileNotFoundError):
-        storage.read("none")
-
-
 def test_a_file_is_whole_or_not_there(storage):
     """As long as it is written, nothing of it is seen under its name."""
     storage.prepare()
@@ -95,17 +89,6 @@ def test_a_folder_that_is_not_there(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OSError):
         Storage.at(tmp_path / "file" / "below").prepare()
-
-
-def test_only_an_empty_folder_is_removed(tmp_path):
-    storage = Storage.at(tmp_path / "parts")
-    storage.prepare()
-    storage.write("a", b"")
-    storage.remove_folder()
-    assert storage.sizes() == {"a": 0}
-    storage.remove(["a"])
-    storage.remove_folder()
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_path_is_made_absolute_and_a_url_is_left(tmp_path, monkeypatch):

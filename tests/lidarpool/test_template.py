@@ -28,11 +28,6 @@ def test_it_is_valid_and_is_the_default_survey(tmp_path):
     assert Scenario.load(tmp_path / "scenario.yaml").model_dump() == Scenario().model_dump()
 
 
-def test_its_head_names_the_schema_and_what_to_do():
-    assert TEXT.startswith("# yaml-language-server: $schema=scenario.schema.json\n")
-    assert "#     lidarpool run scenario.yaml\n" in TEXT
-
-
 def test_every_field_is_in_it_with_a_comment_of_its_own():
     for section in (
         *(Scenario, SceneSection, Sensor, ReturnsSection, NoiseSection, WeatherSection),

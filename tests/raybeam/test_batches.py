@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from benchmarks import seams
 
-from raybeam import Pattern, RayCaster, available_backends, numpy_backend
+from raybeam import Pattern, RayCaster, available_backends
 from raybeam.backend import Found
 from raybeam.mesh import local_mesh
 from raybeam.numpy_backend import NumpyBackend
@@ -50,15 +50,6 @@ def test_batches_may_be_cut_anywhere(caster, shapes, monkeypatch):
         np.testing.assert_array_equal(getattr(shuffled, name), getattr(whole, name)[order])
     monkeypatch.setattr(type(vase._engine), "chunk", 97)
     same(vase.cast(origins, directions), whole)
-
-
-def test_blocks_may_be_of_any_size(shapes, monkeypatch):
-    vase = RayCaster(*shapes["vase"](), "numpy")
-    origins, directions = rays(2000, 3)
-    whole = vase.cast(origins, directions)
-    for size in (5, 333, 1 << 20):
-        monkeypatch.setattr(numpy_backend, "_BLOCK", size)
-        same(vase.cast(origins, directions), whole)
 
 
 def test_one_origin_is_the_same_as_many(caster, shapes):

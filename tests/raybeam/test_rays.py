@@ -74,10 +74,3 @@ def test_unit_vectors_stay_as_they_are():
     mixed = unit.copy()
     mixed[::2] *= 7
     np.testing.assert_array_equal(unit_directions(mixed)[1::2], unit[1::2])
-
-
-def test_input_is_not_touched():
-    given = np.array([[0.0, 0, -3], [0, 4, 0]])
-    check_rays([0, 0, 0], given, 0, np.inf)
-    Pattern(given)
-    assert given.tolist() == [[0, 0, -3], [0, 4, 0]]

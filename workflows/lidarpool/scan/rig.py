@@ -164,7 +164,7 @@ def set_up(handle: str, packed: bytes) -> None:
         now = time.monotonic()
         for other in [h for h, rig in _rigs.items() if now - rig.used_at > UNUSED_S]:
             del _rigs[other]
-        plan: RigPlan = pickle.loads(packed)
+        plan: RigPlan = pickle.loads(packed)  # noqa: S301 - of the run's own driver, by Dask
         worker = get_worker()
         _rigs[handle] = Rig(plan, threads=worker.state.nthreads, device=own_device())
         trace("intersect.built", run=handle, stage="intersect", scans=[])

@@ -44,7 +44,8 @@ def read_yaml(path: Path) -> dict[str, Any]:
         than a mapping.
     """
     try:
-        content = yaml.load(path.read_text("utf-8-sig"), Loader=_Loader)  # builds plain data only
+        # The loader builds plain data only.
+        content = yaml.load(path.read_text("utf-8-sig"), Loader=_Loader)  # noqa: S506
     except FileNotFoundError as error:
         raise LidarpoolError(f"{path} does not exist: check the name and the folder.") from error
     except OSError as error:
