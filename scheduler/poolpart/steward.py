@@ -65,6 +65,8 @@ class Seat:
         Resources that it was started with.
     declared
         What it declares now, as far as it was told.
+    being_told
+        It is being told to declare something, and may do so at any moment.
     partition
         Where it belongs; None for nowhere.
     slots
@@ -82,6 +84,7 @@ class Seat:
     nanny: str | None = None
     found: Resources = field(default_factory=dict)
     declared: Resources = field(default_factory=dict)
+    being_told: bool = False
     partition: str | None = None
     slots: float = 0
     unplaced: bool = False
@@ -279,7 +282,9 @@ class Steward(SchedulerPlugin):
     def settled(self, seat: Seat) -> bool:
         """Whether a worker declares what it should, and the scheduler knows it."""
         worker = self.scheduler.workers.get(seat.info.address)
-        return worker is not None and worker.resources == seat.declared == self.wanted(seat)
+        if worker is None or seat.being_told:
+            return False
+        return bool(worker.resources == seat.declared == self.wanted(seat))
 
     def settle(self, seats: Iterable[Seat]) -> None:
         """Have workers declare what they should; `settled` tells when they do."""
@@ -322,7 +327,12 @@ class Steward(SchedulerPlugin):
             hand_off(self.scheduler, worker, leaving, asked)
             if held_by(self.scheduler, worker, leaving):
                 return False
-        if not await call(self.scheduler, worker.address, declare_on_worker, resources=wanted):
+        seat.being_told = True
+        try:
+            done = await call(self.scheduler, worker.address, declare_on_worker, resources=wanted)
+        finally:
+            seat.being_told = False
+        if not done:
             return False
         if self.scheduler.workers.get(worker.address) is worker:
             seat.declared = wanted

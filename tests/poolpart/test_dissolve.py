@@ -1,5 +1,6 @@
 """Undoing partitions: what the scheduler and workers know is what they knew before."""
 
+import asyncio
 import os
 import signal
 import threading
@@ -103,6 +104,26 @@ def test_a_worker_that_comes_back_after_all_is_as_it_was(nannies, wait_until):
     assert Pool(nannies, []).dissolve(timeout_s=LONG_S) == ["A", "B"]
     nannies.wait_for_workers(2, timeout=LONG_S)
     assert known(nannies) == before
+
+
+def test_a_worker_that_is_just_being_told_to_belong(start, wait_until, monkeypatch):
+    client = start({"a": {}})
+    Pool.from_client(client).divide({"A": rest()})
+    told, call = threading.Event(), steward.call
+
+    async def call_and_linger(*args, **kwargs):
+        answer = await call(*args, **kwargs)
+        if not told.is_set():
+            told.set()
+            await asyncio.sleep(0.5)
+        return answer
+
+    monkeypatch.setattr(steward, "call", call_and_linger)
+    client.cluster.worker_spec["b"] = client.cluster.worker_spec["a"]
+    client.sync(client.cluster._correct_state)
+    assert told.wait(LONG_S)
+    Pool(client, []).dissolve()
+    assert not any(dict(declares) for _, declares, *_ in client.run(_on_worker).values())
 
 
 def test_no_fence_stays(start):
