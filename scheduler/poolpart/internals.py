@@ -484,11 +484,6 @@ def serve(scheduler: Any, application: web.Application) -> None:
     scheduler.http_application.add_application(application)
 
 
-def serves(scheduler: Any, kind: type[web.Application]) -> bool:
-    """Whether pages of a kind are there."""
-    return any(isinstance(other, kind) for other in scheduler.http_application.applications)
-
-
 def serve_no_longer(scheduler: Any, kind: type[web.Application]) -> None:
     """Take pages of a kind away."""
     pages = scheduler.http_application.applications

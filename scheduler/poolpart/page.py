@@ -10,15 +10,19 @@ from html import escape
 from typing import Any
 
 from distributed import Client
+from distributed.diagnostics.plugin import SchedulerPlugin
 from tornado import web
 
 from .errors import PoolError
 from .fence import fences_of
-from .internals import depth_of, serve, serve_no_longer, serves
+from .internals import depth_of, serve, serve_no_longer
 from .pipe import pipes_of
-from .stats import running_on, slots_of, statistics_of, told
+from .stats import NAME as STATISTICS
+from .stats import forget_statistics, running_on, slots_of, statistics_of, told
+from .steward import NAME as STEWARD
 from .workers import on_scheduler
 
+NAME = "poolpart-page"
 PATH = "partitions"
 _LONGEST = 200  # characters of a cell
 
@@ -131,20 +135,27 @@ class PageApplication(web.Application):
     """The page, as the scheduler's HTTP server takes it and gives it back."""
 
 
-def partitions_page(client: Client) -> str:
-    """Add the page to the dashboard of the client's cluster; returns its URL.
+class PageOwners(SchedulerPlugin):
+    """Takes the page away when the last client that wanted it has gone."""
 
-    The page shows partitions, stages, workers and pipes, for all users of the cluster. It is
-    there until all partitions are dissolved, or the scheduler ends. It reads; nobody can change
-    anything with it. It needs no bokeh, and is as open as the dashboard is: on a shared network,
-    whoever reaches the one sees the other.
+    name = NAME
 
-    Raises
-    ------
-    PoolError
-        If the scheduler lacks this package, or runs no HTTP server.
-    """
-    on_scheduler(client, _open)
+    def __init__(self, scheduler: Any) -> None:
+        self.owners: set[str | None] = set()  # None is whoever leaves it to the scheduler
+        self.began_to_count = STATISTICS not in scheduler.plugins
+
+    def remove_client(self, scheduler: Any, client: str) -> None:
+        """Note that a client has gone, or wants the page no longer."""
+        self.owners.discard(client)
+        if not self.owners:
+            close_page(scheduler)
+            if self.began_to_count and STEWARD not in scheduler.plugins:
+                forget_statistics(scheduler)
+
+
+def partitions_page(client: Client, stay: bool = True) -> str:
+    """Add the page to the dashboard of the client's cluster, see `Pool.page`; returns its URL."""
+    on_scheduler(client, _open, owner=client.id, stay=stay)
     link: str | None
     try:
         link = client.dashboard_link
@@ -158,14 +169,30 @@ def partitions_page(client: Client) -> str:
     return link.removesuffix("/").removesuffix("/status") + f"/{PATH}"
 
 
-async def _open(dask_scheduler: Any = None) -> None:
-    if not serves(dask_scheduler, PageApplication):
+def leave_page(client: Client) -> None:
+    """Have the page go, unless others want it, as when the client goes."""
+    on_scheduler(client, _leave, owner=client.id)
+
+
+async def _open(owner: str, stay: bool, dask_scheduler: Any = None) -> None:
+    if not stay and owner not in dask_scheduler.clients:  # killed, and already seen off
+        return
+    if NAME not in dask_scheduler.plugins:
+        dask_scheduler.add_plugin(PageOwners(dask_scheduler))
         # A `dask scheduler --dashboard-prefix` is part of the path.
         handlers = [(r"(?:/.*)?/" + PATH, _Handler, {"scheduler": dask_scheduler})]
         serve(dask_scheduler, PageApplication(handlers))
+    dask_scheduler.plugins[NAME].owners.add(None if stay else owner)
     statistics_of(dask_scheduler)
+
+
+async def _leave(owner: str, dask_scheduler: Any = None) -> None:
+    if NAME in dask_scheduler.plugins:
+        dask_scheduler.plugins[NAME].remove_client(dask_scheduler, owner)
 
 
 def close_page(scheduler: Any) -> None:
     """Serve the page no longer."""
-    serve_no_longer(scheduler, PageApplication)
+    if NAME in scheduler.plugins:
+        serve_no_longer(scheduler, PageApplication)
+        scheduler.remove_plugin(NAME)

@@ -12,7 +12,7 @@ from distributed import Client
 
 from .division import declare, dissolve
 from .errors import PoolError
-from .page import partitions_page
+from .page import leave_page, partitions_page
 from .partition import Partition
 from .probe import probe_worker
 from .rules import Count, PerGpu, PerHost, Rule, check_rules, divide, named
@@ -254,9 +254,29 @@ class Pool:
         made, remainder = self._divide({name: rule}, {name: replace(rule, minimum=needed)})
         return made[name], remainder
 
-    def page(self) -> str:
-        """Add a page of partitions to Dask's dashboard, see `partitions_page`; returns its URL."""
-        return partitions_page(self.client)
+    def page(self, *, stay: bool = True) -> str:
+        """Add a page to Dask's dashboard: partitions, stages, workers and pipes; returns its URL.
+
+        It is for all users of the cluster, and reads: nobody can change anything with it. It
+        needs no bokeh, and is as open as the dashboard is: on a shared network, whoever reaches
+        the one sees the other.
+
+        Parameters
+        ----------
+        stay
+            Whether it is there until all partitions are dissolved or the scheduler ends; else
+            until this client closes, or `leave_page`.
+
+        Raises
+        ------
+        PoolError
+            If the scheduler lacks this package, or runs no HTTP server.
+        """
+        return partitions_page(self.client, stay)
+
+    def leave_page(self) -> None:
+        """Have a page that does not stay go, unless other clients want it."""
+        leave_page(self.client)
 
     def dissolve(self, timeout_s: float = 30.0) -> list[str]:
         """Undo every partition of this cluster that was made while it ran, whoever made it.

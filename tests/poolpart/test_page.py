@@ -10,7 +10,6 @@ import pytest
 from distributed import Client, Scheduler, SpecCluster, Worker, get_worker
 
 from poolpart import Partition, Pipe, Pool, PoolError
-from poolpart.page import partitions_page
 
 LONG_S = 120.0
 NASTY = "<script>alert('x')</script>&\"'"
@@ -66,14 +65,14 @@ def client(request):
 def test_it_is_served_and_taken_away(client):
     applications = client.cluster.scheduler.http_application.applications
     before = list(applications)
-    url = partitions_page(client)
+    url = Pool.from_client(client).page()
     assert re.fullmatch(r"http://127\.0\.0\.1:\d+/partitions", url)
     status, headers, text = get(url)
     assert (status, headers["Content-Type"]) == (200, "text/html; charset=UTF-8")
     assert headers["Cache-Control"] == "no-store"
     assert headers["Content-Security-Policy"].startswith("default-src 'none'")
     assert "<title>Partitions</title>" in text
-    assert partitions_page(client) == url  # once more changes nothing
+    assert Pool.from_client(client).page() == url  # once more changes nothing
     assert len(applications) == len(before) + 1
     # The rest of the dashboard is as it was.
     assert get(url.replace("partitions", "json/counts.json"))[0] == 200
@@ -85,7 +84,9 @@ def test_it_is_served_and_taken_away(client):
 
 
 def test_what_it_tells(client, wait_until):
-    url = partitions_page(client)
+    pool = Pool.from_client(client)
+    url = pool.page()
+    pool.partition("P", workers=["plain"], exclusive=True)
     part = Partition("A", client)
     results = [part.submit(work, i) for i in range(6)]
     failing = part.submit(broken)
@@ -102,20 +103,24 @@ def test_what_it_tells(client, wait_until):
     assert rows["work"][:5] == ["A", "0", "0", "0", "6"]
     assert (rows["broken"][0], rows["broken"][5]) == ("A", "1")
     assert rows[escape(NASTY)][:2] == ["A", "2"]  # names of users stay text
-    assert rows["plain"][:3] == ["remainder", "2", "0"]
+    assert rows["plain"][:3] == ["P", "2", "0"]
+    assert "P (exclusive)" in rows
     assert "frames-12345678" not in rows_of(url)
-
-
-def test_pools_have_a_page_and_dissolving_takes_it_away(client):
-    pool = Pool.from_client(client)
-    pool.partition("P", workers=["plain"], exclusive=True)
-    url = pool.page()
-    assert {"A", "P (exclusive)"} <= rows_of(url).keys()
     pool.dissolve()
-    assert get(url)[0] == 404
+
+
+def test_one_that_does_not_stay_goes_with_whoever_wanted_it(client, wait_until):
+    plugins = set(client.cluster.scheduler.plugins)
+    with Client(client.cluster.scheduler_address, set_as_default=False) as other:
+        url = Pool.from_client(other).page(stay=False)
+        Pool.from_client(client).page(stay=False)
+        Pool.from_client(client).leave_page()
+        assert get(url)[0] == 200
+    wait_until(lambda: get(url)[0] == 404)
+    assert set(client.cluster.scheduler.plugins) == plugins
 
 
 def test_a_scheduler_without_a_port(client, monkeypatch):
     monkeypatch.setattr(Client, "dashboard_link", property(lambda self: None))
     with pytest.raises(PoolError, match="no HTTP server"):
-        partitions_page(client)
+        Pool.from_client(client).page()

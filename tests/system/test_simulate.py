@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import logging
+import urllib.error
+import urllib.request
+
 import numpy as np
 import pytest
 from distributed import Client
@@ -122,6 +126,22 @@ def test_planning_runs_beside_the_survey(client):
     assert progress[-1].collected == progress[-1].framed == progress[-1].generated == 5
     again = simulate(room(), Survey(SENSOR, [(0, 0, 0)], 5), planning, client=client)
     assert np.array_equal(again.plan.path, result.plan.path)
+
+
+def test_a_run_has_a_page_of_partitions_as_long_as_it_lasts(client, caplog):
+    pages = []
+
+    def look(_):
+        said = next(text for text in caplog.messages if text.startswith("partitions page: http://"))
+        pages.append(said.removeprefix("partitions page: "))
+        with urllib.request.urlopen(pages[0], timeout=120) as page:
+            pages.append(page.read().decode())
+
+    with caplog.at_level(logging.INFO, "lidarpool"):
+        simulate(room(), Survey(SENSOR, [(0, 0, 0)]), client=client, on_progress=look)
+    assert all(f"<td>{name}</td>" in pages[-1] for name in ("GPU", "LIDAR", "OTHER", "intersect"))
+    with pytest.raises(urllib.error.HTTPError, match="404"):
+        urllib.request.urlopen(pages[0], timeout=120)
 
 
 def test_a_precision_too_fine_for_the_scene_is_refused(client):

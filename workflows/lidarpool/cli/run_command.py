@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -183,9 +183,11 @@ def _drive(
     with cluster as client, shown_progress(options.quiet) as show:
         tell = (lambda words: None) if options.quiet else _note
         run = Run(client, store, tell)
-        if live is None:
-            return run.drive(None, show)
-        return run.drive(live.on_frame, live.with_progress(show, run.partitions))
+        # The cluster of one run has no dashboard.
+        with run.partitions_page() if options.scheduler else nullcontext():
+            if live is None:
+                return run.drive(None, show)
+            return run.drive(live.on_frame, live.with_progress(show, run.partitions))
 
 
 def _note(words: str) -> None:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -96,6 +96,7 @@ class Run:
             if client.status != "running" or isinstance(error, CommClosedError):
                 raise self._told_lost() from error
             raise
+        self._pool = pool
         self.partitions: dict[str, Partition] = pool.partitions()
         self.notes: list[str] = []
         if not any(worker.gpus for worker in casting):
@@ -107,6 +108,21 @@ class Run:
             f"The cluster at {self.address} cannot be reached any more, or somebody cancelled "
             "the tasks of this run; it has ended without a result."
         )
+
+    @contextmanager
+    def partitions_page(self) -> Iterator[None]:
+        """Say where the page of partitions is, which is there as long as the body runs.
+
+        Nothing happens where the scheduler serves no pages.
+        """
+        with suppress(PoolError):
+            self._tell(f"partitions page: {self._pool.page(stay=False)}")
+        try:
+            yield
+        finally:
+            if self.client.status == "running":
+                with suppress(PoolError, *_CLUSTER_LOST):
+                    self._pool.leave_page()
 
     def drive(
         self,

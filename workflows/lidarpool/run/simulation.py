@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
@@ -20,6 +21,8 @@ from .progress import Progress
 from .result import Result
 from .run import Run, make_result
 from .store import RunStore
+
+logger = logging.getLogger(__name__)
 
 
 def simulate(
@@ -51,8 +54,9 @@ def simulate(
     planning
         A path to plan on the OTHER partition while the survey runs; None for none.
     client
-        Client of a cluster whose workers declare the resources GPU, LIDAR and OTHER. Without
-        one, a local cluster is started on the loopback interface and stopped in the end.
+        Client of a cluster whose workers declare the resources GPU, LIDAR and OTHER. Its dashboard
+        has a page of partitions meanwhile; the log says where. Without a client, a local cluster
+        is started on the loopback interface and stopped in the end.
     backend
         Ray-casting backend of stage 2: auto, cuda, embree or numpy.
     on_frame
@@ -116,7 +120,8 @@ def simulate(
         wait_s,
         patience_s,
     )
-    if client is None:
+    own = client is None
+    if own:
         check_backend_here(backend)
     store = RunStore(job, None if folder is None else Path(folder), parts, resume=resume)
     with store.kept_on_error():
@@ -136,6 +141,8 @@ def simulate(
             if client is None
             else nullcontext(client) as client
         ):
-            result = Run(client, store).drive(on_frame, on_progress)
+            run = Run(client, store, logger.info)
+            with nullcontext() if own else run.partitions_page():
+                result = run.drive(on_frame, on_progress)
             store.db.unlock()
             return result
