@@ -90,12 +90,10 @@ def of(*languages: str) -> Any:
     return pytest.mark.parametrize("block", chosen, ids=lambda block: block.where)
 
 
-def test_all_code_is_of_a_kind_that_is_looked_at():
+def test_no_code_is_overlooked():
     fences = sum(path.read_text("utf-8").count("\n```") for path in DOCUMENTS)
     assert fences == 2 * len(ALL)  # none has another form
-    assert {b.language for b in ALL} <= {"python", "yaml", "text", "matlab", *_SHELL}
-    assert {b.where.split(":")[0] for b in ALL if b.language == "matlab"} == {"docs/from-matlab.md"}
-    assert len(PROGRAMS) > 10
+    assert {block.language for block in ALL} <= {"python", "yaml", "text", "matlab", *_SHELL}
 
 
 @pytest.fixture
@@ -177,7 +175,7 @@ def look(words: list[str]) -> bool:
             assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text("utf-8"), re.M)
         case ["python", "-m", module, *_]:
             assert importlib.util.find_spec(module), module
-        case ["pip", "install", *arguments]:
+        case ["pip", "install", *arguments]:  # pip takes an extra that there is not
             project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
             extras = re.findall(r"\[(\w+)\]", " ".join(arguments))
             assert set(extras) <= set(project["optional-dependencies"])
@@ -199,20 +197,6 @@ def parse(command: click.Command, name: str, arguments: list[str]) -> None:
     with command.make_context(name, list(arguments), parent) as context:
         # dask worker hands what it does not know to preloads.
         assert not context.params.get("preload_argv")
-
-
-def test_wrong_commands_are_found():
-    for line in (
-        "lidarpool rum x.yaml",
-        "lidarpool run x.yaml --resme",
-        "dask scheduler --no-such-option",
-        "dask worker tcp://10.0.0.1:8786 --resource GPU=1 --no-such-option",
-    ):
-        with pytest.raises((click.UsageError, AssertionError)):
-            look(line.split())
-    with pytest.raises(AssertionError):
-        look(["make", "coffee"])
-    assert not look(["curl", "example.org"])
 
 
 @of("yaml")

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import base64
 import json
+import logging
 import os
 import pty
 import re
 import select
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -24,12 +24,12 @@ import psutil
 import pytest
 from distributed import Client
 
+import lidarpool.cli.run_command
 import lidarpool.report.output
 from lidarpool import LidarpoolError, read_cloud, simulate
-from lidarpool.report.output import FILES, result_folder, write_result
+from lidarpool.report.output import FILES, write_result
 from lidarpool.scenario.scenario import Scenario
 
-WAREHOUSE = Path(__file__).parents[3] / "shared" / "scenes" / "warehouse.glb"
 COMMAND = [sys.executable, "-c", "from lidarpool.cli.commands import main; main()"]
 # Of the default survey, with Embree as well as with NumPy.
 CLOUD_SHA256 = "9012bcbf7aa44d9d07c95fae78e707887c40225f1bde1fcb304c674c220c0228"
@@ -158,11 +158,14 @@ def test_the_demo_listens_on_loopback_only(demo):
     assert all(ip_address(one).is_loopback for addresses in demo.sockets for one in addresses)
 
 
+# -- on a cluster that is there -----------------------------------------------------------------
+
+
 @pytest.fixture
-def run(tmp_path, lidarpool, cluster) -> Callable[..., Any]:
+def run(tmp_path, lidarpool, cluster, no_pictures) -> Callable[..., Any]:
     """Run a scenario on the threads' cluster, into the folder `out`."""
 
-    def run(text: str, *options: str) -> Any:
+    def run(*options: str, text: str = SHORT) -> Any:
         (tmp_path / "s.yaml").write_text(text)
         arguments = ["--out", tmp_path / "out", "--scheduler", cluster, *options]
         return lidarpool("run", tmp_path / "s.yaml", *arguments)
@@ -170,23 +173,72 @@ def run(tmp_path, lidarpool, cluster) -> Callable[..., Any]:
     return run
 
 
-def test_without_planning_an_earlier_path_is_removed(run, tmp_path, no_pictures):
+def test_without_planning_an_earlier_path_is_removed(run, tmp_path):
     (tmp_path / "out").mkdir()
     for name in ("path.png", "mine.txt"):
         (tmp_path / "out" / name).write_text("earlier")
-    outcome = run(SHORT, "--no-plan", "--quiet")
+    outcome = run("--no-plan", "--quiet")
     assert (outcome.code, outcome.err) == (0, "")
     assert names_in(tmp_path / "out") == {*FILES, "mine.txt"} - {"path.png"}
     assert "path of" not in outcome.out and "path.png" not in outcome.out
     assert json.loads((tmp_path / "out" / "report.json").read_text())["planning"] is None
 
 
-def test_a_path_that_there_is_not(run, no_pictures):
+def test_a_path_that_there_is_not(run):
     ring = [f"{{centre: [{25 + 6 * np.cos(a):.3f}, {25 + 6 * np.sin(a):.3f}], radius_m: 3}}"
             for a in np.arange(0, 6.28, 0.5)]  # fmt: skip
-    outcome = run(f"planning: {{trials: 2, iterations: 5, obstacles: [{', '.join(ring)}]}}\n")
+    planning = f"planning: {{trials: 2, iterations: 5, obstacles: [{', '.join(ring)}]}}\n"
+    outcome = run(text="sensor: {layers: 2}\n" + planning)
     assert outcome.code == 0, outcome.err
     assert "no path free of collisions was found; none is possible" in outcome.out
+
+
+def test_a_run_that_hits_nothing_says_so(run):
+    outcome = run("--no-plan", text="steps: 1\nposes: [[0, 0, 1000]]\n")
+    assert outcome.code == 0
+    assert "no ray that was cast hit anything: look at poses" in outcome.out
+
+
+def test_json_is_one_document_and_all_of_stdout(run, tmp_path):
+    outcome = run("--json")
+    assert outcome.code == 0
+    assert "survey  done: 108 scans" in outcome.err  # progress for people beside it
+    said = json.loads(outcome.out, parse_constant=pytest.fail)
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert said["folder"] == str(tmp_path / "out")
+    assert list(said["files"]) == report["files"]
+    assert all(Path(path).is_file() for path in said["files"].values())
+    assert said["points"] == len(read_cloud(said["files"]["cloud.ply"])) > 0
+    for name in ("scans", "rays", "hits", "backend", "notes", "seconds", "placement_violations"):
+        assert said[name] == report[name]
+    assert said["planning"]["best_length"] == report["planning"]["best_length"]
+
+
+def test_json_of_a_run_that_fails_is_nothing(run):
+    outcome = run("--json", text="sensor: {layer: 3}\n")
+    assert (outcome.code, outcome.out) == (2, "")
+    assert outcome.err.startswith("lidarpool: ")
+
+
+def test_warnings_of_libraries_are_not_on_the_terminal(run, monkeypatch):
+    shown_progress = lidarpool.cli.run_command.shown_progress
+
+    def warn(quiet: bool) -> Any:
+        logging.getLogger("distributed.worker").warning("memory is nearly full")
+        return shown_progress(quiet)
+
+    monkeypatch.setattr(lidarpool.cli.run_command, "shown_progress", warn)
+    outcome = run("--no-plan")
+    assert outcome.code == 0
+    assert "memory is nearly full" not in outcome.err + outcome.out
+
+
+@pytest.mark.slow
+def test_verbose_shows_what_driver_and_workers_log(tmp_path, lidarpool, no_pictures):
+    (tmp_path / "s.yaml").write_text(SHORT)
+    outcome = lidarpool("run", tmp_path / "s.yaml", "--out", tmp_path / "out", "-v", "-q")
+    assert outcome.code == 0
+    assert {"scheduler", "worker"} <= set(re.findall(r"distributed\.(\w+) - INFO", outcome.err))
 
 
 @pytest.mark.slow
@@ -205,54 +257,45 @@ def test_nobody_reads_the_output(tmp_path, cluster):
     assert names_in(tmp_path / "lidarpool-out") == {"cloud.ply", "report.json"}
 
 
-def test_version_and_help(lidarpool):
-    assert lidarpool("--version").out.startswith("lidarpool, version ")
-    listed = lidarpool("--help").out
-    assert {"demo", "run", "info"} <= set(listed.split())
-
-
 def test_info_tells_versions_backends_and_gpus(lidarpool):
     outcome = lidarpool("info")
     assert (outcome.code, outcome.err) == (0, "")
     first_words = [line.split()[0] for line in outcome.out.splitlines()]
     assert {"lidarpool", "python", "dask", "GPUs", "backends", "cuda", "embree"} <= {*first_words}
     assert re.search(r"^  numpy +ready$", outcome.out, re.MULTILINE)
+    assert lidarpool("--version").out.startswith("lidarpool, version ")
 
 
 # -- on a terminal ------------------------------------------------------------------------------
 
 
-def on_a_terminal(arguments: list[str], **environment: str) -> tuple[int, str]:
-    """Run the command on a pseudo terminal; exit code and all that it drew."""
+def test_bars_on_a_terminal(tmp_path, cluster):
     try:
         master, slave = pty.openpty()
     except OSError as error:
         pytest.skip(f"there are no pseudo-terminals here: {error}")
-    env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "TERM": "xterm-256color"}
+    (tmp_path / "s.yaml").write_text(SHORT)
     process = subprocess.Popen(
-        [*COMMAND, *arguments], stdout=slave, stderr=slave, env={**env, **environment}
+        [*COMMAND, "run", "s.yaml", "--only", "cloud", "--scheduler", cluster],
+        cwd=tmp_path,
+        stdout=slave,
+        stderr=slave,
+        env={
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join(sys.path),
+            "TERM": "xterm-256color",
+            "COLUMNS": "100",
+        },
     )
     os.close(slave)
     drawn = b""
-    stop = time.monotonic() + 300
-    while time.monotonic() < stop:
-        if select.select([master], [], [], 0.2)[0]:
-            try:
-                drawn += os.read(master, 65536)
-            except OSError:  # as Linux says that the other end was closed
-                break
+    with suppress(OSError):  # as Linux says that the other end was closed
+        while select.select([master], [], [], 300)[0]:
+            drawn += os.read(master, 65536)
     os.close(master)
-    return process.wait(300), drawn.decode()
-
-
-def test_bars_on_a_terminal(tmp_path, cluster):
-    (tmp_path / "s.yaml").write_text(SHORT)
-    arguments = ["run", str(tmp_path / "s.yaml"), "--out", str(tmp_path / "o"), "--only", "cloud"]
-    code, drawn = on_a_terminal([*arguments, "--scheduler", cluster], COLUMNS="100")
-    assert code == 0, drawn
-    for label in ("1 generate", "2 intersect", "3 sort", "4 collect", "planning"):
-        assert label in drawn
-    assert "108/108" in drawn and "4/4" in drawn
+    assert process.wait(300) == 0, drawn
+    for label in ("1 generate", "2 intersect", "3 sort", "4 collect", "planning", "108/108", "4/4"):
+        assert label in drawn.decode()
 
 
 # -- the output folder ---------------------------------------------------------------------------
@@ -298,51 +341,12 @@ def test_a_file_that_cannot_be_written_leaves_the_earlier_result(
     assert {path.name for path in (tmp_path / "out").iterdir()} == before.keys()
 
 
-def test_what_a_killed_run_left_is_removed(tmp_path):
-    out = tmp_path / "out"
-    before = earlier(out)
-    (out / ".writing-0123abcd").mkdir()
-    (out / ".writing-0123abcd" / "cloud.ply").write_text("half a cl")
-    with result_folder(out):
-        assert content(out) == before
-        assert {path.name for path in out.iterdir()} == before.keys()
-
-
-def test_folders_made_for_nothing_are_removed(tmp_path):
-    with pytest.raises(ZeroDivisionError), result_folder(tmp_path / "a" / "b"):
-        assert (tmp_path / "a" / "b").is_dir()
-        raise ZeroDivisionError
-    assert list(tmp_path.iterdir()) == []
-
-
-# -- a real scene --------------------------------------------------------------------------------
-
-
-@pytest.mark.skipif(not WAREHOUSE.exists(), reason="the warehouse is not there")
-def test_shelves_of_the_warehouse_stand_upright(lidarpool, cluster, tmp_path, no_pictures):
-    outcome = lidarpool("run", WAREHOUSE, "--out", tmp_path / "o", "--scheduler", cluster, "-q")
-    assert outcome.code == 0, outcome.err
-    scene = Scenario.load(WAREHOUSE).build_scene()
-    cloud = read_cloud(tmp_path / "o" / "cloud.ply")
-    by_object = json.loads((tmp_path / "o" / "report.json").read_text())["points_by_object"]
-    shelves = 0
-    for number, name in enumerate(scene.names):
-        points = cloud.positions[cloud.object == number]
-        assert len(points) == by_object[name]
-        low, high = scene.object_bounds[number] + scene.origin
-        assert (points >= low - 0.011).all() and (points <= high + 0.011).all()
-        if "Shelf" in name and len(points) > 50:
-            shelves += 1
-            assert np.ptp(points[:, 2]) > 1.5  # metres of height, seen from the middle of the hall
-    assert shelves >= 3
-
-
 # -- drawn again ---------------------------------------------------------------------------------
 
 
 def test_the_pictures_of_a_run_are_drawn_again_to_the_bit(demo, lidarpool, tmp_path):
     out = demo.out
-    again = lidarpool("plot", out, "--out", tmp_path)
+    again = lidarpool("plot", out, "--only", "scene", "--only", "path", "--out", tmp_path)
     assert (again.code, again.err) == (0, "")
-    for name in ("scene.png", "intensity.png", "cloud.png", "path.png"):
+    for name in ("scene.png", "path.png"):
         assert (tmp_path / name).read_bytes() == (out / name).read_bytes()

@@ -11,8 +11,6 @@ import time
 import psutil
 import pytest
 
-from lidarpool.base import interrupts
-from lidarpool.base.interrupts import deferred_interrupts, interrupt_on_signals
 from lidarpool.run.connection import local_client
 
 SCRIPT = """
@@ -67,33 +65,3 @@ def test_workers_are_forked_from_one_process_also_in_place_of_others():
         modules = client.run(lambda: {"lidarpool.scan.stages", "open3d"} & sys.modules.keys())
         assert list(modules.values()) == [{"lidarpool.scan.stages"}] * 2
     assert psutil.Process(server).children() == []
-
-
-@pytest.fixture
-def handlers():
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
-
-
-def test_a_first_signal_is_held_back_until_the_body_is_done(handlers):
-    interrupt_on_signals()
-    done = False
-    with pytest.raises(KeyboardInterrupt), deferred_interrupts():
-        signal.raise_signal(signal.SIGTERM)
-        done = True
-    assert done
-
-
-def test_a_second_one_is_not(handlers, monkeypatch):
-    ended: list[int] = []
-    monkeypatch.setattr(interrupts, "_IMPATIENT_S", -1.0)
-    monkeypatch.setattr(interrupts.os, "write", lambda *_: None)
-    monkeypatch.setattr(interrupts.os, "_exit", ended.append)
-    interrupt_on_signals()
-    with pytest.raises(KeyboardInterrupt):
-        signal.raise_signal(signal.SIGINT)
-    with deferred_interrupts():
-        signal.raise_signal(signal.SIGINT)
-        assert ended == [interrupts.INTERRUPTED]

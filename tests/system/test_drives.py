@@ -19,18 +19,15 @@ ROOT = Path(__file__).parents[2]
 
 POINTS = "{time_s: 0, position: [0, 0, 1]}, {time_s: 1, position: [9, 0, 1]}"
 LINE = "1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n"
+CAR = "actors: [{name: Car, box: [4, 2, 1.5]%s}]"
 # (scenario, the file it names, what is said)
 BAD = [
-    ("trajectory: t.txt", "", "t.txt is no trajectory.* it is empty"),
     ("trajectory: t.txt", "# only a comment", "it has no poses"),
     ("trajectory: none.txt", "", "none.txt.*No such file"),
     ("trajectory: t.txt", "1 0 0 0 0 0 0 1\n", "two poses at least"),
     ("trajectory: t.txt", LINE + "3 nan 0 0 0 0 0 1\n", "position of pose 2 is not finite"),
-    ("trajectory: t.txt", LINE + "inf 0 0 0 0 0 0 1\n", "time of pose 2 is not finite"),
     ("trajectory: t.txt", LINE + "2 5 0 0 0 0 0 1\n", "times must ascend.*pose 2"),
-    ("trajectory: t.txt", LINE + "1.5 5 0 0 0 0 0 1\n", "times must ascend.*pose 2"),
     ("trajectory: t.txt", LINE + "3 5 0 0 0 0 0 1.01\n", "quaternion of pose 2 is not of length 1"),
-    ("trajectory: t.txt", LINE + "3 5 0 0 nan 0 0 1\n", "quaternion of pose 2 is not of length 1"),
     ("trajectory: t.txt", LINE + "3 5 0 0 0 0 1\n", "number of columns changed"),
     ("trajectory: t.txt", LINE + "3 5 0 0 0 0 0 east\n", "could not convert string"),
     ("trajectory: {file: t.txt, start_s: 4.5}", LINE, "start_s is 4.5 s, 2.5 s outside"),
@@ -39,33 +36,15 @@ BAD = [
     ("trajectory: {file: t.txt, times: t.txt}", "0.5\n", "1 numbers, not 12"),
     ("trajectory: {file: t.txt, times: t.txt, format: tum}\nsteps: 399", LINE, "1.*s less"),
     ("trajectory: {file: t.txt, format: csv}", "x,y,z\n1,2,3\n", "no column 'time_s'"),
-    ("trajectory: {file: t.txt, format: csv}", "time_s,x,y,z,qx\n", "no column 'qy'"),
     ("trajectory: {file: t.txt, format: csv}", "time_s,x,y,z\n", "it has no poses"),
-    (
-        "trajectory: {file: t.txt, format: csv, columns: {time_s: at}}",
-        "time_s,x,y,z\n1,2,3,4\n",
-        "no column 'at'",
-    ),
     ("trajectory: {file: t.txt, points: [" + POINTS + "]}", LINE, "either file or points"),
-    ("trajectory: {}", "", "either file or points"),
-    ("trajectory: {file: t.txt, format: gpx}", LINE, "trajectory.format is 'gpx'"),
     ("trajectory: {points: [{position: [0, 0, 0]}]}", "", "time_s is missing"),
     ("trajectory: t.txt\nposes: [[0, 0, 1]]", LINE, "either poses or a trajectory"),
-    ("mount: {place: [0, 0, 1]}", "", "mount.place is not a field"),
     ("mount: {position: [0, 0]}", "", "mount.position"),
-    ("sensors: {a: {mount: {yaw: 1}}}", "", "yaw is not a field"),
     ("sensors: {a: {}}\nmount: {yaw_deg: 3}", "", "either sensor and mount, or sensors"),
-]
-
-
-CAR = "actors: [{name: Car, box: [4, 2, 1.5]%s}]"
-AWAY = "\ntrajectory: {file: t.txt, offset_s: -0.5}"
-BAD += [
     (CAR % "", "", r"actors\[0\].trajectory is missing"),
     (CAR % ", trajectory: t.txt", LINE, "actor 'Car': .* start_s is 0 s, 1 s outside"),
-    (CAR % ", trajectory: t.txt" + AWAY, LINE, "0.5 s outside"),
     (CAR % ", file: a.stl, trajectory: t.txt", LINE, "either file or box"),
-    (CAR % ", colour: red, trajectory: t.txt", LINE, "colour is not a field"),
     (CAR % ", trajectory: {file: t.txt, start_s: 1}", LINE, "give offset_s"),
     (CAR % (", trajectory: {points: [" + POINTS + "]}") + "\nsteps: 150", "", "0.25 s outside"),
     ("actors: [{name: Car, file: no.stl, trajectory: t.txt}]", LINE, "no.stl does not exist"),

@@ -7,7 +7,9 @@ import re
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+import time
+import uuid
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -46,12 +48,101 @@ pictures.draw_scene = lambda *_, **__: time.sleep(600)
 """
 
 
+ENDS_WITHIN_S = 300  # on a busy machine; a second or two on an idle one
+
+
+class RunningCommand:
+    """The command in a process group of its own, as a shell starts it."""
+
+    def __init__(self, folder: Path, scenario: str, *options: str, prelude: str = "") -> None:
+        (folder / "s.yaml").write_text(scenario)
+        self.tag = uuid.uuid4().hex
+        self.log = folder / f"{self.tag}.log"
+        with self.log.open("wb") as log:
+            self.process = subprocess.Popen(
+                [
+                    sys.executable,
+                    "-c",
+                    prelude + "from lidarpool.__main__ import main; main()",
+                    "run",
+                    "s.yaml",
+                    "--out",
+                    "out",
+                    *options,
+                ],
+                cwd=folder,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+                env={
+                    **os.environ,
+                    "PYTHONPATH": os.pathsep.join(sys.path),
+                    "TEST_RUN_TAG": self.tag,
+                },
+            )
+
+    def wait_for(self, pattern: str) -> RunningCommand:
+        """Wait until the run says something."""
+        stop = time.monotonic() + ENDS_WITHIN_S
+        while not re.search(pattern, self.said):
+            assert self.process.poll() is None, self.said
+            assert time.monotonic() < stop, self.said
+            time.sleep(0.02)
+        return self
+
+    @property
+    def said(self) -> str:
+        """What it has written so far, its workers included."""
+        return self.log.read_text()
+
+    def signal(self, number: int, *, group: bool = False) -> int:
+        """Send a signal, wait for the end, return the exit code."""
+        (os.killpg if group else os.kill)(self.process.pid, number)
+        return self.process.wait(ENDS_WITHIN_S)
+
+    @property
+    def processes(self) -> set[int]:
+        """Processes of this run that are alive, workers included."""
+        found = set()
+        for entry in Path("/proc").iterdir():
+            if entry.name.isdigit():
+                try:
+                    if self.tag.encode() in (entry / "environ").read_bytes():
+                        found.add(int(entry.name))
+                except (OSError, ProcessLookupError):
+                    continue  # it has ended, or is another user's
+        return found
+
+    def wait_until_alone(self, seconds: float = ENDS_WITHIN_S) -> None:
+        """Wait until no process is left."""
+        stop = time.monotonic() + seconds
+        while self.processes:
+            assert time.monotonic() < stop, self.processes
+            time.sleep(0.1)
+
+    def close(self) -> None:
+        for process in self.processes:
+            os.kill(process, signal.SIGKILL)
+        self.process.wait(300)
+
+
 @pytest.fixture
-def start(tmp_path: Path, start_command: Callable[..., Any]) -> Callable[..., Any]:
-    """Start runs whose result goes to a folder with an earlier one."""
+def start(tmp_path: Path) -> Iterator[Callable[..., RunningCommand]]:
+    """Start runs of a scenario, its text given, into a folder with an earlier result.
+
+    All that is left of them is killed in the end. `prelude` is Python that comes first.
+    """
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "cloud.ply").write_text("an earlier cloud")
-    return start_command
+    runs: list[RunningCommand] = []
+
+    def start(*arguments: str, prelude: str = "") -> RunningCommand:
+        runs.append(RunningCommand(tmp_path, *arguments, prelude=prelude))
+        return runs[-1]
+
+    yield start
+    for run in runs:
+        run.close()
 
 
 @pytest.fixture
@@ -210,14 +301,15 @@ def test_a_terminal_spares_workers_and_what_clears_up_behind_them():
 def test_a_second_ctrl_c_ends_it_at_once():
     script = (
         "import signal, time\n"
-        "from lidarpool.base.interrupts import interrupt_on_signals\n"
+        "from lidarpool.base.interrupts import deferred_interrupts, interrupt_on_signals\n"
         "interrupt_on_signals()\n"
         "try: signal.raise_signal(signal.SIGINT)\n"
         "except KeyboardInterrupt: pass\n"
         "signal.raise_signal(signal.SIGINT)\n"  # the first one's twin
         "time.sleep(1.1)\n"
-        "signal.raise_signal(signal.SIGINT)\n"
-        "print('still here')\n"
+        "with deferred_interrupts():\n"
+        "    signal.raise_signal(signal.SIGINT)\n"
+        "    print('still here')\n"
     )
     ended = subprocess.run([sys.executable, "-c", script], capture_output=True, check=False)
     assert (ended.returncode, ended.stdout) == (130, b"")
@@ -250,29 +342,11 @@ def test_workers_follow_a_driver_that_was_killed(start, untouched):
 
 
 @pytest.mark.slow
-def test_a_run_that_was_stopped_and_killed_while_it_wrote_is_resumed(
-    start, untouched, cluster, lidarpool, tmp_path, monkeypatch, no_pictures
-):
-    options = ("--scheduler", cluster)
-    stopped = start(SHORT, *options, prelude=STAYS_WRITING).wait_for(WRITING)
-    check_interrupted(stopped, stopped.signal(signal.SIGINT, group=True))
-    assert "stopped. 108 of 108 scans are kept in out/run" in stopped.said
+def test_ctrl_c_while_the_result_is_written(start, untouched, cluster):
+    run = start(SHORT, "--scheduler", cluster, prelude=STAYS_WRITING).wait_for(WRITING)
+    check_interrupted(run, run.signal(signal.SIGINT, group=True))
+    assert "stopped. 108 of 108 scans are kept in out/run" in run.said
     assert untouched(kept=True)
-    killed = start(SHORT, *options, "--resume", prelude=STAYS_WRITING).wait_for(WRITING)
-    killed.signal(signal.SIGKILL)
-    assert (tmp_path / "out" / "cloud.ply").read_text() == "an earlier cloud"
-    monkeypatch.chdir(tmp_path)
-    refused = lidarpool("run", "s.yaml", "--out", "out")
-    assert refused.code == 2
-    assert refused.err == (
-        "lidarpool: out/run holds an unfinished run, 108 of 108 scans: continue it with "
-        "--resume (in Python resume=True), or drop it with --fresh (in Python remove_run).\n"
-    )
-    run = lidarpool("run", "s.yaml", "--out", "out", "--resume")
-    assert run.code == 0, run.err
-    assert "starting the workers" not in run.err
-    names = {path.name for path in (tmp_path / "out").iterdir()}
-    assert names == {*FILES}
 
 
 def test_the_scheduler_of_an_outside_cluster_is_killed(start, untouched, outside):

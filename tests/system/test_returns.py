@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from distributed import Client
@@ -14,7 +10,6 @@ from tests.clusters import thread_cluster
 import lidarpool.scan.driver
 from lidarpool import (
     Cloud,
-    Frame,
     Material,
     Noise,
     Returns,
@@ -24,8 +19,6 @@ from lidarpool import (
     load_sensor,
     simulate,
 )
-from lidarpool.run.identity import difference, identity_of
-from lidarpool.run.job import Job
 
 SURVEY = Survey(
     Sensor.grid(rays_per_revolution=360, layers=40, step_deg=1, max_range_m=60),
@@ -60,42 +53,6 @@ def test_another_cluster_and_other_batches_give_the_same_bytes(
         Client(cluster, set_as_default=False) as client,
     ):
         assert same_cloud(simulate(Scene.seed(), SURVEY, client=client).cloud, undisturbed)
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("small_batches")
-def test_a_killed_worker_leaves_no_trace(client, undisturbed, same_cloud):
-    killed: list[int] = []
-
-    def on_frame(frame: Frame) -> None:
-        if frame.scan == 50:
-            gpu = [
-                a for a, w in client.scheduler_info()["workers"].items() if "GPU" in w["resources"]
-            ]
-            killed.append(client.run(os.getpid, workers=gpu[:1])[gpu[0]])
-            os.kill(killed[0], signal.SIGKILL)
-
-    assert same_cloud(
-        simulate(Scene.seed(), SURVEY, client=client, on_frame=on_frame).cloud, undisturbed
-    )
-    assert killed
-
-
-OTHERS = {
-    "materials": (Material("*", 0.3),),
-    "returns": Returns("all"),
-    "noise": Noise(0.02, seed=6),
-    "visibility_km": 1.0,
-}
-
-
-@pytest.mark.parametrize("name", OTHERS)
-def test_a_run_with_others_is_not_resumed(name):
-    job = Job(Scene.seed(), SURVEY)
-    other = Job(Scene.seed(), replace(SURVEY, **{name: OTHERS[name]}))
-    same = Job(Scene.seed(), replace(SURVEY, steps=180))
-    assert difference(identity_of(job), identity_of(same)) == ""
-    assert difference(identity_of(job), identity_of(other)) == "it is of another survey"
 
 
 def test_a_sensor_says_how_finely_points_are_rounded(cluster_client):

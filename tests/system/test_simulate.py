@@ -107,13 +107,6 @@ def test_far_from_zero_the_cloud_is_in_world_coordinates(client):
     assert np.abs(far.positions - there - here.positions).max() <= 0.0101
 
 
-def test_the_queue_capacity_changes_nothing_in_the_cloud(client):
-    survey = Survey(SENSOR, [(1, 1, 0)], 40)
-    usual = simulate(room(), survey, client=client).cloud
-    narrow = simulate(room(), survey, client=client, queue_capacity=1, collectors=1).cloud
-    assert np.array_equal(usual.positions, narrow.positions)
-
-
 def test_planning_runs_beside_the_survey(client):
     planning = Planning((25, 25), (-30, -20), [(0, 0)], 2.0, trials=5, particles=50, iterations=20)
     progress = []
