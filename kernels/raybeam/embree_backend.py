@@ -66,17 +66,17 @@ class _Hits:
 
     Attributes
     ----------
-    ray
-        (k,): numbers of the rays whose hits count, ascending.
+    counts
+        bool (n,): rays whose hits count.
     t
-        (n,): local distance of each ray's hit; of a ray that is not listed, anything.
+        (n,): local distance of each ray's hit; where it does not count, anything.
     place
         uint32 (n,): row of the mesh's corners; likewise.
     refined
         (n,): whether the distance is refined; None if all are rough.
     """
 
-    ray: NDArray[np.intp]
+    counts: NDArray[np.bool_]
     t: NDArray[np.floating[Any]]
     place: NDArray[np.uint32]
     refined: NDArray[np.bool_] | None
@@ -127,9 +127,10 @@ class EmbreeBackend(Backend):
         unit, starts = rays.directions.T.copy(), Starts(self._mesh.to_local(rays.origins))
         desk.aim(unit)
         hits = self._within(desk, unit, starts, limits)
-        t, place = self._distance(hits, hits.ray, unit, starts, limits)
-        u, v = self._refine.weights(starts.of(hits.ray), rays.directions[hits.ray], place)
-        return Found(hits.ray, t, self._mesh.index[place], u, v)
+        ray = np.flatnonzero(hits.counts)
+        t, place = self._distance(hits, ray, unit, starts, limits)
+        u, v = self._refine.weights(starts.of(ray), rays.directions[ray], place)
+        return Found(ray, t, self._mesh.index[place], u, v)
 
     def scan(self, scan: Scan) -> ScanReturns:
         """See `Backend.scan`; rays are made where Embree reads them, a chunk at a time."""
@@ -137,12 +138,15 @@ class EmbreeBackend(Backend):
         limits = self._limits(scan.t_min, scan.t_max)
         for start, stop in scan.chunks(self.chunk):
             desk = self._desk(stop - start)
-            unit, starts = desk.make(scan, start, stop, self._mesh)
+            order, unit, starts = desk.make(scan, start, stop, self._mesh)
             hits = self._within(desk, unit, starts, limits)
+            ray = np.flatnonzero(order.by_ray(hits.counts))
+            slot = order.of(ray)
             if scan.tally:
-                collector.tally(self._mesh.index.take(hits.place.take(hits.ray)))
-            kept = hits.ray[collector.keep(hits.ray, start, stop)]
-            t, place = self._distance(hits, kept, unit, starts, limits)
+                collector.tally(self._mesh.index.take(hits.place.take(slot)))
+            keep = collector.keep(ray, start, stop)
+            kept, slot = ray[keep], slot[keep]
+            t, place = self._distance(hits, slot, unit, starts, limits)
             t /= self._mesh.scale
             collector.add(start, kept, t, self._mesh.index.take(place))
         return collector.result()
@@ -167,7 +171,7 @@ class EmbreeBackend(Backend):
             unclear &= counts
         ray = np.flatnonzero(unclear)
         if not len(ray):
-            return _Hits(np.flatnonzero(counts), t, place, None)
+            return _Hits(counts, t, place, None)
         exact = self._refined(ray, t[ray], place[ray], unit, starts)
         t = t.astype(np.float64)
         t[ray] = exact
@@ -176,7 +180,7 @@ class EmbreeBackend(Backend):
         if early.any():
             again, t[again], place[again] = self._beyond(desk, ray[early], unit, starts, limits)
             counts[again] = t[again] <= limits.t_max
-        return _Hits(np.flatnonzero(counts), t, place, unclear)
+        return _Hits(counts, t, place, unclear)
 
     def _beyond(
         self,

@@ -44,7 +44,8 @@ class Poses:
     positions
         float64 (k, 3), metres.
     rotations
-        float64 (k, 3, 3) from the sensor's axes to the mesh's; None when those are the same.
+        float64 (k, 3, 3) from the sensor's axes to the mesh's; None when those are the same. In
+        memory the poses of each number lie together, as those of positions and motion do.
     rays
         Rays of a pose, at least 1: ray i belongs to pose ``i // rays``.
     motion
@@ -144,7 +145,7 @@ def check_poses(
             "give more poses, more rays_per_pose, or a smaller window."
         )
     return Poses(
-        np.broadcast_to(np.ascontiguousarray(places, dtype=np.float64), (count, 3)),
+        np.broadcast_to(_by_number(places), (count, 3)),
         None if turns is None else np.broadcast_to(turns, (count, 3, 3)),
         each,
         None if motion is None else _check_motion(motion, count, each),
@@ -154,7 +155,7 @@ def check_poses(
 def _check_motion(motion: Motion, poses: int, rays: int) -> Motion:
     arrays = []
     for name, shape in (("delays", (rays,)), ("velocities", (poses, 3)), ("rates", (poses, 3))):
-        array = np.ascontiguousarray(getattr(motion, name), dtype=np.float64)
+        array = _by_number(np.asarray(getattr(motion, name), dtype=np.float64))
         if array.shape != shape or not np.isfinite(array).all():
             raise ValueError(
                 f"Motion.{name} must be {shape} finite numbers for {poses:,} poses of {rays:,} "
@@ -166,10 +167,10 @@ def _check_motion(motion: Motion, poses: int, rays: int) -> Motion:
 
 def _check_rotations(rotations: ArrayLike) -> NDArray[np.float64]:
     """Rotation matrices (k, 3, 3) in float64; raises ValueError for one that is not orthonormal."""
-    matrices = np.ascontiguousarray(real_rows("rotations", rotations, (3, 3)), dtype=np.float64)
+    matrices = _by_number(real_rows("rotations", rotations, (3, 3)))
     # Written out for all matrices at once: a product of matrices one by one takes longer than
     # casting their rays. NaN compares as false.
-    rows = np.ascontiguousarray(matrices.reshape(-1, 9).T).reshape(3, 3, -1)
+    rows = matrices.transpose(1, 2, 0)
     good = np.ones(len(matrices), np.bool_)
     with np.errstate(over="ignore", invalid="ignore"):
         for one in range(3):
@@ -184,3 +185,9 @@ def _check_rotations(rotations: ArrayLike) -> NDArray[np.float64]:
             f"turn the sensor's axes to the mesh's ({len(bad)} of {len(matrices)} are like that)."
         )
     return matrices
+
+
+def _by_number(table: NDArray[Any]) -> NDArray[np.float64]:
+    """Table (k, ...) in float64, whose entries for each number lie together in memory."""
+    last = np.moveaxis(table, 0, -1)
+    return np.moveaxis(np.ascontiguousarray(last, dtype=np.float64), -1, 0)

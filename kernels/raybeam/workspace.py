@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,80 @@ Float = NDArray[np.float64]
 
 # Rays that are turned together: what that takes stays in a core's level 2 cache.
 _BLOCK = 1 << 14
-_FEW = 32  # rays of a pose
+_ORDERS = 8  # that are kept; 1 MiB each
+# Numbers in a buffer of NumPy's. Since 2.3 it copies what is broadcast to buffers if they hold
+# several rows, which makes a product of a row and a column take three times as long.
+_BUFFER = 16
+
+
+class Order:
+    """Blocks of a chunk's rays, and in which order rays lie in them.
+
+    Each block has rays of one pose, or all rays of some poses. Its rays lie as they are numbered,
+    pose by pose; but if it has more poses than a pose has rays, beam by beam: first ray 0 of all
+    poses, then ray 1. So NumPy's loops run along many poses, not along a few rays of each.
+
+    Parameters
+    ----------
+    skip
+        Rays of the first pose that are not in the chunk.
+    rays
+        Of the chunk.
+    each
+        Rays of a pose.
+    plain
+        Rays lie as they are numbered in all blocks.
+
+    Attributes
+    ----------
+    blocks
+        Of each the first ray, how many there are, the first pose, and how many.
+
+    Examples
+    --------
+    >>> Order(3, 15, 4).blocks
+    [(0, 1, 0, 1), (1, 12, 1, 3), (13, 2, 4, 1)]
+    >>> Order(0, 6, 2).slots.tolist()
+    [0, 3, 1, 4, 2, 5]
+    """
+
+    def __init__(self, skip: int, rays: int, each: int, *, plain: bool = False) -> None:
+        self._skip, self._rays, self._each, self._plain = skip, rays, each, plain
+        self.blocks = list(_blocks(skip, skip + rays, each))
+
+    def _by_beam(self, length: int, poses: int) -> bool:
+        return not self._plain and poses > length // poses
+
+    def view(self, slots: NDArray[Any], length: int, poses: int) -> NDArray[Any]:
+        """View slots (length, ...) of a block as (poses, rays of a pose, ...)."""
+        if self._by_beam(length, poses):
+            return slots[:length].reshape(-1, poses, *slots.shape[1:]).swapaxes(0, 1)
+        return slots[:length].reshape(poses, -1, *slots.shape[1:])
+
+    @cached_property
+    def slots(self) -> NDArray[np.intp] | None:
+        """Where each ray lies, (rays,); None if as they are numbered."""
+        if not any(self._by_beam(length, poses) for _, length, _, poses in self.blocks):
+            return None
+        table = np.arange(self._rays)
+        parts = [self.view(table[a:], n, k).reshape(-1) for a, n, _, k in self.blocks]
+        return np.concatenate(parts)
+
+    @cached_property
+    def poses(self) -> NDArray[np.intp]:
+        """Pose of what lies in each slot: (rays,)."""
+        pose = (np.arange(self._rays) + self._skip) // self._each
+        table = np.empty_like(pose)
+        table[slice(None) if self.slots is None else self.slots] = pose
+        return table
+
+    def of(self, ray: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Where some rays lie."""
+        return ray if self.slots is None else self.slots.take(ray)
+
+    def by_ray(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Put values (rays,) from their slots into the order of rays."""
+        return values if self.slots is None else values.take(self.slots)
 
 
 class Starts:
@@ -25,21 +99,19 @@ class Starts:
     Parameters
     ----------
     points
-        (m, 3): one for all rays, or one for so many rays each.
-    rays
-        Rays of each point.
-    skip
-        Rays of the first point that are not in the chunk.
+        (m, 3): one for all rays, one for each slot; or with `order` one for each pose.
+    order
+        Of the rays.
     """
 
-    def __init__(self, points: Float, rays: int = 1, skip: int = 0) -> None:
-        self.points, self.rays, self.skip = points, rays, skip
+    def __init__(self, points: Float, order: Order | None = None) -> None:
+        self.points, self.order = points, order
 
-    def of(self, ray: NDArray[np.intp]) -> Float:
-        """Look up where some rays start: (len(ray), 3), or (1, 3) when one is that of all."""
+    def of(self, slot: NDArray[np.intp]) -> Float:
+        """Look up where some rays start: (len(slot), 3), or (1, 3) when one is that of all."""
         if len(self.points) == 1:
             return self.points
-        row = ray if self.rays == 1 else (ray + self.skip) // self.rays
+        row = slot if self.order is None else self.order.poses.take(slot)
         # One axis at a time: `take` along an axis copies all points first where they are
         # transposed, which took as long as half of Embree's cast.
         out = np.empty((3, len(row)))
@@ -69,6 +141,7 @@ class Workspace:
         self._product = np.empty(min(size, _BLOCK))
         self._crosses = np.empty((3, min(size, _BLOCK)))  # of a lidar that moves within a pose
         self._origin: Float | None = None  # where all rows start, if at one point
+        self._orders: dict[tuple[int, ...], Order] = {}  # of the last few shapes of chunks
 
     def start(self, n: int, starts: Starts) -> NDArray[np.float32]:
         """Write where n rays start, and return their rows as an engine reads them.
@@ -81,11 +154,15 @@ class Workspace:
         """
         points = starts.points
         if len(points) > 1:
-            self._origin = None
-            for at, length, point, count in _blocks(starts.skip, starts.skip + n, starts.rays):
-                rows = self._rows[at : at + length].reshape(count, -1, 6)
+            self._origin, order = None, starts.order
+            if order is None:
                 for axis in range(3):
-                    rows[:, :, axis] = points[point : point + count, axis, None]
+                    self._rows[:n, axis] = points[:, axis]
+            else:
+                for at, length, pose, count in order.blocks:
+                    rows = order.view(self._rows[at:], length, count)
+                    for axis in range(3):
+                        rows[..., axis] = points[pose : pose + count, axis, None]
         elif self._origin is None or not np.array_equal(points, self._origin):
             self._origin = points.copy()
             self._rows[:, :3] = points
@@ -96,7 +173,9 @@ class Workspace:
         for axis in range(3):
             self._rows[: unit.shape[1], 3 + axis] = unit[axis]
 
-    def make(self, scan: Scan, start: int, stop: int, mesh: LocalMesh) -> tuple[Float, Starts]:
+    def make(
+        self, scan: Scan, start: int, stop: int, mesh: LocalMesh
+    ) -> tuple[Order, Float, Starts]:
         """Make the rays `start` to `stop` of a scan, and write their directions to the rows.
 
         They are turned in float64, with the operations of `Pattern.rays` and so to the same
@@ -109,101 +188,131 @@ class Workspace:
 
         Returns
         -------
+        order
+            In which they lie: in all that follows, a ray stands at its slot.
         unit
             (3, n) float64, valid until the next call: directions, one row an axis.
         starts
             Where they start; as `unit`, valid until the next call.
         """
-        n, poses = stop - start, scan.poses
-        pose, skip = divmod(start, poses.rays)
-        positions = poses.positions[pose : -(-stop // poses.rays)]
-        given = self._rays(scan, scan.pattern.directions.T, start, self._given[0, :, :n])
-        unit = self._turn(given, poses, start, self._turned[0, :, :n], written=True)
-        shifted, motion = scan.pattern.origins is not None, poses.motion
-        if not shifted and motion is None:
-            return unit, Starts(mesh.to_local(positions), poses.rays, skip)
+        before = np.setbufsize(_BUFFER)
+        try:
+            return self._make(scan, start, stop, mesh)
+        finally:
+            np.setbufsize(before)
+
+    def _make(
+        self, scan: Scan, start: int, stop: int, mesh: LocalMesh
+    ) -> tuple[Order, Float, Starts]:
+        n, poses, pattern = stop - start, scan.poses, scan.pattern
+        order = self._order(start, n, poses)
+        given = self._rays(scan, pattern.directions.T, start, self._given[0, :, :n])
+        unit = self._turn(given, poses, start, order, self._turned[0, :, :n], written=True)
+        first, motion = start // poses.rays, poses.motion
+        if pattern.origins is None and motion is None:
+            positions = poses.positions[first : -(-stop // poses.rays)]
+            return order, unit, Starts(mesh.to_local(positions), order)
+        # The scale is a power of two: scaled before or after, the bits are the same.
         moved = turned = self._turned[1, :, :n]
-        if scan.pattern.origins is not None:
-            given = self._rays(scan, scan.pattern.origins.T, start, self._given[1, :, :n])
-            turned = self._turn(given, poses, start, moved, written=False)
-        for at, length, number, count in _blocks(start, stop, poses.rays):
-            block = slice(at, at + length)
-            product = self._product[:length].reshape(count, -1)
+        if pattern.origins is not None:
+            room = self._given[1, :, :n]
+            given = self._rays(scan, pattern.origins.T, start, room)
+            given = np.multiply(given, mesh.scale, out=room[:, : given.shape[1]])
+            turned = self._turn(given, poses, start, order, moved, written=False)
+        for at, length, pose, count in order.blocks:
+            some = slice(first + pose, first + pose + count)
+            places, product = poses.positions[some] * mesh.scale, self._product
             for axis in range(3):
-                vectors, out = (a[axis, block].reshape(count, -1) for a in (turned, moved))
-                place = poses.positions[number : number + count, axis, None]
-                np.add(vectors if shifted else 0.0, place, out=out)
+                out = order.view(moved[axis, at:], length, count)
+                place = places[:, axis, None]
+                if pattern.origins is None:
+                    out[:] = place
+                else:
+                    np.add(order.view(turned[axis, at:], length, count), place, out=out)
                 if motion is not None:
-                    delay = _delays(motion, poses.rays, start + at, product.shape[1])
-                    speed = motion.velocities[number : number + count, axis, None]
-                    out += np.multiply(delay, speed, out=product)
-                out -= mesh.centre[axis]  # as `to_local`
-                out *= mesh.scale
-        return unit, Starts(moved.T)
+                    speed = motion.velocities[some, axis, None] * mesh.scale
+                    delays = _delays(motion, poses.rays, start + at, length // count)
+                    out += np.multiply(delays, speed, out=order.view(product, length, count))
+                out -= mesh.centre[axis] * mesh.scale
+        return order, unit, Starts(moved.T)
+
+    def _order(self, start: int, rays: int, poses: Poses) -> Order:
+        """Order of a chunk, made once for those of one shape."""
+        plain = poses.rotations is None and poses.motion is None  # nothing is worked out
+        key = (start % poses.rays, rays, poses.rays, plain)
+        if key not in self._orders:
+            if len(self._orders) >= _ORDERS:
+                self._orders.clear()
+            self._orders[key] = Order(*key[:3], plain=plain)
+        return self._orders[key]
 
     @staticmethod
     def _rays(scan: Scan, table: Float, start: int, room: Float) -> Float:
         """Rows of a pattern (3, n) that are cast; where each pose casts all of it, (3, rays).
 
-        Those of one pose stay in a core's cache, however many poses there are; but loops over few
-        rays at a time cost more than that gains.
+        Those of one pose stay in a core's cache, however many poses there are.
         """
-        alike = table.shape[1] == scan.poses.rays >= _FEW and not scan.first
-        if alike and scan.poses.rotations is not None and room.shape[1] > table.shape[1]:
+        alike = table.shape[1] == scan.poses.rays and not scan.first
+        turned = scan.poses.rotations is not None or scan.poses.motion is not None
+        if alike and turned and room.shape[1] > table.shape[1]:
             return table
         return _columns(table, scan.first + start, room)
 
-    def _turn(self, given: Float, poses: Poses, start: int, out: Float, *, written: bool) -> Float:
-        """Turn vectors (3, n) of the rays from `start` on; `written` to the rows as directions.
+    def _turn(
+        self, given: Float, poses: Poses, start: int, order: Order, out: Float, *, written: bool
+    ) -> Float:
+        """Turn vectors of the rays from `start` on, see `_rays`; `written` to the rows as well.
 
-        Returns them as (3, n): `out`, or `given` where there is nothing to turn.
+        Returns them by slot, (3, n): `out`, or `given` where there is nothing to turn.
         """
         n = out.shape[1]
         if poses.rotations is None and poses.motion is None:
             if written:
                 self.aim(given)
             return given
-        for at, length, pose, count in _blocks(start, start + n, poses.rays):
-            block = slice(at, at + length)
-            # All rays of a pose are beside each other: one row of the block a pose.
-            shape = (count, -1) if count > 1 else (-1,)
-            product = self._product[:length].reshape(shape)
+        first = start // poses.rays
+        for at, length, pose, count in order.blocks:
+            product = order.view(self._product, length, count)
             if given.shape[1] == n:
-                x, y, z = (row.reshape(shape) for row in given[:, block])
+                vectors = given[:, at : at + length].reshape(3, count, -1)
             else:  # those of one pose
                 skip = (start + at) % poses.rays
-                x, y, z = given[:, skip : skip + product.shape[-1]]
-            for axis in range(3):
-                total = out[axis, block].reshape(shape)
+                vectors = given[:, None, skip : skip + length // count]
+            x, y, z = vectors
+            turned = [order.view(row[at:], length, count) for row in out]
+            some = slice(first + pose, first + pose + count)
+            for axis, total in enumerate(turned):
                 if poses.rotations is None:
-                    total[:] = (x, y, z)[axis]
+                    total[:] = vectors[axis]
                     continue
-                a, b, c = _factors(poses.rotations[pose : pose + count, axis])
+                a, b, c = _factors(poses.rotations[some, axis])
                 np.multiply(x, a, out=total)
                 total += np.multiply(y, b, out=product)
                 total += np.multiply(z, c, out=product)
             if poses.motion is not None:
-                rates = poses.motion.rates[pose : pose + count]
-                delays = _delays(poses.motion, poses.rays, start + at, product.shape[-1])
-                self._drift(out[:, block].reshape(3, *shape), rates, delays)
+                delays = _delays(poses.motion, poses.rays, start + at, length // count)
+                crosses = [order.view(row, length, count) for row in self._crosses]
+                _drift(turned, poses.motion.rates[some], delays, crosses, product)
             if written:
+                rows = order.view(self._rows[at:], length, count)
                 for axis in range(3):
-                    self._rows[block, 3 + axis] = out[axis, block]
+                    rows[..., 3 + axis] = turned[axis]
         return out
 
-    def _drift(self, vectors: Float, rates: Float, delays: Float) -> None:
-        """Turn vectors of a block on, in place; with the operations of `Poses.drifted`."""
-        x, y, z = vectors
-        crosses, product = self._crosses[:, : x.size].reshape(3, *x.shape), self._product[: x.size]
-        product = product.reshape(x.shape)
-        a, b, c = _factors(rates)
-        for cross, (p, one, q, other) in zip(
-            crosses, ((b, z, c, y), (c, x, a, z), (a, y, b, x)), strict=True
-        ):
-            np.multiply(p, one, out=cross)
-            cross -= np.multiply(q, other, out=product)
-            cross *= delays
-        vectors += crosses
+
+def _drift(
+    vectors: list[Float], rates: Float, delays: Float, crosses: list[Float], product: Float
+) -> None:
+    """Turn vectors of a block on, in place; with the operations of `Poses.drifted`."""
+    x, y, z = vectors
+    a, b, c = _factors(rates)
+    pairs = ((b, z, c, y), (c, x, a, z), (a, y, b, x))
+    for cross, (p, one, q, other) in zip(crosses, pairs, strict=True):
+        np.multiply(p, one, out=cross)
+        cross -= np.multiply(q, other, out=product)
+        cross *= delays
+    for vector, cross in zip(vectors, crosses, strict=True):
+        vector += cross
 
 
 def _delays(motion: Motion, each: int, ray: int, count: int) -> Float:

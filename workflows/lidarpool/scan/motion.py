@@ -137,7 +137,7 @@ def into_axes(vectors: Float, rotations: Float | None) -> Float:
     if rotations is None:
         return vectors
     x, y, z = vectors.T
-    out = np.empty_like(vectors)
+    out = np.empty(vectors.shape[::-1]).T
     for axis in range(3):
         a, b, c = (rotations[:, row, axis] for row in range(3))
         out[:, axis] = (x * a + y * b) + z * c
@@ -146,7 +146,7 @@ def into_axes(vectors: Float, rotations: Float | None) -> Float:
 
 def _product(one: Float, other: Float) -> Float:
     """Products of matrices (k, 3, 3), or (1, 3, 3), in one order of rounding, however many."""
-    out = np.empty((max(len(one), len(other)), 3, 3))
+    out = np.empty((3, 3, max(len(one), len(other)))).transpose(2, 0, 1)
     for row in range(3):
         a, b, c = (one[:, row, k, None] for k in range(3))
         out[:, row] = (a * other[:, 0] + b * other[:, 1]) + c * other[:, 2]
@@ -158,7 +158,7 @@ def _turned_by(before: Float, after: Float) -> Float:
 
     Half the sum of the cross products of the axes before and after: the sine of the angle.
     """
-    out = np.empty((len(before), 3))
+    out = np.empty((3, len(before))).T
     for axis in range(3):
         one, other = (axis + 1) % 3, (axis + 2) % 3
         cross = before[:, one] * after[:, other] - before[:, other] * after[:, one]

@@ -102,7 +102,10 @@ class Trajectory(Protocol):
     def poses(
         self, station: int, times_ns: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
-        """Positions (k, 3) and rotations (k, 3, 3) at times (k,) of a station that moves."""
+        """Positions (k, 3) and rotations (k, 3, 3) at times (k,) of a station that moves.
+
+        They are fastest to work with where the poses of each number lie together in memory.
+        """
 
 
 @dataclass(frozen=True)
@@ -262,28 +265,29 @@ class Track:
                 f"for from {low:.9g} to {high:.9g} s, {gap:.6g} s outside."
             )
         segment = np.clip(np.searchsorted(times, at, "right") - 1, 0, len(times) - 2)
-        since = (at - times[segment])[:, None]
+        since = at - times.take(segment)
         way, turn, rates = self._segments
         # By Horner; a straight way has no more than two coefficients.
-        positions = way[-1].take(segment, axis=0)
+        positions = way[-1].take(segment, axis=1)
         for coefficient in way[-2::-1]:
-            positions = positions * since + coefficient.take(segment, axis=0)
-        angle = since * rates.take(segment)[:, None]
-        rotations = turn[0].take(segment, axis=0)
-        rotations += np.sin(angle) * turn[1].take(segment, axis=0)
-        rotations += np.cos(angle) * turn[2].take(segment, axis=0)
-        return positions, rotations.reshape(-1, 3, 3)
+            positions *= since
+            positions += coefficient.take(segment, axis=1)
+        angle = since * rates.take(segment)
+        rotations = turn[0].take(segment, axis=1)
+        for factor, table in ((np.sin(angle), turn[1]), (np.cos(angle), turn[2])):
+            rotations += factor * table.take(segment, axis=1)
+        return positions.T, rotations.reshape(3, 3, -1).transpose(2, 0, 1)
 
     @cached_property
     def _segments(self) -> tuple[list[NDArray[np.float64]], NDArray[np.float64], Any]:
-        """What poses between two that are given follow from, one row a segment.
+        """What poses between two that are given follow from, one column a segment.
 
         Returns
         -------
         way
-            Coefficients (s, 3) of the position's polynomial in seconds, the constant first.
+            Coefficients (3, s) of the position's polynomial in seconds, the constant first.
         turn
-            (3, s, 9): the rotation is ``turn[0] + sin(a) turn[1] + cos(a) turn[2]`` (Rodrigues,
+            (3, 9, s): the rotation is ``turn[0] + sin(a) turn[1] + cos(a) turn[2]`` (Rodrigues,
             1840), a the angle since the segment began.
         rates
             (s,) radians a second.
@@ -313,8 +317,9 @@ class Track:
         about = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
         start = matrices(turns[:-1])
         square = start @ about @ about
-        table = np.stack([start + square, start @ about, -square])
-        return way, table.reshape(3, -1, 9), rates[:, 0]
+        table = np.stack([start + square, start @ about, -square]).reshape(3, -1, 9)
+        columns = [np.ascontiguousarray(coefficient.T) for coefficient in way]
+        return columns, np.ascontiguousarray(table.transpose(0, 2, 1)), rates[:, 0]
 
 
 def matrices(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
