@@ -2,7 +2,7 @@
 
 from .devices import assign_devices, own_device
 from .errors import PipeClosed, PipeFailed, PoolError
-from .fetch import fetch_available, fetch_from, hold_for_driver, take_held
+from .fetch import fetch_available, hold_for_driver, take_held
 from .local import local_cluster
 from .mapping import Results
 from .partition import Partition
@@ -35,7 +35,6 @@ __all__ = [
     "ask_workers",
     "assign_devices",
     "fetch_available",
-    "fetch_from",
     "forget_pipes",
     "hold_for_driver",
     "local_cluster",

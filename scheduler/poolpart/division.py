@@ -21,7 +21,7 @@ from .page import close_page
 from .rules import Rule
 from .stats import forget_statistics, statistics_of
 from .steward import Seat, Steward, names_of, steward_of
-from .workers import WorkerInfo, on_scheduler
+from .workers import on_scheduler
 
 PATIENCE_S = 60.0  # for a worker to answer
 _RETURN_S = 10.0  # for workers to declare what they did before, at least
@@ -29,15 +29,9 @@ _LOOK_EVERY_S = 0.05  # at all tasks, for those that have not ended
 _UNFINISHED = ("waiting", "queued", "no-worker", "processing")
 
 
-def _ask(client: Client, function: Callable[..., Any], **arguments: Any) -> Any:
-    """Call `function(steward, **arguments)` on the scheduler.
-
-    Raises
-    ------
-    PoolError
-        If it raises one there.
-    """
-    result, complaint = on_scheduler(client, _answer, question=function, arguments=arguments)
+def ask(client: Client, question: Callable[..., Any], **arguments: Any) -> Any:
+    """Call `question(steward, **arguments)` on the scheduler; a PoolError of it is raised here."""
+    result, complaint = on_scheduler(client, _answer, question=question, arguments=arguments)
     if complaint:
         raise PoolError(complaint)
     return result
@@ -57,42 +51,20 @@ async def _answer(
 # -- making partitions -----------------------------------------------------------------
 
 
-def declare(
-    client: Client,
-    rules: Mapping[str, Rule],
-    chosen: Mapping[str, Sequence[WorkerInfo]],
-    pool: Sequence[WorkerInfo],
-    seen: Collection[str],
-) -> str:
-    """Make partitions, and have the scheduler follow their rules from now on; all or none.
-
-    `chosen` are workers to begin with, of those in `pool`; `seen` are the partitions that the
-    client saw when it chose. Returns what a user should know of all of them, "" for nothing.
-
-    Raises
-    ------
-    PoolError
-        If one of them left meanwhile, somebody else has put it into a partition or made a
-        partition of such a name, or other workers have it.
-    """
-    note: str = _ask(
-        client,
-        _declare,
-        rules=dict(rules),
-        chosen={name: [worker.address for worker in chosen[name]] for name in rules},
-        seen=sorted(seen),
-        gpus={worker.address: worker.gpus for worker in pool},
-    )
-    return note
-
-
-async def _declare(
+async def declare(
     steward: Steward,
     rules: Mapping[str, Rule],
     chosen: Mapping[str, Sequence[str]],
     seen: Collection[str],
     gpus: Mapping[str, Sequence[str]],
 ) -> str:
+    """Make partitions, and follow their rules from now on; all or none.
+
+    `chosen` are addresses of workers to begin with, `seen` the partitions that the client saw when
+    it chose, `gpus` what it knows of the workers. Returns what a user should know of all
+    partitions, "" for nothing; PoolError if a worker left meanwhile, somebody else has put it into
+    a partition or made a partition of such a name, or other workers have it.
+    """
     # Up to the first await nothing else happens on the scheduler.
     seats = {name: [_seat(steward, name, a) for a in chosen[name]] for name in rules}
     for name in rules:
@@ -178,31 +150,11 @@ def _declared_by(steward: Steward, seat: Seat) -> set[str]:
 # to other members, those that run end there; then it declares what it is to be.
 
 
-def grow(
-    client: Client, name: str, workers: int, source: str | None, timeout_s: float
-) -> list[str]:
-    """Move workers into a partition; see `Partition.grow`. Returns their names."""
-    _check(workers)
-    arguments = {"name": name, "count": workers, "source": source, "timeout_s": timeout_s}
-    names: list[str] = _ask(client, _grow, **arguments)
-    return names
-
-
-def shrink(client: Client, name: str, workers: int, timeout_s: float) -> list[str]:
-    """Move workers out of a partition; see `Partition.shrink`. Returns their names."""
-    _check(workers)
-    names: list[str] = _ask(client, _shrink, name=name, count=workers, timeout_s=timeout_s)
-    return names
-
-
-def _check(workers: int) -> None:
-    if not isinstance(workers, int) or workers < 1:
-        raise PoolError(f"The number of workers to move is {workers!r}; give 1 or more.")
-
-
-async def _grow(
+async def grow(
     steward: Steward, name: str, count: int, source: str | None, timeout_s: float
 ) -> list[str]:
+    """Move workers into a partition; see `Partition.grow`. Returns their names."""
+    _check(count)
     steward.adopt(name)
     if source == name:
         raise PoolError(f"Partition {name!r} cannot grow by its own workers.")
@@ -222,7 +174,9 @@ async def _grow(
     return await _move(steward, _by_load(steward, there)[:count], name, timeout_s)
 
 
-async def _shrink(steward: Steward, name: str, count: int, timeout_s: float) -> list[str]:
+async def shrink(steward: Steward, name: str, count: int, timeout_s: float) -> list[str]:
+    """Move workers out of a partition; see `Partition.shrink`. Returns their names."""
+    _check(count)
     steward.adopt(name)
     members, least = _arrived(steward, name), steward.rules[name].minimum
     if len(members) - count < least:
@@ -232,6 +186,11 @@ async def _shrink(steward: Steward, name: str, count: int, timeout_s: float) -> 
         )
     target = steward.remainder()
     return await _move(steward, members[:count], None if target == name else target, timeout_s)
+
+
+def _check(count: int) -> None:
+    if not isinstance(count, int) or count < 1:
+        raise PoolError(f"The number of workers to move is {count!r}; give 1 or more.")
 
 
 async def _move(
@@ -283,14 +242,8 @@ def _by_load(steward: Steward, seats: Sequence[Seat]) -> list[Seat]:
 # -- undoing it ------------------------------------------------------------------------
 
 
-def dissolve(client: Client, names: Collection[str] | None, timeout_s: float) -> list[str]:
+async def dissolve(steward: Steward, names: Collection[str] | None, timeout_s: float) -> list[str]:
     """Undo partitions, all of them if None; see `Pool.dissolve`. Returns their names."""
-    asked = None if names is None else list(names)
-    done: list[str] = _ask(client, _dissolve, names=asked, timeout_s=timeout_s)
-    return done
-
-
-async def _dissolve(steward: Steward, names: list[str] | None, timeout_s: float) -> list[str]:
     scheduler = steward.scheduler
 
     def those() -> list[str]:

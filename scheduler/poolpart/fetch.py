@@ -21,7 +21,7 @@ _held: dict[str, Any] = {}  # {name: bytes} of this process
 
 
 def fetch_available(
-    client: Client, keys: Collection[str], patience_s: float = 2.0
+    client: Client, keys: Collection[str], patience_s: float = 2.0, *, at: str | None = None
 ) -> dict[str, Any]:
     """Fetch those of the results that can be had now; ask again for the others.
 
@@ -42,6 +42,8 @@ def fetch_available(
     patience_s
         Longest time to wait for an answer of the scheduler, and then for a sign of life of each
         worker, in seconds. What a worker sends may take longer.
+    at
+        Address of a worker that has them: the scheduler is not asked where they are.
 
     Returns
     -------
@@ -50,6 +52,8 @@ def fetch_available(
     """
 
     async def fetch() -> dict[str, Any]:
+        if at is not None:
+            return await _take(client, at, list(keys), patience_s)
         try:
             found = await wait_for(who_has(client, keys), patience_s)
         except TimeoutError:
@@ -63,35 +67,6 @@ def fetch_available(
             *(_take(client, *worker, patience_s) for worker in by_worker.items())
         )
         return {key: result for data in taken for key, result in data.items()}
-
-    return client.sync(fetch)
-
-
-def fetch_from(
-    client: Client, address: str, keys: Collection[str], patience_s: float = 2.0
-) -> dict[str, Any]:
-    """Fetch results from a worker that has them, without asking the scheduler where they are.
-
-    Parameters
-    ----------
-    client
-        A client; on a worker, the worker's own.
-    address
-        Of the worker.
-    keys
-        Keys of tasks whose results are there.
-    patience_s
-        Longest time without a sign of life of that worker, in seconds. What it sends may take
-        longer.
-
-    Returns
-    -------
-    dict
-        Results by key, without those that are not there; none if the worker is gone.
-    """
-
-    async def fetch() -> dict[str, Any]:
-        return await _take(client, address, list(keys), patience_s)
 
     return client.sync(fetch)
 

@@ -87,19 +87,8 @@ class Rules:
     def after(self, owner: Any, name: str, rule: After, *parameters: str) -> None:
         """Have `rule(result, …)` called with a method's result and arguments; it returns a result.
 
-        Parameters
-        ----------
-        owner, name
-            The method's instance, and its name.
-        rule
-            The rule.
-        parameters
-            What the first parameters of the method are called.
-
-        Raises
-        ------
-        PoolError
-            If there is no such method in this version of Dask; then all rules are taken back.
+        `parameters` are what the first ones of the method are called. PoolError if there is no
+        such method in this version of Dask; then all rules are taken back.
         """
         self._check(owner, name, parameters, in_order=True)
         self._stand_in(owner, name).after.append(rule)
@@ -144,12 +133,7 @@ class Rules:
 def rule_for_graphs(rules: Rules, scheduler: Any, bequeath: Callable[[Any], Resources]) -> None:
     """Give tasks resources that their graph leaves open, by the task that submits the graph.
 
-    Parameters
-    ----------
-    rules, scheduler
-        Where the rule goes.
-    bequeath
-        From the state of the submitting task to the resources.
+    `bequeath` gives them, from the state of the submitting task.
     """
 
     def before(graph: dict[str, Any]) -> dict[str, Any]:
@@ -202,19 +186,8 @@ def rule_for_fences(
 ) -> None:
     """Keep tasks away from workers behind a fence.
 
-    Parameters
-    ----------
-    rules, scheduler
-        Where the rule goes.
-    closed
-        States of the workers behind fences; read each time.
-    stop
-        Whether a task is to stay out.
-
-    Raises
-    ------
-    PoolError
-        If this version of Dask decides by other means.
+    `closed` are the states of those workers, read each time; `stop` says whether a task is to stay
+    out. PoolError if this version of Dask decides by other means.
     """
     if not isinstance(getattr(scheduler, "idle_task_count", None), set):
         raise PoolError(
@@ -350,16 +323,8 @@ def held_by(scheduler: Any, worker: Any, names: Collection[str]) -> list[str]:
 def hand_off(scheduler: Any, worker: Any, names: Collection[str], asked: set[Any]) -> None:
     """Move a worker's tasks that have not started to other members of their partition.
 
-    A task that no other worker may take stays, and ends here.
-
-    Parameters
-    ----------
-    scheduler, worker
-        The scheduler, and its state of the worker.
-    names
-        The partitions that the worker leaves.
-    asked
-        Tasks that it was asked for already; added to.
+    A task that no other worker may take stays, and ends here. `names` are the partitions that the
+    worker leaves; `asked` are tasks that it was asked for already, and is added to.
     """
     stealing = scheduler.extensions.get("stealing")
     if stealing is None:
@@ -381,10 +346,7 @@ def hand_off(scheduler: Any, worker: Any, names: Collection[str], asked: set[Any
 async def call(scheduler: Any, address: str, function: Callable[..., Any], **arguments: Any) -> Any:
     """Call a function in the event loop of a worker, which it gets as `dask_worker`.
 
-    Raises
-    ------
-    OSError
-        If nobody answers there, or the function raises something.
+    OSError if nobody answers there, or the function raises something.
     """
     answer = await scheduler.rpc(address).run(function=dumps(function), kwargs=dumps(arguments))
     if answer["status"] != "OK":
@@ -404,11 +366,8 @@ def declare_on_worker(resources: Resources, dask_worker: Any = None) -> bool:
     that was cancelled may still be on its way, and a worker breaks down that gets a task for a
     resource whose name it does not know.
 
-    Returns
-    -------
-    done
-        False if tasks still hold a resource that is to go. Such a task may be one that was
-        cancelled but runs on, of which the scheduler knows nothing any more.
+    Returns False if tasks still hold a resource that is to go. Such a task may be one that was
+    cancelled but runs on, of which the scheduler knows nothing any more.
     """
     state = dask_worker.state
     total, available = state.total_resources, state.available_resources
@@ -445,13 +404,14 @@ def state_of(scheduler: Any, name: str) -> Any:
 
 
 async def set_state(scheduler: Any, name: str, value: Any) -> None:
-    """Make a variable, or change its value."""
+    """Change the value of a variable."""
     await scheduler.extensions["variables"].set(name=name, data=value)
 
 
-def make_queue(scheduler: Any, name: str) -> None:
-    """Make a queue without a limit."""
+async def make_queue(scheduler: Any, name: str, state: Any) -> None:
+    """Make a queue without a limit, and a variable of the same name."""
     scheduler.extensions["queues"].create(name=name)
+    await set_state(scheduler, name, state)
 
 
 async def take_all(scheduler: Any, name: str) -> list[Any]:

@@ -10,7 +10,7 @@ from typing import Any, Self
 import dask
 from distributed import Client, Future
 
-from . import division
+from .division import ask, dissolve, grow, shrink
 from .errors import PoolError
 from .inherit import keep_shuffles_in
 from .mapping import Results, Stage
@@ -317,7 +317,9 @@ class Partition:
         >>> gpu.grow(2, source="OTHER")                                # doctest: +SKIP
         ['5', '6']
         """
-        return division.grow(self.client, self.name, workers, source, timeout_s)
+        arguments = {"count": workers, "source": source, "timeout_s": timeout_s}
+        moved: list[str] = ask(self.client, grow, name=self.name, **arguments)
+        return moved
 
     def shrink(self, workers: int = 1, *, timeout_s: float = 60.0) -> list[str]:
         """Move workers out of this partition while everything runs; returns their names.
@@ -330,8 +332,10 @@ class Partition:
         PoolError
             If fewer than its minimum would be left, or their tasks do not end in time.
         """
-        return division.shrink(self.client, self.name, workers, timeout_s)
+        arguments = {"count": workers, "timeout_s": timeout_s}
+        moved: list[str] = ask(self.client, shrink, name=self.name, **arguments)
+        return moved
 
     def dissolve(self, timeout_s: float = 30.0) -> None:
         """Undo this partition; see `Pool.dissolve`."""
-        division.dissolve(self.client, [self.name], timeout_s)
+        ask(self.client, dissolve, names=[self.name], timeout_s=timeout_s)

@@ -353,8 +353,7 @@ async def _open(name: str, state: State, dask_scheduler: Any = None) -> bool:
     if taken or state["owner"] not in dask_scheduler.clients:
         return False
     # Without a limit: of two producers that see room for one the second would wait inside it.
-    make_queue(dask_scheduler, name)
-    await set_state(dask_scheduler, name, state)
+    await make_queue(dask_scheduler, name, state)
     if _OWNERS not in dask_scheduler.plugins:
         dask_scheduler.add_plugin(PipeOwners(), name=_OWNERS)
     return True

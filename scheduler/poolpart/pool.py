@@ -10,7 +10,7 @@ from typing import Any
 
 from distributed import Client
 
-from .division import declare, dissolve
+from .division import ask, declare, dissolve
 from .errors import PoolError
 from .page import leave_page, partitions_page
 from .partition import Partition
@@ -300,7 +300,8 @@ class Pool:
         PoolError
             If tasks of theirs have not ended; then everything stays.
         """
-        return dissolve(self.client, None, timeout_s)
+        names: list[str] = ask(self.client, dissolve, names=None, timeout_s=timeout_s)
+        return names
 
     def _divide(
         self, rules: Mapping[str, Rule], now: Mapping[str, Rule]
@@ -316,8 +317,14 @@ class Pool:
         chosen, notes = divide(now, mine)
         for name, note in notes.items():
             logger.warning("Partition %r: %s", name, note)
-        seen = {name for worker in cluster for name in worker.partitions}
-        common = declare(self.client, rules, chosen, mine, seen)
+        common = ask(
+            self.client,
+            declare,
+            rules=dict(rules),
+            chosen={name: [worker.address for worker in chosen[name]] for name in rules},
+            seen={name for worker in cluster for name in worker.partitions},
+            gpus={worker.address: worker.gpus for worker in mine},
+        )
         told = {name: "; ".join(filter(None, (notes.get(name), common))) for name in rules}
         parts = {name: Partition(name, self.client, told[name]) for name in rules}
         taken = {worker.address for group in chosen.values() for worker in group}

@@ -16,7 +16,6 @@ from poolpart import (
     Partition,
     fetch,
     fetch_available,
-    fetch_from,
     hold_for_driver,
     take_held,
     worker_identities,
@@ -112,9 +111,9 @@ def test_results_come_from_the_worker_that_has_them(client):
     there, elsewhere = (part.submit(twice, n, worker=a) for n, a in ((3, one), (4, two)))
     wait([there, elsewhere], timeout=LONG_S)
     keys = [there.key, elsewhere.key, "never-submitted"]
-    assert fetch_from(client, one, keys, LONG_S) == {there.key: 6}
-    assert fetch_from(client, two, keys, LONG_S) == {elsewhere.key: 8}
-    assert fetch_from(client, one, [], LONG_S) == {}
+    assert fetch_available(client, keys, LONG_S, at=one) == {there.key: 6}
+    assert fetch_available(client, keys, LONG_S, at=two) == {elsewhere.key: 8}
+    assert fetch_available(client, [], LONG_S, at=one) == {}
 
 
 # -- bytes that a long task leaves with its worker -------------------------------------
@@ -162,11 +161,11 @@ def test_what_a_dead_worker_had_is_given_up_soon(nannies):
     address, pid = nannies.submit(hold, "part").result(LONG_S)
     result = nannies.submit(os.getpid, workers=[address])
     wait([result], timeout=LONG_S)
-    assert fetch_from(nannies, address, [result.key], LONG_S) == {result.key: pid}
+    assert fetch_available(nannies, [result.key], LONG_S, at=address) == {result.key: pid}
     os.kill(pid, signal.SIGKILL)
     while address in worker_identities(nannies):
         time.sleep(0.01)
     start = time.monotonic()
     assert take_held(nannies, address, "part", patience_s=0.5) is None
-    assert fetch_from(nannies, address, [result.key], patience_s=0.5) == {}
+    assert fetch_available(nannies, [result.key], 0.5, at=address) == {}
     assert time.monotonic() - start < 20

@@ -29,11 +29,11 @@ def two(start):
 def both(monkeypatch):
     """Call two functions so that both have looked at the cluster before either changes it."""
     looked = threading.Barrier(2, timeout=LONG_S)
-    declare = pool.declare
+    ask = pool.ask
 
-    def wait_and_declare(*args):
+    def wait_and_ask(*args, **kwargs):
         looked.wait()
-        declare(*args)
+        return ask(*args, **kwargs)
 
     def call(*functions):
         def outcome(function):
@@ -42,10 +42,10 @@ def both(monkeypatch):
             except PoolError as error:
                 return error
 
-        monkeypatch.setattr(pool, "declare", wait_and_declare)
+        monkeypatch.setattr(pool, "ask", wait_and_ask)
         with ThreadPoolExecutor(2) as threads:
             outcomes = list(threads.map(outcome, functions))
-        monkeypatch.setattr(pool, "declare", declare)
+        monkeypatch.setattr(pool, "ask", ask)
         return outcomes
 
     return call

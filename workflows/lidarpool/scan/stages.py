@@ -18,7 +18,7 @@ from poolpart import (
     PipeFailed,
     Recorder,
     TaskRecord,
-    fetch_from,
+    fetch_available,
     hold_for_driver,
     own_client,
     telling_departure,
@@ -163,7 +163,7 @@ def _collected(
     """Make a part of one batch; returns what to tell the driver."""
     first, stop, offer = item["first"], item["stop"], item["offer"]
     scans = list(range(first, stop))
-    found = fetch_from(own_client(), item["at"], [item["key"]], FETCH_PATIENCE_S)
+    found = fetch_available(own_client(), [item["key"]], FETCH_PATIENCE_S, at=item["at"])
     batch: CastBatch | None = found.get(item["key"])
     if batch is None:
         return {"lost": offer}
