@@ -3,7 +3,6 @@ from __future__ import annotations
 import json
 import logging
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -129,100 +128,68 @@ def left_over() -> Callable[[Client], tuple[list[str], list[str], list[str]]]:
     return left_over
 
 
-_CLIENT_HUNG_UP = (
-    r".* - distributed\.batched - INFO - Batched Comm Closed <TCP \(closed\) Scheduler->Client "
-)
-
-
 class OutsideCluster:
-    """A scheduler and workers from the `dask` command line, each a process of its own."""
+    """A scheduler and workers from the `dask` command line, in processes of their own."""
 
-    def __init__(self, folder: Path, *options: str, **environment: str) -> None:
-        self.folder, self.options = folder, options  # of scheduler and workers
+    def __init__(self, folder: Path, **environment: str) -> None:
+        self.folder = folder
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
-        self.others = 0  # workers beyond one a process
+        self.workers: dict[str, int] = {}  # {process: how many are in it}
         file = folder / "scheduler.json"
         self._start(
-            "scheduler", "scheduler", "--port", "0", "--no-dashboard",
+            "scheduler", "--port", "0", "--no-dashboard",
             "--scheduler-file", str(file), "--host", "127.0.0.1", **environment,
         )  # fmt: skip
         _wait(lambda: file.exists() and file.read_text().endswith("}"))  # it is written in pieces
         self.address = json.loads(file.read_text())["address"]
 
-    def _start(self, name: str, *arguments: str, **environment: str) -> None:
-        log = (self.folder / f"{name}.log").open("wb")
-        self.processes[name] = subprocess.Popen(
-            [Path(sys.executable).with_name("dask"), *arguments, *self.options],
-            stdout=log,
-            stderr=log,
+    def _start(self, command: str, *arguments: str, name: str = "", **environment: str) -> None:
+        self.processes[name or command] = subprocess.Popen(
+            [Path(sys.executable).with_name("dask"), command, *arguments],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
             env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), **environment},
         )
 
-    def add(
-        self, partition: str, count: int = 1, slots: int = 1, preload: str = "", **environment: str
-    ) -> None:
-        """Start workers of a partition; `preload` is Python that each runs first."""
-        for _ in range(count):
-            name = f"{partition}-{len(self.processes)}"
-            options = ["--nthreads", str(slots), "--resources", f"{partition}={slots}"]
-            if preload:
-                file = self.folder / f"{name}.py"
-                file.write_text(preload)
-                options += ["--preload", str(file)]
-            self._start(
-                name, "worker", self.address, "--name", name, "--no-dashboard", "--no-nanny",
-                "--host", "127.0.0.1", "--local-directory", str(self.folder), *options,
-                **environment,
-            )  # fmt: skip
+    def add(self, *workers: tuple[str, int], preload: str = "", **environment: str) -> str:
+        """Start workers, (partition, slots) each, in one process.
 
-    def add_threads(self, *workers: tuple[str, int], **environment: str) -> str:
-        """Start workers, (partition, slots) each, all in one process; its name."""
-        name = f"workers-{len(self.processes)}"
-        common = {"host": "127.0.0.1", "dashboard": False, "local_directory": str(self.folder)}
+        Returns the name of the first, which is that of the process too. `preload` is Python that
+        comes before its workers.
+        """
         spec = {}
-        for number, (partition, slots) in enumerate(workers):
-            own = {"name": f"{partition}-{name}-{number}", "resources": {partition: slots}}
-            options = {"nthreads": slots, **own, **common}
-            spec[own["name"]] = {"cls": "distributed.Worker", "opts": options}
-        self._start(name, "spec", self.address, "--spec", json.dumps(spec), **environment)
-        self.others += len(workers) - 1
-        return name
+        for partition, slots in workers:
+            name = f"{partition}-{len(spec) + sum(self.workers.values())}"
+            options = {"name": name, "nthreads": slots, "resources": {partition: slots}}
+            options |= {"host": "127.0.0.1", "dashboard": False}
+            spec[name] = {
+                "cls": "distributed.Worker",
+                "opts": {**options, "local_directory": str(self.folder)},
+            }
+        first = next(iter(spec))
+        if preload:
+            file = self.folder / f"{first}.py"
+            file.write_text(preload)
+            spec[first]["opts"]["preload"] = [str(file)]
+        self._start("spec", self.address, "--spec", json.dumps(spec), name=first, **environment)
+        self.workers[first] = len(spec)
+        return first
 
     def wait(self) -> None:
         """Wait until all workers are there."""
         with Client(self.address, set_as_default=False) as client:
-            client.wait_for_workers(len(self.processes) - 1 + self.others, timeout=300)
+            client.wait_for_workers(sum(self.workers.values()), timeout=300)
 
     def kill(self, name: str) -> None:
         """Kill a process, without goodbye."""
         self.processes[name].kill()
         self.processes.pop(name).wait(300)
-
-    def log(self) -> str:
-        """What all processes have logged."""
-        return "\n".join(file.read_text() for file in sorted(self.folder.glob("*.log")))
-
-    def complaints(self) -> list[str]:
-        """What processes have logged with a traceback, a line each.
-
-        But for one that no program can avoid: a client that leaves waits a tenth of a second for
-        the scheduler's farewell and hangs up. On a busy machine the scheduler finds that out by
-        what it has yet to tell the client (that tasks were cancelled, say, or just that farewell),
-        and notes it as an information, with a traceback.
-        """
-        records = re.split(r"^(?=\d{4}-\d\d-\d\d )", self.log(), flags=re.MULTILINE)
-        return [
-            record.splitlines()[0]
-            for record in records
-            if record.count("Traceback") > bool(re.match(_CLIENT_HUNG_UP, record))
-        ]
+        self.workers.pop(name, None)
 
     def close(self) -> None:
         """End all processes."""
-        for process in self.processes.values():
-            process.kill()
-        for process in self.processes.values():
-            process.wait(300)
+        for name in list(self.processes):
+            self.kill(name)
 
 
 @pytest.fixture(scope="module")
@@ -232,9 +199,8 @@ def outside(
     """Start clusters from the `dask` command line that end with the module."""
     clusters: list[OutsideCluster] = []
 
-    def start(*options: str, **environment: str) -> OutsideCluster:
-        folder = tmp_path_factory.mktemp("cluster")
-        clusters.append(OutsideCluster(folder, *options, **environment))
+    def start(**environment: str) -> OutsideCluster:
+        clusters.append(OutsideCluster(tmp_path_factory.mktemp("cluster"), **environment))
         return clusters[-1]
 
     yield start

@@ -246,10 +246,10 @@ def test_workers_whose_lidarpool_is_not_ours(outside, place, refused):
         (WITHOUT_LIDARPOOL, "does not have lidarpool: install lidarpool"),
         (ANOTHER_VERSION, "has lidarpool 99.0, here it is"),
     ):
-        cluster.add("GPU", preload=preload)
+        worker = cluster.add(("GPU", 1), preload=preload)
         cluster.wait()
         refused(["run", "good.yaml", "--scheduler", cluster.address], says)
-        cluster.kill(list(cluster.processes)[-1])
+        cluster.kill(worker)
 
 
 def test_the_installed_command_says_the_same(place):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import re
-from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -16,13 +15,6 @@ DOCUMENTS = [ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md"))]
 def test_the_readme_shows_the_example_as_it_is():
     example = (ROOT / "examples/survey.py").read_text(encoding="utf-8").split('"""', 2)[2].strip()
     assert example in (ROOT / "README.md").read_text(encoding="utf-8")
-
-
-def test_scripts_of_the_readme_exist_as_make_targets_and_commands():
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    targets = re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.M)
-    used = set(re.findall(r"\bmake ([a-z]+)", text))
-    assert {"demo", "test"} <= used <= set(targets)
 
 
 @pytest.mark.parametrize("path", [*sorted(ROOT.glob("*.md")), *DOCUMENTS[1:]])
@@ -61,19 +53,3 @@ def test_files_that_the_architecture_names_exist():
     assert [
         name for name in sorted(named) if not any(f"/{f}".endswith(f"/{name}") for f in tree)
     ] == []
-
-
-def test_a_site_that_asks_the_network_is_refused(tmp_path, monkeypatch):
-    mkdocs = pytest.importorskip("mkdocs.exceptions", reason="needs the extra docs")
-    monkeypatch.syspath_prepend(ROOT / "docs/hooks")
-    pages = import_module("pages")
-    page, config = tmp_path / "index.html", {"site_dir": str(tmp_path)}
-    page.write_text(
-        '<a href="https://example.org">there</a> <img src="images/live.png">'
-        '<link rel="canonical" href="https://example.org/"> <script src="assets/a.js"></script>'
-    )
-    pages.on_post_build(config)  # links are only followed when they are clicked
-    for fetched in ('<script src="https://cdn.example/a.js">', "<link href=//fonts.example/a.css>"):
-        page.write_text(fetched)
-        with pytest.raises(mkdocs.PluginError, match=r"index\.html: .*example"):
-            pages.on_post_build(config)

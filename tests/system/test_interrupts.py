@@ -169,9 +169,9 @@ def check_interrupted(run: Any, code: int) -> None:
 
 
 def said_besides_progress(run: Any) -> list[str]:
-    """What it said but for lines with a time stamp."""
+    """What it said but for lines with a time stamp, and where there is a page."""
     lines = [line for line in run.said.splitlines() if line.strip()]
-    return [line for line in lines if not re.match(r"\d\d:\d\d:\d\d  ", line)]
+    return [line for line in lines if not re.match(r"\d\d:\d\d:\d\d  |note: partitions", line)]
 
 
 # Under nohup the tests ignore hangups, and what they start inherits that.
@@ -351,7 +351,7 @@ def test_ctrl_c_while_the_result_is_written(start, untouched, cluster):
 
 def test_the_scheduler_of_an_outside_cluster_is_killed(start, untouched, outside):
     cluster = outside()
-    cluster.add_threads(("GPU", 1), ("LIDAR", 4), ("OTHER", 1))
+    cluster.add(("GPU", 1), ("LIDAR", 4), ("OTHER", 1))
     cluster.wait()
     run = start(LONG, "--scheduler", cluster.address).wait_for(SURVEYING)
     cluster.kill("scheduler")

@@ -111,10 +111,9 @@ Storage.write = write_and_die
 def test_a_collector_dies_while_it_uploads(run, check, outside, environment):
     """The stages begin on the worker with more slots, which dies, and go on on the other."""
     cluster = outside()
-    cluster.add_threads(("GPU", 1), ("LIDAR", 4), **environment)
-    cluster.add("LIDAR", slots=8, preload=DIES, **environment)
+    cluster.add(("GPU", 1), ("LIDAR", 4), **environment)
+    doomed = cluster.add(("LIDAR", 8), preload=DIES, **environment)
     cluster.wait()
-    doomed = list(cluster.processes)[-1]
     done = run("died", scheduler=cluster.address)
     assert (done.code, done.err) == (0, "")
     assert cluster.processes.pop(doomed).wait(300) == -9

@@ -155,11 +155,6 @@ def test_a_client_that_has_given_its_scheduler_up_is_told_of_in_one_sentence(cli
         simulate(room(), survey, client=lost, on_frame=lambda _: lost.close())
 
 
-def test_too_few_slots_are_told_before_anything_runs(client):
-    with pytest.raises(LidarpoolError, match="Partition 'LIDAR' has 4 of the 7 slots"):
-        simulate(room(), Survey(SENSOR, [(0, 0, 0)], 5), client=client, collectors=5, wait_s=0)
-
-
 def raise_at(scan: int | None, scan_of=None):
     """A stand-in that fails, at one scan if it can tell which it is about."""
 

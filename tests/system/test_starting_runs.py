@@ -96,7 +96,7 @@ def test_what_a_starting_run_waits_for_and_what_not(outside, lose_gpu):
     """Workers that come late, and not a scheduler that is gone."""
     soon = "2s"  # for others to notice what is lost
     cluster = outside(DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT=soon)
-    cluster.add_threads(("LIDAR", 4))
+    cluster.add(("LIDAR", 4))
     cluster.wait()
     with (
         dask.config.set({"distributed.comm.timeouts.connect": soon}),
@@ -106,7 +106,7 @@ def test_what_a_starting_run_waits_for_and_what_not(outside, lose_gpu):
         def run(**options: float) -> int:
             return simulate(Scene.seed(), SURVEY, client=client, backend="numpy", **options).hits
 
-        comes = threading.Timer(0.5, cluster.add, ["GPU"])
+        comes = threading.Timer(0.5, cluster.add, [("GPU", 1)])
         comes.start()
         assert run(wait_s=300) > 0
         comes.join()
