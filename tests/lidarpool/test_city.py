@@ -51,18 +51,6 @@ def test_same_seed_same_city():
     assert third.vertices.tobytes() != one.vertices.tobytes()
 
 
-def test_names_and_numbers():
-    scene = city(100_000)
-    classes = Counter(name.partition("-")[0] for name in scene.names)
-    assert set(classes) == {"ground", "pavement", "building", "tree", "car", "lamp"}
-    assert classes["ground"] == classes["pavement"] == 1
-    assert len(set(scene.names)) == len(scene.names)
-    for name, count in classes.items():
-        if count > 1:
-            assert {f"{name}-{k + 1}" for k in range(count)} <= set(scene.names)
-    assert np.bincount(scene.face_object, minlength=len(scene.names)).min() > 0
-
-
 def test_everything_stands_on_the_ground():
     scene = city(100_000)
     bounds = scene.object_bounds

@@ -24,7 +24,7 @@ DAE = """<?xml version="1.0"?>{doctype}
  <library_visual_scenes><visual_scene id="s">
   <node id="n" name="Wall">{here}</node>
  </visual_scene></library_visual_scenes>
- <scene><instance_visual_scene url="#s"/></scene>
+ {scene}
 </COLLADA>
 """
 V = '<input semantic="VERTEX" source="#v" offset="0"/>'
@@ -40,6 +40,7 @@ PARTS = {
     "primitive": f'<polylist count="1">{V}<vcount>4</vcount><p>0 1 2 3</p></polylist>',
     "nodes": "",
     "here": HERE,
+    "scene": '<scene><instance_visual_scene url="#s"/></scene>',
 }
 
 
@@ -91,6 +92,7 @@ MATERIAL = (
             "here": HERE.replace("/>", f">{EFFECT.format('#m')}</instance_geometry>"),
             "libraries": MATERIAL,
         },
+        {"scene": ""},
         {"libraries": '<library_images><image id="i"/></library_images>'},
         {
             "libraries": '<library_images><image id="i"><init_from>../gone.png</init_from></image>'

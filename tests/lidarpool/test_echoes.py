@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -29,7 +30,7 @@ from lidarpool.scan.rig import Rig, RigPlan
 from lidarpool.scene.mesh import Mesh
 from lidarpool.scene.shapes import seed_objects
 from lidarpool.sensor.materials import extinction, fresnel
-from lidarpool.sensor.optics import SUBRAYS, hexagon, spread
+from lidarpool.sensor.optics import spread
 from raybeam import available_backends
 
 COLUMNS = ("ray", "range", "intensity", "reflectivity", "return_number", "returns", "class")
@@ -46,16 +47,10 @@ def beam_along_x(rays=1, max_range_m=float("inf"), **optics):
     return Sensor(Beams(np.zeros(rays)), Spin(1, 360), 0, max_range_m, optics=Optics(**optics))
 
 
-def cast(meshes, sensor=None, backend="numpy", **options):
+def cast(meshes, sensor=None, backend="numpy", at=(0, 0, 0), **options):
     """Points of one scan of some meshes, by column."""
-    survey = Survey(
-        sensor or beam_along_x(),
-        poses=[(0, 0, 0)],
-        steps=1,
-        keep_every=options.pop("keep_every", 1),
-        columns=COLUMNS,
-        **options,
-    )
+    options = {"keep_every": 1, "columns": COLUMNS, **options}
+    survey = Survey(sensor or beam_along_x(), poses=[at], steps=1, **options)
     rig = Rig(RigPlan(Scene.from_meshes(meshes), survey, backend))
     (batch,) = rig.cast(0, 1)
     return {c.name: c.make(batch) for c in survey.stored_columns} | {"batch": batch}
@@ -132,17 +127,6 @@ def test_the_last_material_that_names_an_object_counts():
 # -- beams ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("count", SUBRAYS)
-def test_a_hexagon_fills_its_cone_evenly(count):
-    places = hexagon(count, 0.01)
-    assert places.shape == (count, 2)
-    assert np.abs(places.mean(axis=0)).max() < 1e-12
-    assert np.hypot(*places.T).max(initial=0) < 0.005
-    if count > 1:
-        apart = np.linalg.norm(places[:, None] - places[None], axis=2) + np.eye(count)
-        assert np.allclose(apart.min(axis=1), apart.min()), "all have a neighbour as near"
-
-
 def test_directions_are_spread_by_their_angles_wherever_they_point():
     rng = np.random.default_rng(0)
     axes = np.concatenate([rng.normal(size=(50, 3)), np.eye(3), -np.eye(3)])
@@ -175,12 +159,9 @@ def test_what_is_nearer_than_half_a_pulse_is_one_return(apart_m, returns):
     beam = Returns("all", subrays=37, divergence_mrad=1, pulse_ns=5)
     found = cast(meshes, returns=beam)
     assert len(found["range"]) == returns
-    if returns == 1:
-        energies = {5.0: 18 / 5**2, 5.74: 19 / 5.74**2}
-        mean = sum(r * e for r, e in energies.items()) / sum(energies.values())
-        other = {5.0: 19 / 5**2, 5.74: 18 / 5.74**2}
-        mean_of_other = sum(r * e for r, e in other.items()) / sum(other.values())
-        assert min(abs(found["range"] - mean), abs(found["range"] - mean_of_other)) < 1e-4
+    if returns == 1:  # weighted by energy; which of the two the ray in the middle meets is rounding
+        near, far = np.array([[18, 19], [19, 18]]) / [[5**2], [5.74**2]]
+        assert np.isclose(found["range"], (5 * near + 5.74 * far) / (near + far), atol=1e-4).any()
 
 
 MODES = {
@@ -266,18 +247,10 @@ def test_a_pane_has_two_surfaces_from_whatever_side(backend, away_m, angle_deg):
         wall("Behind", away_m + 60),
     ]
     materials = [Material("Behind", 0.5), Material("Pane", transparent="pass")]
-    survey = Survey(
-        beam_along_x(),
-        poses=[(away_m, 0.01, 0.02)],
-        steps=1,
-        keep_every=1,
-        columns=COLUMNS,
-        materials=materials,
-    )
-    (batch,) = Rig(RigPlan(Scene.from_meshes(meshes), survey, backend)).cast(0, 1)
+    found = cast(meshes, at=(away_m, 0.01, 0.02), backend=backend, materials=materials)
     through = (1 - fresnel(np.array([math.cos(angle)]))) ** 4  # two surfaces, there and back
-    assert batch.range == pytest.approx([60], abs=1e-3)
-    assert batch.reflectivity == pytest.approx(0.5 * through, rel=1e-4)
+    assert found["range"] == pytest.approx([60], abs=1e-3)
+    assert found["reflectivity"] == pytest.approx(0.5 * through, rel=1e-4)
 
 
 def test_glass_reflects_by_fresnel():
@@ -302,12 +275,8 @@ def test_a_mirror_shows_what_is_reflected_at_the_unfolded_range(subrays, backend
     assert found["range"] == pytest.approx([7], abs=1e-4)
     assert found["reflectivity"] == pytest.approx([0.5], rel=1e-4)
     assert np.allclose(found["batch"].positions, [[7, 0, 0]], atol=1e-4), "behind the mirror"
-
-
-def test_light_between_two_mirrors_is_given_up():
-    meshes = [wall("A", 4), wall("B", -4)]
-    found = cast(meshes, materials=[Material("*", transparent="mirror")])
-    assert not len(found["range"])
+    everywhere = [Material("*", transparent="mirror")]
+    assert not len(cast([wall("A", 4), wall("B", -4)], materials=everywhere)["range"]), "given up"
 
 
 # -- noise ---------------------------------------------------------------------------------------
@@ -327,6 +296,8 @@ def test_ranges_have_the_noise_that_was_asked_for(distance, beam):
     assert off.std() == pytest.approx(sigma, rel=0.02)
     assert found["batch"].positions[:, 0] == pytest.approx(distance + off, abs=1e-4)
     assert np.ptp(found["intensity"]) < 1e-6, "what came back knows nothing of it"
+    other = cast([wall("W", distance)], beam_along_x(MANY), noise=replace(noise, seed=1))
+    assert abs(np.corrcoef(found["range"], other["range"])[0, 1]) < 0.03
 
 
 def test_light_goes_where_a_beam_points_and_its_angle_is_reported_without_noise():
@@ -339,15 +310,6 @@ def test_light_goes_where_a_beam_points_and_its_angle_is_reported_without_noise(
     assert off.std() == pytest.approx(math.radians(0.1), rel=0.03)
     across = found["batch"].positions[:, 1:]
     assert np.abs(across).max() < 1e-2, "reported along the nominal ray"
-
-
-def test_noise_depends_on_its_seed():
-    ranges = [
-        cast([wall("W", 9)], beam_along_x(9), noise=Noise(range_m=0.1, seed=seed))["range"]
-        for seed in (1, 1, 2)
-    ]
-    assert np.array_equal(ranges[0], ranges[1])
-    assert not np.array_equal(ranges[0], ranges[2])
 
 
 @pytest.mark.parametrize("distance", [80, 95, 100, 105, 130])

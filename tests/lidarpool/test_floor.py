@@ -36,10 +36,6 @@ def test_within_a_hall_that_is_one_box():
     assert floor_under(boxes(((8, 6, 3), 1.5)), 0, 0) == 0
 
 
-def test_beside_everything():
-    assert floor_under(boxes(((8, 6, 3), 1.5)), 50, 0) == 0
-
-
 def test_in_world_coordinates():
     shift = np.array([500_000.0, 4_000_000.0, 20_000.0])
     ground = np.array([[-9, -9, 0], [9, -9, 0], [9, 9, 3.6], [-9, 9, 3.6]])

@@ -11,18 +11,16 @@ import trimesh
 from benchmarks.live import looking
 from distributed import Client
 from tests.clusters import thread_cluster
+from tests.lidarpool.committing import commit
 
 from lidarpool import Column, LidarpoolError, Planning, Scene, Sensor, Survey
-from lidarpool.columns.parts import PartColumns, pack
 from lidarpool.live.live_points import LivePoints
 from lidarpool.live.result_page import open_result
 from lidarpool.live.run_page import LiveRun, live_run
 from lidarpool.run.job import Job
 from lidarpool.run.progress import Progress
-from lidarpool.run.run import Run, make_result
+from lidarpool.run.run import Run
 from lidarpool.run.store import RunStore
-from lidarpool.scan import Receipt
-from lidarpool.scan.messages import samples_of_scan, summary_type
 from lidarpool.scene.mesh import Mesh
 
 LONG_S = 120.0
@@ -35,28 +33,6 @@ def make_job(scans: int) -> Job:
     """Make a survey from two poses, 1 m and 5 m up, in cells of half a metre."""
     poses = [(0, 0, 1), (0, 0, 5)]
     return Job(SCENE, Survey(Sensor.grid(), poses, steps=scans // 2, precision_m=0.5))
-
-
-def commit(store: RunStore, first: int, count: int, triangle=7) -> None:
-    """Commit a part of one scan, as a run does: so many points 3 m up, and hits on a triangle."""
-    cells = {axis: np.full(count, 6 if axis == "z" else 0, np.int32) for axis in "xyz"}
-    columns = {
-        **cells,
-        "channel": np.full(count, 3, np.uint16),
-        "object": np.zeros(count, np.int32),
-    }
-    part = PartColumns(
-        first, np.array([count]), columns, np.int32([triangle]), np.int64([5 * count])
-    )
-    name, data = f"p{first}.npz", bytes(pack(part))
-    store.storage.prepare()
-    store.storage.write(name, data)
-    summaries = np.zeros(1, summary_type(samples_of_scan(store.job.survey.scan_count))).tobytes()
-    box = tuple(part.cells.ravel().tolist()) if count else ()
-    receipt = Receipt(-1, first, first + 1, name, count, len(data), 5 * count, box, summaries)
-    new = store.db.commit([receipt])
-    if store.on_parts:
-        store.on_parts(new)
 
 
 def panel(live: LiveRun) -> str:
@@ -81,7 +57,7 @@ def test_points_are_bounded_and_even_and_hits_exact_where_all_parts_are_read():
     store = RunStore(make_job(100))
     live = LivePoints(store, most=500)
     for scan in range(100):
-        commit(store, scan, 33, triangle=scan % 10)
+        commit(store, scan, [33], [scan % 10], [165])
         live.add([store.db.part_of(scan)])
         live.gather()
     assert live.version == 100
@@ -95,42 +71,19 @@ def test_a_part_that_cannot_be_read_is_told_of_and_the_others_are_shown():
     store = RunStore(make_job(4))
     live = LivePoints(store)
     for scan in range(3):
-        commit(store, scan, 5)
-    store.storage.remove(["p1.npz"])
+        commit(store, scan, [5], [7], [25])
+    store.storage.remove(["1-0.npz"])
     live.add(store.db.ordered)
     live.gather()
     assert len(live.cloud) == 10
-    assert "p1.npz cannot be read" in live.error
-
-
-def test_what_comes_while_somebody_looks_is_drawn_and_the_last_picture_is_whole():
-    store = RunStore(make_job(200))
-    with live_run(store.job, port=0, browser=False) as live:
-        live.follow(store)
-        commit(store, 0, 10)
-        time.sleep(0.1)
-        assert displayed(live) == 0  # for whom?
-        with looking(live.page.url):
-            wait_for(lambda: displayed(live) == 10)
-            for scan in range(1, 200):
-                commit(store, scan, 10)
-            live.on_progress(store.progress())
-            wait_for(lambda: "2,000 points" in panel(live) and "running" in panel(live))
-            store.db.frames = 200
-            live.on_progress(store.progress())
-            live.finish(make_result(store))
-            store.remove()
-            wait_for(lambda: "done" in panel(live))
-            wait_for(lambda: displayed(live) == len(live._points.cloud) > 500)
-        menu = live._view._colour.options
-        assert menu == ("z", "scan", "channel", "object")
+    assert "1-0.npz cannot be read" in live.error
 
 
 def test_a_resumed_run_shows_what_the_earlier_one_has_left(tmp_path):
     job = make_job(100)
     first = RunStore(job, tmp_path / "run")
     for scan in range(60):
-        commit(first, scan, 10)
+        commit(first, scan, [10], [7], [50])
     first.db.close()
     store = RunStore(job, tmp_path / "run", resume=True)
     with live_run(job, port=0, browser=False) as live, looking(live.page.url):

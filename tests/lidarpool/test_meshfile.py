@@ -290,12 +290,3 @@ def test_missing_and_folders(tmp_path):
         load_meshes(tmp_path / "no.glb")
     with pytest.raises(LidarpoolError, match="cannot be read: Is a directory"):
         load_meshes(tmp_path / "d.glb")
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [({"unit": "parsec"}, "must be one of um, mm"), ({"up_axis": "w"}, "must be x, y or z")],
-)
-def test_bad_options(tmp_path, options, message):
-    with pytest.raises(LidarpoolError, match=message):
-        load_meshes(write(tmp_path / "m.obj", OBJ.format(x=0, x1=1)), **options)

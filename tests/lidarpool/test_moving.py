@@ -84,19 +84,6 @@ def test_raw_points_are_off_by_metres_and_deskewed_ones_on_the_wall(wall, model)
     assert np.abs(placed(turn)[:, 1] - WALL_M).max() > 0.3
 
 
-def test_beams_of_one_firing_leave_from_different_places(wall):
-    """VLP-16: 16 beams in 34.56 µs, in which 20 m/s are 0.7 mm."""
-    sensor = load_sensor("velodyne/vlp16", max_range_m=30)
-    columns = ["time", "azimuth", "range"]
-    survey = Survey(sensor, trajectory=DRIVE, keep_every=1, columns=columns, precision_m=1e-6)
-    batch = next(Rig(RigPlan(wall, survey, "numpy")).cast(0, 36))
-    first = batch.firing == batch.firing[len(batch) // 2]
-    steps = np.diff(batch.origins[first], axis=0)[:, 0]
-    order = np.diff(batch.time[first])
-    assert first.sum() > 8
-    assert np.allclose(steps, 20e-9 * order, atol=3e-8)
-
-
 def way(*steps, **options):
     """A trajectory of (seconds, x, y, z, yaw in degrees)."""
     seconds, x, y, z, yaw = np.array(steps, np.float64).T

@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidarpool.plan import cost as cost_module
 from lidarpool.plan import shortest_path_length
 from lidarpool.plan.cost import PathCost
 from lidarpool.plan.geometry import clearance, path_length
@@ -77,16 +76,3 @@ def test_the_margin_is_wider_than_rounding_and_narrower_than_a_millimetre_in_100
     charged, free = cost.evaluate()
     assert charged > cost.entry_price
     assert free < 1.1
-
-
-@pytest.mark.parametrize(("discs", "waypoints", "particles"), [(6, 5, 101), (25, 3, 64), (3, 1, 1)])
-def test_blocks_change_no_bit(monkeypatch, discs, waypoints, particles):
-    random = np.random.default_rng(3)
-    centres, radii = random.uniform(-1, 1, (discs, 2)), np.full(discs, 0.05)
-    found = []
-    for elements in (10**9, 1000, 1):
-        monkeypatch.setattr(cost_module, "_BLOCK_ELEMENTS", elements)
-        cost = PathCost(centres, radii, waypoints, particles)
-        random_paths(cost, seed=1)
-        found.append(cost.evaluate().tobytes())
-    assert found[0] == found[1] == found[2]

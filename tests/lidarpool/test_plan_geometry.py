@@ -45,10 +45,6 @@ def test_clearance_signs():
     assert clearance(path, np.empty((0, 2)), np.empty(0)) == math.inf
 
 
-def test_path_length():
-    assert path_length(np.array([[0.0, 0], [3, 4], [3, 5], [3, 5]])) == 6
-
-
 @given(start=point, target=point, points=st.lists(point, min_size=1, max_size=5))
 def test_axes_put_the_ends_half_a_unit_from_the_middle(start, target, points):
     if math.dist(start, target) < 1e-3:

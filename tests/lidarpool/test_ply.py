@@ -114,21 +114,11 @@ def test_bad_targets(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["d.ply", "file"]
 
 
-def existing(tmp_path):
-    """A folder with an earlier result in it, and a check that nothing happened to it."""
+@pytest.mark.parametrize("fault", ["cut", "fewer", "interrupted", "no space"])
+def test_a_faulty_write_leaves_the_earlier_result(tmp_path, monkeypatch, fault):
     path = tmp_path / "c.ply"
     save_cloud(path, sample(3))
     before = path.read_bytes()
-
-    def untouched():
-        return path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == ["c.ply"]
-
-    return path, untouched
-
-
-@pytest.mark.parametrize("fault", ["cut", "fewer", "interrupted", "no space"])
-def test_a_faulty_write_leaves_the_earlier_result(tmp_path, monkeypatch, fault):
-    path, untouched = existing(tmp_path)
     write = ply._write_open3d
 
     def faulty(target, cloud):
@@ -154,7 +144,7 @@ def test_a_faulty_write_leaves_the_earlier_result(tmp_path, monkeypatch, fault):
     kind, message = expected[fault]
     with pytest.raises(kind, match=message):
         save_cloud(path, sample(1000))
-    assert untouched()
+    assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
 
 
 def test_permissions_follow_the_umask(tmp_path):
@@ -178,6 +168,9 @@ def test_reading_what_is_not_a_cloud(tmp_path):
         "ascii": (data.replace(b"binary_little_endian", b"ascii"), "no header"),
         "no z": (data.replace(b"float z", b"float w"), "lacks z"),
         "mesh": (data.replace(b"end_header", b"element face 0\nend_header"), "more than points"),
+        "huge": (data.replace(b"vertex 20", b"vertex " + b"9" * 30), "bytes announced"),
+        "5000 digits": (data.replace(b"vertex 20", b"vertex " + b"9" * 5000), "Exceeds the limit"),
+        "below 0": (data.replace(b"vertex 20", b"vertex -1"), "no points"),
         "list": (data.replace(b"uint16 ring", b"list uchar int ring"), "list properties"),
     }
     for name, (content, message) in cases.items():

@@ -59,16 +59,6 @@ def test_a_shape_is_filled_wherever_its_outline_begins(name):
         assert (parts @ whole > -1e-12).all()
 
 
-def test_polygons_of_all_sizes_keep_their_order():
-    shapes = [SHAPES["wall"], SHAPES["triangle"], SHAPES["arrow"], [(0, 0), (1, 1)], [(7, 7)]]
-    vertices = np.concatenate(
-        [placed(shape, shift=(0, 10 * i, 0)) for i, shape in enumerate(shapes)]
-    )
-    faces = cut(vertices, *map(len, shapes))
-    assert len(faces) == 6 + 1 + 2
-    np.testing.assert_array_equal(np.diff(vertices[faces][:, 0, 1]) >= 0, True)
-
-
 @given(
     st.lists(st.tuples(*[st.integers(-3, 3)] * 3), min_size=3, max_size=9),
     st.sampled_from([1.0, 1e-9, 1e8, float("nan")]),

@@ -4,7 +4,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import poolpart
 from lidarpool.run.local import default_workers, local_cluster
 from poolpart import PoolError
 
@@ -16,25 +15,6 @@ def test_every_machine_gets_workers_and_no_more_than_cores_and_gpus(cores, gpus)
     assert all(count >= 1 for count in workers.values())
     # Every partition has a worker, also where that makes one more than there are cores.
     assert sum(workers.values()) <= max(cores + 1, gpus + 1)
-
-
-@pytest.mark.parametrize(
-    ("given", "partitions"),
-    [
-        ({}, {"GPU": (6, 1), "LIDAR": (1, 4), "OTHER": (2, 1)}),
-        (
-            {"gpu_workers": 1, "lidar_slots": 3, "other_workers": 0},
-            {"GPU": (1, 1), "LIDAR": (1, 3), "OTHER": (0, 1)},
-        ),
-    ],
-)
-def test_what_is_not_given_is_chosen_for_the_machine(monkeypatch, given, partitions):
-    asked = []
-    monkeypatch.setattr("lidarpool.run.local.usable_cores", lambda: 8)
-    monkeypatch.setattr("lidarpool.run.local.visible_gpus", tuple)
-    monkeypatch.setattr(poolpart, "local_cluster", lambda wanted, **_: asked.append(wanted))
-    local_cluster(**given)
-    assert asked == [partitions]
 
 
 @pytest.mark.parametrize("given", [{"gpu_workers": 0}, {"lidar_slots": 0}, {"other_workers": -1}])

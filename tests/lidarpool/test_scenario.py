@@ -1,5 +1,7 @@
 """Scenario files: defaults, what they build, and a message for each way to get one wrong."""
 
+import itertools
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -101,6 +103,20 @@ def test_a_model_and_a_unit_of_it(tmp_path):
     assert mine.survey(Scenario().build_scene()).ray_count == 3 * 90
 
 
+def test_the_warehouse_example_with_a_mesh_beside_it(tmp_path):
+    scene = trimesh.Scene()
+    for i, name in enumerate(["Cluttering", "ShelfD", "ShelfE", "Bucket"]):
+        place = trimesh.transformations.translation_matrix((6, 1, 3 * i))
+        scene.add_geometry(trimesh.creation.box((1, 2, 1)), node_name=name, transform=place)
+    (tmp_path / "warehouse.glb").write_bytes(scene.export(file_type="glb"))
+    shutil.copy(EXAMPLES / "warehouse.yaml", tmp_path)
+    scene, survey, planning = everything(Scenario.load(tmp_path / "warehouse.yaml"))
+    np.testing.assert_allclose(scene.bounds[:, 2], [0, 2], atol=1e-6)  # Y-up stands upright
+    assert survey.sensor.channels == 64
+    assert [pose.pitch_deg for pose in survey.poses] == [0, 0, 10]
+    assert len(planning.radii) == 5
+
+
 def test_mesh_files_are_placed(scenario, crate):
     loaded = scenario(
         """
@@ -185,6 +201,14 @@ def test_numbers_as_everybody_writes_them(scenario):
     assert fingerprint(loaded.sensor.sensor(Path())) == fingerprint(Sensor.grid(step_deg=20.0))
 
 
+def laughs():
+    """YAML whose last list holds 10^9 others."""
+    rows = [f"a: &a [{', '.join('1' * 10)}]"]
+    for of, name in itertools.pairwise("abcdefghi"):
+        rows.append(f"{name}: &{name} [{', '.join([f'*{of}'] * 10)}]")
+    return "\n".join(rows)
+
+
 IDENTITY = "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"
 BAD = [
     # (text, what the message says after the file's name)
@@ -233,6 +257,10 @@ BAD = [
     ("1: 2", "1.* is not a field"),
     ("[" * 50_000, "not valid YAML: maximum recursion depth"),
     ("steps: !!python/object/apply:os.getcwd []", "line 1: could not determine a constructor"),
+    (laughs() + "\nposes: *i", r"poses\[0\]"),
+    (laughs() + "\nscene: {files: *i}", r"scene\.files\[0\]"),
+    ("scene: {files: [!!python/name:os.system ]}", "could not determine a constructor"),
+    ("sensor: {layers: " + "9" * 5000 + "}", "not valid YAML: Exceeds the limit"),
     (b"\xff\xfe\x00", "not valid YAML: 'utf-8' codec"),
     ("steps: '\0'", "not valid YAML: unacceptable character"),
     ('scene: {files: ["~nosuchuser/x.stl"]}', r"'~nosuchuser/x\.stl' has no place"),

@@ -64,14 +64,6 @@ def test_georeferenced_coordinates_lose_no_digit():
     np.testing.assert_array_equal(scene.origin, [512_346, 5_403_211, 432])
 
 
-def test_meshes_are_the_inverse_of_from_meshes():
-    scene = Scene.seed()
-    again = Scene.from_meshes(scene.meshes())
-    assert again.names == scene.names
-    np.testing.assert_array_equal(world(again), world(scene))
-    np.testing.assert_array_equal(again.face_object, scene.face_object)
-
-
 @given(st.lists(st.sampled_from(["a", "b", "a.2", "a.3", "b.2.2"]), max_size=12))
 def test_unique_names(names):
     unique = unique_names(names)

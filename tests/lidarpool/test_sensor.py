@@ -36,13 +36,6 @@ def test_the_steps_of_a_turn_hold_each_firing_once(rays, steps):
     assert sectors[-1][1] == rays
 
 
-@pytest.mark.parametrize(("rays", "step", "steps"), [(1000, 10, 36), (720, 0.5, 720), (7, 72, 5)])
-def test_decimal_steps_are_exact(rays, step, steps):
-    sensor = Sensor.grid(rays_per_revolution=rays, layers=1, step_deg=step)
-    assert sensor.firings(steps - 1)[1] == rays == sensor.period
-    assert sensor.firings(10 * steps - 1)[1] == 10 * rays, "and the numbers go on"
-
-
 def test_a_grid_fires_from_plus_x_counter_clockwise_lowest_channel_first():
     sensor = Sensor.grid(rays_per_revolution=4, layers=3, vertical_fov_deg=90, step_deg=90)
     found = sensor.directions(np.arange(8))

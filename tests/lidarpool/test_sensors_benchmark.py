@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 
 import numpy as np
 import pytest
@@ -32,9 +31,3 @@ def test_a_peer_gets_the_same_rays(tmp_path):
     assert len(job["directions"]) == survey.ray_count == 128 * len(job["origins"])
     assert np.ptp(job["origins"], axis=0)[0] == pytest.approx(20 * 0.0019, rel=0.05)
     assert job["turned"] == pytest.approx(len(job["origins"]) / 1024)
-
-
-def test_a_peer_that_is_not_there_is_named(capsys):
-    with pytest.raises(SystemExit):
-        sensors.main(["--quick", "--peers", sys.executable])
-    assert "pip install mujoco pyhelios3d" in capsys.readouterr().err

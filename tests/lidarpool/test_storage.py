@@ -80,24 +80,6 @@ def test_a_write_that_fails_leaves_nothing(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
 
 
-def test_a_folder_that_is_not_there(tmp_path):
-    storage = Storage.at(tmp_path / "none")
-    with pytest.raises(FileNotFoundError):
-        storage.write("a", b"")
-    storage.remove(["a"])
-    storage.remove_folder()
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OSError):
-        Storage.at(tmp_path / "file" / "below").prepare()
-
-
-def test_a_path_is_made_absolute_and_a_url_is_left(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    here, there = Storage.at("parts"), Storage.at("s3://bucket/a/")
-    assert here.url == str(tmp_path / "parts") and here.is_local
-    assert there.url == "s3://bucket/a" and not there.is_local
-
-
 @pytest.mark.parametrize("url", ["nonsense://a/b", "gs://bucket/folder"])
 def test_a_storage_whose_library_is_missing_says_so(url, monkeypatch):
     monkeypatch.setitem(sys.modules, "gcsfs", None)

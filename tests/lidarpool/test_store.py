@@ -7,15 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.lidarpool.committing import commit
 
 import lidarpool.run.store
 from lidarpool import LidarpoolError, Planning, Scene, Sensor, Survey, remove_run
-from lidarpool.columns.parts import PartColumns, pack
 from lidarpool.plan import run_trial
 from lidarpool.run.identity import identity_of
 from lidarpool.run.job import Job
 from lidarpool.run.store import RunStore
-from lidarpool.scan.messages import Receipt, samples_of_scan, summary_type
 from lidarpool.scene.shapes import seed_objects
 
 SCENE = Scene.from_meshes(seed_objects(rings=4, segments=6))
@@ -24,28 +23,9 @@ PLANNING = Planning((0, 0), (9, 1), [(5, 0)], 1.0, trials=2, particles=10, itera
 JOB = Job(SCENE, SURVEY)
 
 
-def add(store, first, stop, name="", rows=3, number=0):
-    """Write a part of scans, with `rows` points of each, and commit it."""
-    rng = np.random.default_rng(first)
-    counts = np.full(stop - first, rows)
-    columns = {
-        c.name: rng.integers(0, 2, counts.sum()).astype(c.dtype)
-        for c in store.job.survey.stored_columns
-    }
-    triangles = np.array([first, stop], np.int32)
-    part = PartColumns(first, counts, columns, triangles, np.array([1, 2]))
-    data, name = bytes(pack(part)), name or f"{first}-{number}.npz"
-    store.storage.prepare()
-    store.storage.write(name, data)
-    kind = summary_type(samples_of_scan(store.job.survey.scan_count))
-    summaries = np.zeros(stop - first, kind)
-    summaries["samples"] = [first, 0, 0]
-    cells = part.cells
-    receipt = Receipt(
-        0, first, stop, name, len(part), len(data), 3,
-        () if cells is None else tuple(cells.ravel().tolist()), summaries.tobytes(),
-    )  # fmt: skip
-    return store.db.commit([receipt])
+def add(store, first, stop, number=0):
+    """Commit a part of scans with three points of each."""
+    return commit(store, first, [3] * (stop - first), [first, stop], [1, 2], number)
 
 
 def names(folder):

@@ -10,7 +10,7 @@ import pytest
 from tests.lidarpool.carts import Cart
 
 import lidarpool.sensor.survey
-from lidarpool import Column, LidarpoolError, Pose, Sensor, Spin, Survey
+from lidarpool import LidarpoolError, Pose, Sensor, Spin, Survey
 from lidarpool.sensor import Stations
 
 
@@ -32,11 +32,6 @@ def test_the_default_survey_fires_every_ray_of_every_turn_once():
         assert {survey.pose(spec.scan).position[2] for spec in mine} == {pose + 1}
 
 
-def test_stations_follow_one_another_in_time():
-    survey = Survey(Sensor.grid(rate_hz=20), poses=[(0, 0, 1), (0, 0, 2)], steps=72)
-    assert [survey.scan(i).start_ns for i in (0, 71, 72)] == [0, 0, 100_000_000]
-
-
 def test_a_survey_may_have_a_trajectory_in_place_of_poses():
     sensor = Sensor(head=Spin(100, step_deg=36, rate_hz=10))
     survey = Survey(sensor, steps=20, trajectory=Cart())
@@ -55,14 +50,6 @@ def test_poses_are_a_trajectory_too():
     assert positions.tolist() == [[1, 2, 3]] * 4
     assert np.array_equal(rotations, [poses[1].rotation] * 4)
     assert by_poses.path.poses(0, np.zeros(4))[1] is None
-
-
-def test_columns_are_looked_up_and_stored_after_those_that_are_always_there():
-    own = Column("twice", "float32", "m", "range, doubled", lambda returns: 2 * returns.range)
-    survey = Survey(poses=[(0, 0, 1)], columns=["time", own, "ring"])
-    assert [c.name for c in survey.columns] == ["time", "twice"]
-    names = [c.name for c in survey.stored_columns]
-    assert names == ["x", "y", "z", "channel", "object", "time", "twice"]
 
 
 def test_rotation_is_yaw_then_pitch_then_roll():

@@ -49,9 +49,3 @@ def test_what_is_commented_out_is_valid_too(line):
     scenario = Scenario.from_data(data)
     # What cannot be told from a default that follows from other things says it in words.
     assert "auto" in line or scenario.model_dump() != Scenario().model_dump()
-
-
-def test_the_lines_that_are_commented_out_are_found():
-    found = [OFF.match(line) for line in TEXT.splitlines()]
-    names = {match[2].partition(":")[0] for match in found if match}
-    assert names >= {"preset", "files", "ground", "poses", "start", "obstacles", "gpu", "enabled"}

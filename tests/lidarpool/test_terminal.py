@@ -1,4 +1,4 @@
-"""Progress goes to a terminal as long as there is one; a run does not depend on it."""
+"""What is said to a terminal: progress as long as there is one, and nothing that commands it."""
 
 import os
 import sys
@@ -6,6 +6,7 @@ from contextlib import suppress
 
 import pytest
 
+import lidarpool.cli.commands
 from lidarpool.cli.terminal import shown_progress, shown_status
 from lidarpool.run.progress import Progress
 
@@ -38,3 +39,15 @@ def test_a_terminal_that_is_closed_ends_nothing(kind, monkeypatch):
     assert said
     with suppress(OSError):  # what it could not write it tries to write once more
         stream.close()
+
+
+def test_a_complaint_commands_no_terminal(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(lidarpool.cli.commands, "interrupt_on_signals", lambda: None)
+    monkeypatch.setattr(lidarpool.cli.commands, "set_logs", lambda shown: None)
+    path = tmp_path / "s.yaml"
+    path.write_text('scene: {files: ["\\e]0;title\\a\\r\\u202e.ply"]}\n')
+    with pytest.raises(SystemExit):
+        lidarpool.cli.commands.main(["run", str(path)])
+    said = capsys.readouterr().err
+    assert "title" in said
+    assert all(line.isprintable() for line in said.splitlines())

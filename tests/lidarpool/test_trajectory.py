@@ -10,7 +10,7 @@ import pytest
 from lidarpool import LidarpoolError, Mounted, Pose, Sensor, Survey, Track, load_trajectory
 from lidarpool.base.fingerprint import fingerprint
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.sensor.trajectory import matrices, quaternions_of
+from lidarpool.sensor.trajectory import matrices
 
 RNG = np.random.default_rng(5)
 TIMES = np.cumsum(RNG.uniform(0.05, 0.4, 12)) + 1.4e9
@@ -60,11 +60,6 @@ def test_without_angles_a_carrier_faces_its_way():
     track = Track([0, 1, 2, 3], [[0, 0, 0], [0, 0, 1], [0, 2, 1], [0, 2, 2]])
     assert [round(track.pose(0, t * 1e9).yaw_deg, 6) for t in (0, 1, 2, 3)] == [90] * 4
     assert Track([0, 1], [[0, 0, 0], [0, 0, 1]]).pose(0, 5e8).yaw_deg == 0
-
-
-def test_quaternions_of_matrices():
-    same = (quaternions_of(matrices(TURNS)) * TURNS).sum(axis=1)
-    assert np.allclose(np.abs(same), 1)
 
 
 @pytest.fixture

@@ -21,12 +21,6 @@ def test_scale_then_x_then_y_then_z_then_translation():
     np.testing.assert_allclose(points, [[0, 2, 0], [0, 0, 3], [4, 0, 0]], atol=1e-12)
 
 
-def test_matrix():
-    matrix = np.diag([1.0, 2.0, 3.0, 1.0])
-    matrix[:3, 3] = 4, 5, 6
-    np.testing.assert_array_equal(Transform.from_matrix(matrix).apply(np.ones((1, 3))), [[5, 7, 9]])
-
-
 @pytest.mark.parametrize(
     ("make", "message"),
     [

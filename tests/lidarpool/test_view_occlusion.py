@@ -87,19 +87,6 @@ def test_a_line_that_passes_behind_a_box_is_broken(row, shot):
     assert len(whole) == 1
 
 
-def test_nearer_points_are_drawn_over_farther_ones(row, shot):
-    place, _ = shot.camera.project(row.object_bounds[0].mean(axis=0)[None])
-    depth = shot.camera.look_up(shot.depth, place, np.inf)
-    points = shot.camera.eye + (depth + np.array([[-0.05], [0.05]])) * shot.camera.rays(place)
-    red, blue = np.array([1.0, 0, 0]), np.array([0, 0, 1.0])
-    blank = np.ones((*SIZE[::-1], 3), np.float32)
-    column, line = np.floor(place[0]).astype(int)
-    for order in ([0, 1], [1, 0]):
-        image = with_points(blank, shot, points[order], np.stack([red, blue])[order])
-        np.testing.assert_allclose(image[line, column, 1:], 0, atol=0.05)
-        assert 0 < (image != 1).any(axis=2).sum() < 40
-
-
 def drawn(shot, points):
     """Whether points, each by itself, leave something in the picture."""
     blank = np.ones((*SIZE[::-1], 3), np.float32)
@@ -117,21 +104,8 @@ def room():
     return [*shell, box("Crate", (1.5, 1.5, 1.5), (2, -4, 1.05))]
 
 
-def as_one(meshes):
-    """The same triangles as a single object."""
-    first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-    return [
-        Mesh(
-            "Everything",
-            np.concatenate([mesh.vertices for mesh in meshes]),
-            np.concatenate([m.faces + n for m, n in zip(meshes, first, strict=False)]),
-        )
-    ]
-
-
-@pytest.mark.parametrize("group", [list, as_one])
-def test_the_inside_of_a_closed_hall_is_shown(group):
-    scene = Scene.from_meshes(group(room()))
+def test_the_inside_of_a_closed_hall_is_shown():
+    scene = Scene.from_meshes(room())
     poses = np.array([[0, 0.5, 1.5], [1, 6, 1.5]])
     shot = take_shot(scene, poses, size=SIZE, backend="numpy")
     _, seen = shot.visible(np.concatenate([poses, [[2, -4, 1.85], [-3, -5, 0.35]]]))

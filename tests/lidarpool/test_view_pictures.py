@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from lidarpool import Cloud, LidarpoolError
-from lidarpool.plan import Plan, Planning, best, run_trial
+from lidarpool.plan import Planning, best, run_trial
 from lidarpool.render.page import Page
 from lidarpool.render.pictures import draw_cloud, draw_intensity, draw_scene
 from lidarpool.render.shot import take_shot
@@ -169,13 +169,6 @@ def test_the_path_plot_has_equal_axes_in_world_coordinates(tmp_path, planned, fi
     offset = int(re.sub(r"\D", "", axes.get_xlabel()))  # x − 499 970 (m)
     labels = [offset + float(text.get_text()) for text in axes.get_xticklabels()]
     assert labels == (500_003 + axes.get_xticks()).tolist()
-
-
-def test_a_plan_without_a_way_can_be_drawn(pixels, planned):
-    free = Planning((25, 25), (-30, -20), centres=np.empty((0, 2)), radii=np.empty(0))
-    path = np.array([[25, 25], [-30, -20.0]])
-    plan = Plan(path=path, length=0.0, shortest_possible=np.inf, clearance=-1.0, trial=0, trials=1)
-    pixels(draw_path, free, plan, [], np.zeros(2), SIZE)
 
 
 def test_a_picture_that_cannot_be_written_is_named(tmp_path, shot, monkeypatch):

@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import numpy as np
@@ -48,6 +49,12 @@ def test_what_cannot_be_had_says_why(monkeypatch):
         RayCaster(*MESH, backend="embree")
 
 
+def run_python(code):
+    path = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=path)
+    assert done.returncode == 0, done.stderr
+
+
 def test_import_needs_numpy_only():
     """Neither Open3D nor CuPy is loaded by importing, nor by casting with numpy."""
     code = (
@@ -56,9 +63,7 @@ def test_import_needs_numpy_only():
         "heavy = {'open3d', 'cupy', 'dask', 'trimesh', 'scipy'} & set(sys.modules); "
         "sys.exit(str(heavy) if heavy else 0)"
     )
-    path = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=path)
-    assert done.returncode == 0, done.stderr
+    run_python(code)
 
 
 def test_open3d_comes_without_its_viewers_and_whole_to_whoever_imports_it():
@@ -74,14 +79,10 @@ def test_open3d_comes_without_its_viewers_and_whole_to_whoever_imports_it():
         "assert not {'open3d', 'dash', 'plotly'} & set(sys.modules); "
         "import open3d; assert open3d.t.geometry is o3d.t.geometry is load_open3d().t.geometry"
     )
-    path = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=path)
-    assert done.returncode == 0, done.stderr
+    run_python(code)
 
 
 def test_threads_of_one_process_may_share_a_caster(backend, shapes):
-    from concurrent.futures import ThreadPoolExecutor
-
     caster = RayCaster(*shapes["vase"](), backend, threads=1)
     directions = np.random.default_rng(0).normal(size=(8, 5000, 3))
     want = [caster.cast([0.05, 0.1, 0.4], part) for part in directions]

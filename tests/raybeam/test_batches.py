@@ -8,11 +8,7 @@ import numpy as np
 import pytest
 from benchmarks import seams
 
-from raybeam import Pattern, RayCaster, available_backends
-from raybeam.backend import Found
-from raybeam.mesh import local_mesh
-from raybeam.numpy_backend import NumpyBackend
-from raybeam.scan import check_scan
+from raybeam import RayCaster, available_backends
 
 FIELDS = ("distance", "triangle", "u", "v")
 
@@ -119,21 +115,3 @@ def test_memory_of_a_cast_is_bounded(shapes):
         assert 0 < hits.hit.mean() < 0.5
     assert peaks[1] < 96 * 2**20
     assert peaks[1] - peaks[0] < 8 * 2**20
-
-
-def test_rays_are_numbered_beyond_32_bits(shapes, monkeypatch):
-    """The last ray of each chunk of a scan hits; rays are not made."""
-    many = 2**31 + 5
-    engine = NumpyBackend(local_mesh(*shapes["cube"]()))
-    monkeypatch.setattr(NumpyBackend, "chunk", 1 << 29)
-    scan = check_scan(Pattern(np.eye(3)), [0, 0, 0], window=(0, many))
-    monkeypatch.setattr(type(scan), "rays", lambda self, start, stop: stop - start)
-
-    def last(count):
-        none = np.zeros(0)
-        return Found(np.array([count - 1]), np.ones(1), np.zeros(1, np.int32), none, none)
-
-    monkeypatch.setattr(engine, "closest", last)
-    found = engine.scan(scan)
-    assert found.ray.tolist() == [2**29 - 1, 2**30 - 1, 3 * 2**29 - 1, 2**31 - 1, many - 1]
-    assert found.hits.tolist() == [5]

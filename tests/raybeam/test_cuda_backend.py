@@ -12,23 +12,6 @@ from raybeam.mesh import local_mesh
 from raybeam.scan import check_scan
 
 
-def test_hits_stay_in_ray_order(source_backend, shapes, monkeypatch):
-    """In however many casts they were found."""
-    engine = source_backend(local_mesh(*shapes["soup"]("random")))
-    pattern = Pattern(np.random.default_rng(0).normal(size=(600, 3)))
-    scan = check_scan(pattern, [1.0, 2.0, 3.0], window=(50, 550))
-    want = engine.scan(scan)
-    for chunk in (1, 7):
-        monkeypatch.setattr(source_backend, "chunk", chunk)
-        got = engine.scan(scan)
-        assert len(got) > 50
-        assert (np.diff(got.ray) > 0).all()
-        for name in ("ray", "distance", "triangle"):
-            mine, other = getattr(got, name), getattr(want, name)
-            assert mine.dtype == other.dtype
-            np.testing.assert_array_equal(mine, other)
-
-
 def test_arrays_are_kept_until_the_device_has_read_them(source_backend, shapes, monkeypatch):
     """Some devices read the host's memory only when the stream comes to it."""
     mesh = local_mesh(*shapes["soup"]("random", count=3000))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 from benchmarks import raycast_moving
 
@@ -17,10 +16,3 @@ def test_all_numbers_of_beams(capsys):
     lines = capsys.readouterr().out.splitlines()
     assert [int(line.split()[0]) for line in lines] == [16, 16, 64, 64, 128, 128]
     assert all("x bare; moving" in line and "hits 0 %" not in line for line in lines)
-
-
-def test_track_is_made_of_rotations():
-    positions, rotations = raycast_moving.track(30)
-    assert positions.shape == (30, 3)
-    products = rotations @ rotations.transpose(0, 2, 1)
-    np.testing.assert_allclose(products, np.broadcast_to(np.eye(3), (30, 3, 3)), atol=1e-15)
