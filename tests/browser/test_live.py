@@ -3,6 +3,7 @@
 import re
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from lidarpool.run.connection import local_client
 from lidarpool.run.job import Job
 from lidarpool.run.run import Run
 from lidarpool.run.store import RunStore
+from lidarpool.scan import SurveyDriver
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -28,8 +30,9 @@ def client():
 
 
 @pytest.fixture
-def live():
-    """Return a page, and the store that it follows, of a survey that takes its time."""
+def live(monkeypatch):
+    """Return a page, and the store that it follows, of a survey of many small batches."""
+    monkeypatch.setattr(SurveyDriver, "_wished_scans", lambda *_: 10)
     survey = Survey(poses=[(0, 0, 1 + step / 20) for step in range(SCANS // 36)])
     job = Job(Scene.seed(), survey)
     store = RunStore(job)
@@ -41,28 +44,36 @@ def live():
 class Driven:
     """A run in a thread of its own, and how it ended.
 
-    It stands still when it has `most` points: a browser may be slower than any run.
+    It stands still at the first frame after it has `most` points: a browser may be slower than
+    any run. Few batches are ahead of the frames, so that it is far from its end then.
     """
 
     def __init__(self, client, live, store, most=1):
         self.error, self.most = None, most
+        run, begun = Run(client, store), time.monotonic()
 
-        def show(progress):
-            tell(progress)  # which the page shows while the run stands still
-            while store.db.point_count >= self.most and not live.stopped.is_set():
+        def on_frame(frame):
+            live.on_frame(frame)
+            while store.db.point_count >= self.most:
+                now = replace(store.progress(), seconds=time.monotonic() - begun)
+                live.on_progress(now)  # KeyboardInterrupt if somebody has stopped it
                 time.sleep(0.05)
-
-        run = Run(client, store)
-        tell = live.with_progress(lambda progress: None, run.partitions)
 
         def drive():
             try:
-                live.finish(run.drive(live.on_frame, show))
+                tell = live.with_progress(lambda progress: None, run.partitions)
+                live.finish(run.drive(on_frame, tell))
             except BaseException as error:
                 self.error = error
 
         self.thread = threading.Thread(target=drive)
         self.thread.start()
+
+    def ended(self):
+        """Wait for its end."""
+        self.most = ALL
+        self.thread.join(300)
+        assert not self.thread.is_alive()
 
 
 def opened(new_tab, live):
@@ -89,8 +100,7 @@ def test_points_grow_until_all_are_there(client, live, new_tab, tmp_path):
         tab.wait_for(lambda text: points_in(text) > first)
         assert not store.complete
     finally:
-        run.most = ALL
-        run.thread.join(120)
+        run.ended()
     assert run.error is None
     assert store.complete
     total = f"{store.db.point_count:,} points"
@@ -109,9 +119,9 @@ def test_stop_ends_the_run_as_an_interrupt_does(client, live, new_tab):
     try:
         tab.wait_for(points_in)
         tab.click("Stop")
+        tab.wait_for(lambda _: live.stopped.is_set())
     finally:
-        run.thread.join(120)
-        live.stopped.set()
+        run.ended()
     assert isinstance(run.error, KeyboardInterrupt)
     assert not store.complete
 
