@@ -59,7 +59,7 @@ def colourful(image):
 
 
 def test_the_scene_shows_every_object_in_its_colour(pixels, shot):
-    image = pixels(draw_scene, shot)
+    image = pixels(draw_scene, shot, 9)
     for colour in object_colours(6):
         hue = image / np.maximum(image.max(axis=2, keepdims=True), 1)
         alike = np.abs(hue - colour / colour.max()).max(axis=2) < 0.06
@@ -69,9 +69,9 @@ def test_the_scene_shows_every_object_in_its_colour(pixels, shot):
 def test_intensity_colours_what_was_hit_and_only_that(pixels, scene):
     shot = take_shot(scene, [], size=SIZE, backend="numpy")
     hits = np.zeros(len(scene.faces), np.int64)
-    assert colourful(pixels(draw_intensity, shot, hits, NONE)[:, LEFT]) == 0
+    assert colourful(pixels(draw_intensity, shot, hits, NONE, 9)[:, LEFT]) == 0
     hits[scene.face_object == 0] = 50
-    plot = pixels(draw_intensity, shot, hits, NONE)[:, LEFT]
+    plot = pixels(draw_intensity, shot, hits, NONE, 9)[:, LEFT]
     right = shot.camera.project(scene.object_bounds[0])[0][:, 0].max()
     assert colourful(plot) > 30
     assert colourful(plot[:, int(right) + 20 :]) == 0, "the five other objects stay grey"
@@ -80,7 +80,7 @@ def test_intensity_colours_what_was_hit_and_only_that(pixels, scene):
 def test_sample_rays_are_drawn(pixels, scene, shot):
     hits = np.zeros(len(scene.faces), np.int64)
     rays = np.array([[[0, 0, 2], [20, -20, 2]], [[0, 0, 2], [-9, 9, 2]]], np.float32)
-    plain, drawn = (pixels(draw_intensity, shot, hits, some) for some in (NONE, rays))
+    plain, drawn = (pixels(draw_intensity, shot, hits, some, 9) for some in (NONE, rays))
     changed = np.abs(plain - drawn).max(axis=2) > 20
     column, line = shot.camera.project([[10, -10, 2]])[0][0].astype(int)
     assert changed[line - 2 : line + 3, column - 2 : column + 3].any()
@@ -110,8 +110,8 @@ def test_cloud_points_have_the_colour_of_their_height(pixels, scene, shot):
 def test_any_scene_and_poses_can_be_drawn(pixels, corners, poses):
     scene = Scene.from_meshes([Mesh("T", np.array(corners, float), np.array([[0, 1, 2]]))])
     shot = take_shot(scene, poses, size=SIZE, backend="numpy")
-    assert colourful(pixels(draw_scene, shot)) > 100
-    assert colourful(pixels(draw_intensity, shot, np.array([7]), NONE)) > 100
+    assert colourful(pixels(draw_scene, shot, 9)) > 100
+    assert colourful(pixels(draw_intensity, shot, np.array([7]), NONE, 9)) > 100
     for points in (scene.vertices, scene.vertices[[0] * 500], np.array([[0, 0, 0], [1e7, 0, 0]])):
         pixels(draw_cloud, shot, Cloud(points, {}), 3)
 
@@ -125,7 +125,7 @@ def solid(k):
 def test_many_objects_fit_the_legend(figures, tmp_path):
     meshes = [Mesh(f"site_{k}_object_with_a_long_name", *solid(k)) for k in range(60)]
     shot = take_shot(Scene.from_meshes(meshes), [], size=SIZE, backend="numpy")
-    draw_scene(tmp_path, shot)
+    draw_scene(tmp_path, shot, 9)
     names = [text.get_text() for text in figures[0].legends[0].get_texts()]
     assert len(names) == 32 and names[-1] == "and 30 more"
     assert max(map(len, names)) <= 18
@@ -134,7 +134,7 @@ def test_many_objects_fit_the_legend(figures, tmp_path):
 @pytest.mark.parametrize("name", ["$\\frac{x$", "_hidden", "a\x1b]0;b\x07\nc", "\u202egnp", " "])
 def test_names_from_files_are_words_and_nothing_else(tmp_path, figures, name):
     scene = Scene.from_meshes([Mesh(name, *solid(0)), Mesh("plain", *solid(1))])
-    draw_scene(tmp_path, take_shot(scene, [], size=SIZE, backend="numpy"))
+    draw_scene(tmp_path, take_shot(scene, [], size=SIZE, backend="numpy"), 9)
     figures[0].draw_without_rendering()
     first, second, _ = (text.get_text() for text in figures[0].legends[0].get_texts())
     assert (len(first), second) == (len(name), "plain")
@@ -173,11 +173,11 @@ def test_the_path_plot_has_equal_axes_in_world_coordinates(tmp_path, planned, fi
 
 def test_a_picture_that_cannot_be_written_is_named(tmp_path, shot, monkeypatch):
     with pytest.raises(LidarpoolError, match=r"gone.*Choose a folder"):
-        draw_scene(tmp_path / "gone" / "scene.png", shot)
+        draw_scene(tmp_path / "gone" / "scene.png", shot, 9)
 
     def full_disk(figure, file, **options):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Figure, "savefig", full_disk)
     with pytest.raises(LidarpoolError, match=r"scene\.png.*No space left"):
-        draw_scene(tmp_path / "scene.png", shot)
+        draw_scene(tmp_path / "scene.png", shot, 9)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lidarpool import read_cloud
+from lidarpool import Mounted, Pose, Scene, Sensor, Survey, Track, read_cloud, simulate
 from lidarpool.scan.rig import Rig, RigPlan
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.city import city
@@ -76,10 +76,45 @@ def test_what_check_says_of_a_drive(town, lidarpool):
     assert re.search(r"144 scans along a trajectory, .* \(2 sensors\)", told)
     assert re.search(r"way         2\.\d\d m in 0.200 s", told)
     assert re.search(
-        r"roof        3,61\d firings, 2.00 turns; in one the carrier moves 1\.\d+ m", told
+        r"roof        Velodyne VLP-16, 3,61\d firings, 2.00 turns; in one .* moves 1\.\d+ m", told
     )
     done = lidarpool("check", town / "drive.yaml", "--out", town / "out", "--json")
     assert [s["name"] for s in json.loads(done.out)["drive"]["sensors"]] == ["roof", "nose"]
+
+
+def test_what_check_says_of_sensors_without_turns_and_of_returns(tmp_path, lidarpool):
+    (tmp_path / "s.yaml").write_text(
+        "sensors: {left: {model: livox/mid70}, right: {model: livox/mid70}}\n"
+        "returns: {mode: dual, subrays: 7}\nplanning: {enabled: false}\n"
+        "trajectory: {points: [" + POINTS + "]}\n"
+    )
+    told = lidarpool("check", tmp_path / "s.yaml", "--out", tmp_path / "out").out
+    assert re.search(r"left        Livox Mid-70, 100,000 firings, 10.00 frames; in one", told)
+    assert "returns     dual of each pulse, 7 sub-rays a beam" in told
+
+
+def test_the_drive_of_three_sensors_and_ten_actors_can_be_made(tmp_path):
+    write_scene(tmp_path / "city.glb", city(20_000))
+    for name in ("city-drive.yaml", "car.obj", "pedestrian.obj"):
+        (tmp_path / name).write_bytes((ROOT / "examples" / name).read_bytes())
+    scenario = Scenario.load(tmp_path / "city-drive.yaml")
+    scene = scenario.build_scene()
+    survey = scenario.survey(scene)
+    assert [carried.name for carried in survey.carried] == ["roof", "left", "right"]
+    assert len(scene.actors) == 10
+    assert 15e6 < survey.ray_count < 15.2e6
+    for actor in scene.actors:
+        actor.check(survey.duration_ns)
+
+
+def test_a_frame_says_whose_it_is(cluster_client):
+    one = Sensor.grid(layers=4, step_deg=180)
+    carrier = Track(np.array([0.0, 1]), np.array([[0.0, 0, 1], [1, 0, 1]]))
+    sensors = [Mounted(one, Pose((0, 0, 0)), "roof"), Mounted(one, Pose((1, 0, 0)), "nose")]
+    survey = Survey(trajectory=carrier, sensors=sensors, steps=3)
+    frames = []
+    simulate(Scene.seed(), survey, client=cluster_client, on_frame=frames.append)
+    assert [frame.sensor for frame in frames] == ["roof"] * 3 + ["nose"] * 3
 
 
 def test_a_drive_with_actors_on_a_cluster(town, lidarpool, cluster, no_pictures):

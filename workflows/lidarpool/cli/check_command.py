@@ -95,13 +95,18 @@ def told(job: Job, found: dict[str, Any]) -> Iterator[str]:
     if drive:
         yield f"way         {drive['metres']:,.2f} m in {drive['seconds']:,.3f} s"
         for sensor in drive["sensors"]:
-            told = f"{sensor['name'] or 'sensor':<11} {counted(sensor['firings'], 'firing')}"
+            told = f"{sensor['name'] or 'sensor':<11} {sensor['model']}, "
+            told += counted(sensor["firings"], "firing")
             if sensor["turns"]:
                 told += (
-                    f", {sensor['turns']:,.2f} turns; in one the carrier moves "
+                    f", {sensor['turns']:,.2f} {sensor['cycle']}s; in one the carrier moves "
                     f"{sensor['metres_a_turn']:,.3f} m"
                 )
             yield told
+    returns = job.survey.returns
+    if returns != type(returns)():
+        rays = f", {returns.subrays} sub-rays a beam" if returns.subrays > 1 else ""
+        yield f"returns     {returns.mode} of each pulse{rays}"
     if estimate:
         yield (
             f"points      about {estimate['points']:,} of {estimate['hits']:,} hits; an estimate "

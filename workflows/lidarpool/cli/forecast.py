@@ -161,6 +161,8 @@ def _drive(survey: Survey) -> dict[str, Any] | None:
         sensors.append(
             {
                 "name": carried.name,
+                "model": carried.sensor.model,
+                "cycle": carried.sensor.cycle,
                 "scans": steps * survey.path.stations,
                 "firings": firings * survey.path.stations,
                 "turns": turns,

@@ -62,11 +62,17 @@ class LivePage(viser.ViserServer):
     def __init__(self, title: str, port: int) -> None:
         super().__init__(host=HOST, port=port, label=title, verbose=False)
         refuse_strangers(self)
-        self.gui.configure_theme(show_logo=False, show_share_button=False)
+        self._set_theme(dark=False)
+        # It is the last of the panel.
+        dark = self.gui.add_checkbox("dark", initial_value=False, order=1e6)
+        dark.on_update(lambda _: self._set_theme(dark.value))
         self.scene.configure_environment_map(None)
         self.scene.configure_default_lights(enabled=False, cast_shadow=False)
         self.scene.add_light_ambient("/light/around", intensity=_AROUND)
         self.scene.add_light_directional("/light/sun", intensity=_SUN, position=_FROM)
+
+    def _set_theme(self, dark: bool) -> None:
+        self.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=dark)
 
     def request_share_url(self, verbose: bool = True) -> None:
         """Do nothing: viser would open a way to this page from the whole internet."""

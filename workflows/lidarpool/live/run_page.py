@@ -63,6 +63,7 @@ class LiveRun:
         origin, lasts = job.scene.origin, job.survey.duration_ns
         self._view = View(page, job.scene, sensors, columns, origin, bounds, lasts)
         self._described = described(sensors)
+        self._newest = ""  # sensor and time of the newest frame
         self._shown = -1  # the last scan of which the page was told when it was
         self._store: RunStore | None = None
         self._points: LivePoints | None = None
@@ -163,7 +164,10 @@ class LiveRun:
         frames = list(self._frames)
         if frames and frames[-1].scan != self._shown:
             self._shown = frames[-1].scan
-            self._view.set_time(self._job.survey.begins_ns(self._shown))
+            time_ns = self._job.survey.begins_ns(self._shown)
+            self._view.set_time(time_ns)
+            of = f"{frames[-1].sensor}, " if frames[-1].sensor else ""
+            self._newest = f"newest scan: {of}at {time_ns / 1e9:,.4g} s"
         if self._rays is not None:
             self._view.draw_rays(self._rays, "all")
         elif frames:
@@ -192,6 +196,7 @@ class LiveRun:
             if getattr(progress, total)
         ]
         lines.append(self._described)
+        lines += [escape(self._newest)] if self._newest else []
         shown = len(points.cloud) if points is not None and points.cloud is not None else 0
         some = "" if shown == progress.points else f", {shown:,} of them displayed"
         lines.append(f"<b>{progress.points:,} points</b>{some}")

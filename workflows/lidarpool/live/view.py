@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ..columns.cloud import Cloud
 from ..columns.table import AXES, Column, Z
 from ..plan import Planning
+from ..render.closeup import around_ways
 from ..render.colouring import colours_of
 from ..render.theme import object_colours
 from ..run.picture_file import SensorWay
@@ -78,7 +79,9 @@ class View:
         self._poses = places_of(sensors)
         self._actors = () if scene is None else scene.actors
         self._origin, self._ground = origin, float(bounds[0, 2])
-        self._size_m = float(np.linalg.norm(bounds[1] - bounds[0])) or 1.0
+        near = around_ways(bounds, [way.positions for way in sensors if way.moves])
+        near = bounds if near is None else near
+        self._size_m = float(np.linalg.norm(near[1] - near[0])) or 1.0
         self._columns = {c.name: c for c in (Z, *(c for c in table if c not in AXES))}
         self._drawn: dict[str, Hashable] = {}  # {name: what it depended on when it was drawn}
         self._surface: Surface | None = None
@@ -90,8 +93,11 @@ class View:
         self._time: Any = None  # slider, where anything moves
         self._playing = False
         self._moved_at = 0.0  # when the time was last moved on by playing
-        page.frame_scene(bounds)
+        self._ends_ns = duration_ns
+        page.frame_scene(near)
         self._add_controls(bounds, duration_ns / 1e9)
+        if near is not bounds:  # towers would hide the street
+            self._cut.value = min(float(near[1, 2] + origin[2]), self._top)
         self._add_poses()
         self._add_actors()
 
@@ -106,7 +112,10 @@ class View:
         self._cut: Any = gui.add_slider("cut above, m", first, self._top, step, self._top)
         if duration_s > 0 and (self._actors or any(way.moves for way in self._sensors)):
             step = 10.0 ** math.floor(math.log10(duration_s / 200))
-            self._time = gui.add_slider("time, s", 0.0, duration_s, step, 0.0)
+            end = round(
+                step * math.ceil(duration_s / step), 9
+            )  # digits are shown as many as it has
+            self._time = gui.add_slider("time, s", 0.0, end, step, 0.0)
             self._play = gui.add_button("Play")
             self._play.on_click(lambda _: self._start_or_stop())
         with gui.add_folder("cloud"):
@@ -255,6 +264,7 @@ class View:
         self._place(self._time.value * 1e9)
 
     def _place(self, time_ns: float) -> None:
+        time_ns = min(time_ns, self._ends_ns)  # the slider ends at a round number
         if not self._changed("time", time_ns):
             return
         scene = self._page.scene
@@ -262,7 +272,11 @@ class View:
             name = f"/sensors/{number}"
             radius = _BALL * self._size_m * (_MOVES if way.moves else 1.0)
             self._markers.append(scene.add_icosphere(name, radius, _RED, cast_shadow=False))
-            scene.add_label(f"{name}/label", way.name or "sensor", anchor="bottom-left")
+            if not way.moves:
+                scene.add_label(f"{name}/label", way.name or "sensor", anchor="bottom-left")
+            elif not number:  # those of one carrier are near each other
+                names = ", ".join(way.name for way in self._sensors if way.name) or "sensor"
+                scene.add_label(f"{name}/label", names, anchor="bottom-left")
         with self._page.atomic():
             for marker, way in zip(self._markers, self._sensors, strict=True):
                 marker.position = way.at(time_ns)

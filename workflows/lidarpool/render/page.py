@@ -29,7 +29,7 @@ DPI = 200
 FONT = "DejaVu Sans"  # comes with matplotlib
 MANY_POSES = 40  # more than this are drawn as small dots
 PATH_PIECES = 200  # of which the way of a sensor is drawn
-MOST_NAMES = 8  # of actors beside what they name
+MOST_NAMES = 12  # of actors beside what they name
 NAME_ABOVE, NAME_ROOM = 26.0, (150.0, 22.0)  # pixels of a picture 1600 wide
 LEGEND_ROWS = 30
 LEGEND_LETTERS = 18
@@ -129,13 +129,17 @@ class Page:
 
     def _actors(self, axes: Axes, shot: Shot) -> None:
         """Name the actors, if they are few, each above its place."""
-        if not 0 < shot.actors <= MOST_NAMES:
+        boxes, taken = shot.scene.object_bounds, np.empty((0, 2))
+        some = np.arange(len(boxes) - shot.actors, len(boxes))
+        some = some[np.isfinite(boxes[some]).all(axis=(1, 2))]
+        if len(some) > MOST_NAMES:
             return
-        boxes, taken = shot.scene.object_bounds[-shot.actors :], np.empty((0, 2))
-        tops = np.column_stack([boxes[:, :, :2].mean(axis=1), boxes[:, 1, 2]])
+        tops = np.column_stack([boxes[some, :, :2].mean(axis=1), boxes[some, 1, 2]])
         halo = [withStroke(linewidth=1.6 * self.unit, foreground=theme.PAGE)]
-        names = shot.scene.names[-shot.actors :]
-        for pixel, name in zip(shot.camera.project(tops)[0], names, strict=True):
+        names = [shot.scene.names[k] for k in some]
+        places = shot.camera.project(tops)[0]
+        for k in np.argsort(-places[:, 1]).tolist():  # those in front first
+            pixel, name = places[k], names[k]
             place = pixel - (0, NAME_ABOVE * self.unit)
             while (np.abs(taken - place) < np.array(NAME_ROOM) * self.unit).all(axis=1).any():
                 place = place - (0, NAME_ROOM[1] * self.unit)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.colors import LogNorm, Normalize
@@ -27,8 +28,8 @@ MOST_RAYS = 600
 SURROUNDING = 0.6
 
 
-def draw_scene(path: Path, shot: Shot) -> None:
-    """Draw a scene, each object in its own colour, and the sensors.
+def draw_scene(path: Path, shot: Shot, triangles: int) -> None:
+    """Draw a scene, each object in its own colour, and the sensors; `triangles` are all there are.
 
     Raises
     ------
@@ -40,38 +41,49 @@ def draw_scene(path: Path, shot: Shot) -> None:
     page = Page(shot.camera.size)
     page.show(shot, shot.paint(colours[scene.face_object]))
     entries = list(zip(without_common_prefix(scene.names), colours, strict=True))
+    there = np.bincount(scene.face_object, minlength=len(entries)) > 0
     first = len(entries) - shot.actors  # actors are first in the legend: they are what happens
-    page.legend(entries[first:] + entries[:first])
+    order = [*range(first, len(entries)), *range(first)]
+    page.legend([entries[k] for k in order if there[k]])
     page.title(
         "Scene",
-        f"{counted(len(scene.names), 'object')} · {counted(len(scene.faces), 'triangle')} · "
-        f"{shot.when}",
+        f"{counted(len(scene.names), 'object')} · {counted(triangles, 'triangle')} · {shot.when}",
     )
     page.save(path)
 
 
 def draw_intensity(
-    path: Path, shot: Shot, hit_counts: NDArray[np.int64], sample_rays: NDArray[np.floating]
+    path: Path,
+    shot: Shot,
+    hit_counts: NDArray[Any],
+    sample_rays: NDArray[np.floating],
+    count: int,
 ) -> None:
     """Draw a scene coloured by hits per square metre, with the sensors and sample rays.
 
     Parameters
     ----------
     hit_counts
-        (f,) hits of each triangle.
+        (f,) hits of each triangle that is drawn.
     sample_rays
-        (n, 2, 3) start and end of rays, metres, local coordinates; some of them are drawn.
+        (n, 2, 3) start and end of rays, metres, local coordinates; of those that end in what is
+        drawn, some are.
+    count
+        Hits in all.
     """
     density = hit_density(shot.scene, hit_counts)
     low, high = density_range(density)
     colours = density_colours(density, hit_counts > 0, (low, high), TURBO)
     page = Page(shot.camera.size)
     axes = page.show(shot, shot.paint(colours, 0.5))
+    slack, (lowest, highest) = 1e-3 * shot.stage.size, shot.stage.bounds
+    ends = sample_rays[:, 1]
+    inside = (ends >= lowest - slack) & (ends <= highest + slack)
+    sample_rays = sample_rays[inside.all(axis=1)]
     some = np.linspace(0, len(sample_rays) - 1, min(len(sample_rays), MOST_RAYS)).astype(int)
     page.lines(axes, shot, sample_rays[some].astype(np.float64), 0.45, 0.5)
     page.colour_bar(TURBO, LogNorm(low, high), "hits per square metre")
-    hits = counted(int(hit_counts.sum()), "hit")
-    page.title("Ray intensity", f"{hits} · {shot.when} · grey: hit by no ray")
+    page.title("Ray intensity", f"{counted(count, 'hit')} · {shot.when} · grey: hit by no ray")
     page.save(path)
 
 

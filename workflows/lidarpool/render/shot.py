@@ -176,7 +176,8 @@ def take_shot(
     everywhere = np.concatenate([sensors, *paths])
     stage = _stage(scene, everywhere)
     surface = Surface.of(scene, backend)
-    camera, reach = _camera(stage, size, 33.0), np.inf
+    # What moves is on the ground, between what stands there.
+    camera, reach = _camera(stage, size, 48.0 if len(paths) else 33.0), np.inf
     cutaway = plan_cutaway(surface, everywhere, camera.eye)
     if cutaway is not None:
         # From higher up more of the floor is seen between what stands on it.

@@ -7,14 +7,17 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..base.errors import LidarpoolError
 from ..base.words import did_you_mean
 from ..columns.table import Z
 from ..export.cloud_file import CloudFile
+from ..render.closeup import around_ways, cut_out
 from ..render.pictures import MOST_POINTS, draw_cloud, draw_intensity, draw_scene
 from ..render.shot import SIZE, Shot, take_shot
 from ..run.picture_file import Pictured
+from ..scene.scene import Scene
 from .path_picture import draw_path
 
 
@@ -36,21 +39,40 @@ def picture_makers(
     colour
         Column that the cloud is coloured by.
     """
+    middle, moving = shown.duration_ns / 2, [way for way in shown.sensors if way.moves]
+    ways = [way.positions for way in moving]
+
+    @cache
+    def part() -> tuple[Scene, NDArray[np.int64], NDArray[np.float64], str]:
+        """Cut out what is drawn; of each triangle, which it was and how much, and words on it."""
+        scene = shown.scene.solid(middle)
+        box = around_ways(scene.bounds, ways)
+        if box is None:
+            return scene, np.arange(len(scene.faces)), np.ones(len(scene.faces)), ""
+        wide, deep, _ = box[1] - box[0]
+        top = box[1, 2] + scene.origin[2]
+        return *cut_out(scene, box), (
+            f" · drawn: {wide:,.0f} × {deep:,.0f} m around the way, below z = {top:,.0f} m"
+        )
 
     @cache
     def shot() -> Shot:
-        middle, scene = shown.duration_ns / 2, shown.scene
-        moving = [way for way in shown.sensors if way.moves]
         # Of sensors that move a marker is where they are halfway, and a line the rest.
         places = [w.at(middle)[None] if w.moves else w.positions for w in shown.sensors]
+        scene, _, _, words = part()
         return take_shot(
-            scene.solid(middle),
+            scene,
             np.concatenate([np.empty((0, 3)), *places]) + scene.origin,
-            paths=[way.positions for way in moving],
-            actors=len(scene.actors),
-            when=shown.when,
+            paths=ways,
+            actors=len(shown.scene.actors),
+            when=shown.when + words,
             size=size,
         )
+
+    def draw_hits(path: Path) -> None:
+        _, parents, shares, _ = part()
+        hits = int(shown.hit_counts.sum())
+        draw_intensity(path, shot(), shown.hit_counts[parents] * shares, shown.sample_rays, hits)
 
     def draw_points(path: Path) -> None:
         file = CloudFile(cloud, shown.own)
@@ -65,8 +87,8 @@ def picture_makers(
         draw_cloud(path, shot(), *file.choose(MOST_POINTS), column, shown.names_of(column))
 
     makers: dict[str, Callable[[Path], object]] = {
-        "scene": lambda path: draw_scene(path, shot()),
-        "intensity": lambda path: draw_intensity(path, shot(), shown.hit_counts, shown.sample_rays),
+        "scene": lambda path: draw_scene(path, shot(), shown.scene.triangles),
+        "intensity": draw_hits,
         "cloud": draw_points,
     }
     planning, plan = shown.planning, shown.plan

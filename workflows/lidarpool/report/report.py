@@ -22,6 +22,7 @@ from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
 from .cloud_numbers import CountedCloud
 
+ELEVATION_RAYS = 20_000  # whose elevations are looked at
 _ORDER = (GENERATE, INTERSECT, SORT, COLLECT, TRIAL)  # in which stages are listed
 
 _PACKAGES = (
@@ -151,17 +152,20 @@ def _columns(cloud: CountedCloud) -> list[dict[str, Any]]:
 
 def _sensor(sensor: Sensor) -> dict[str, Any]:
     """Describe a sensor: its beams, and the numbers and words of its head."""
-    elevations = np.degrees(sensor.beams.elevation)
+    firings = np.arange(ELEVATION_RAYS // sensor.channels + 1)
+    elevations = np.degrees(np.arcsin(sensor.directions(firings)[..., 2].clip(-1, 1)))
     head = {
         name: value
         for name, value in vars(sensor.head).items()
         if not name.startswith("_") and isinstance(value, (int, float, str))
+        if sensor.cycle != "frame" or name == "rate_hz"  # of those the head is only the clock
     }
     return {
         "kind": sensor.model,
         "channels": sensor.channels,
         "elevation_deg": [round(float(elevations.min()), 6), round(float(elevations.max()), 6)],
         "head": {"kind": type(sensor.head).__name__, **head},
+        "cycle": sensor.cycle,
         "min_range_m": sensor.min_range_m,
         "max_range_m": _finite(sensor.max_range_m),
     }

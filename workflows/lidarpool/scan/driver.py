@@ -638,11 +638,12 @@ class SurveyDriver:
         return bool(items)
 
     def _hand_out(self, scan: int, summary: np.void) -> None:
-        samples = summary["samples"]
+        samples, spec = summary["samples"], self.survey.scan(scan)
         frame = Frame(
             scan,
+            self.survey.carried[spec.sensor].name,
             self.survey.pose(scan),
-            self.survey.scan(scan).ray_count,
+            spec.ray_count,
             int(summary["hits"]),
             int(summary["points"]),
             samples[~np.isnan(samples[:, 0])],

@@ -106,8 +106,10 @@ class Frame:
     ----------
     scan
         Its number.
+    sensor
+        Name of its sensor; "" where there is one without.
     pose
-        Where the sensor was when it began, in the scene's local coordinates.
+        Where that was when it began, in the scene's local coordinates.
     rays, hits, count
         Rays fired, those that hit something, and points of the cloud.
     samples
@@ -115,6 +117,7 @@ class Frame:
     """
 
     scan: int
+    sensor: str
     pose: Pose
     rays: int
     hits: int

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +41,7 @@ class PrismSensor(Sensor):
     rpm: tuple[float, float] = (7294.0, -4664.0)
     phase_deg: tuple[float, float] = (0.0, 0.0)
     inclined_first: bool = False
+    cycle: ClassVar[str] = "frame"
 
     @property
     def period(self) -> int | None:
@@ -100,6 +102,7 @@ class ListedSensor(Sensor):
     rays: NDArray[np.float64] = field(default_factory=lambda: np.array([[1.0, 0, 0]]))
     shot_ns: NDArray[np.float64] = field(default_factory=lambda: np.zeros(1))
     cycle_ns: float = 1e8
+    cycle: ClassVar[str] = "frame"
 
     @property
     def period(self) -> int | None:

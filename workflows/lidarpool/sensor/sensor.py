@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +52,7 @@ class Sensor:
     max_range_m: float = float("inf")
     name: str = ""
     optics: Optics = field(default_factory=Optics)
+    cycle: ClassVar[str] = "turn"  # what is done so many times a second, in a word
 
     def __post_init__(self) -> None:
         checks = (
@@ -219,6 +221,8 @@ class LineSensor(Sensor):
 
     So an airborne scanner flies along x and sweeps across.
     """
+
+    cycle: ClassVar[str] = "cycle"
 
     def _turned(
         self, firings: NDArray[np.int64], vectors: NDArray[np.float64]

@@ -1,0 +1,118 @@
+"""The part of a scene around the way of a carrier: what happens there would be lost in a city."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..scene.scene import Scene
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+# Room on each side of a way: a share of its diagonal, times its height above the scene's lowest
+# point, and metres at least.
+_SHARE, _HEIGHTS, _LEAST_M = 0.35, 2.0, 25.0
+_MOST = 0.5  # of the scene's ground: then all of it is shown
+
+
+def around_ways(bounds: Floats, ways: Sequence[Floats]) -> Floats | None:
+    """Box (2, 3) around ways, down to the ground; None if it has most of the scene's ground.
+
+    Parameters
+    ----------
+    bounds
+        Box (2, 3) of the scene, metres.
+    ways
+        (k, 3) each, metres.
+    """
+    if not ways:
+        return None
+    places = np.concatenate(ways)
+    low, high = places.min(axis=0), places.max(axis=0)
+    length = float(np.linalg.norm((high - low)[:2]))
+    room = max(_SHARE * length, _HEIGHTS * float(high[2] - bounds[0, 2]), _LEAST_M)
+    box = np.stack([low - room, high + room]).clip(*bounds)
+    box[0, 2] = bounds[0, 2]
+    ground, whole = (float(np.prod((b[1] - b[0])[:2])) for b in (box, bounds))
+    return box if ground < _MOST * whole else None
+
+
+def cut_out(scene: Scene, box: Floats) -> tuple[Scene, Ints, Floats]:
+    """Cut what stands in a box (2, 3) out of a scene.
+
+    Objects that are narrower than the box are there if their middle is; wider ones, as the
+    ground, are cut at its sides. All are cut at its top: else towers would hide the way. Objects
+    keep their numbers, also those of which nothing is left.
+
+    Returns
+    -------
+    scene
+        The part; the scene itself if there is nothing in the box.
+    parents
+        (f,): of each triangle that which it was in the scene.
+    shares
+        (f,): how much of that it is, by area.
+    """
+    boxes = scene.object_bounds[:, :, :2]
+    middle = boxes.mean(axis=1)
+    narrow = ((boxes[:, 1] - boxes[:, 0]) <= (box[1] - box[0])[:2]).all(axis=1)
+    inside = ((middle >= box[0, :2]) & (middle <= box[1, :2])).all(axis=1)
+    whole = np.flatnonzero((narrow & inside)[scene.face_object])
+    vertices, parents = scene.vertices, np.flatnonzero(~narrow[scene.face_object])
+    faces = scene.faces[parents].astype(np.int64)
+    for axis in (0, 1):
+        for sign, limit in ((1.0, box[1, axis]), (-1.0, box[0, axis])):
+            vertices, faces, parents = _clipped(vertices, faces, parents, axis, sign, limit)
+    faces, parents = np.concatenate([scene.faces[whole], faces]), np.append(whole, parents)
+    vertices, faces, parents = _clipped(vertices, faces, parents, 2, 1.0, box[1, 2])
+    if not len(faces):
+        return scene, np.arange(len(scene.faces)), np.ones(len(scene.faces))
+    part = replace(
+        scene,
+        vertices=vertices,
+        faces=faces.astype(np.int32),
+        face_object=scene.face_object[parents],
+        actors=(),
+    )
+    was = _areas(scene.vertices, scene.faces[parents])
+    shares = np.divide(_areas(vertices, faces), was, out=np.ones(len(was)), where=was > 0)
+    return part, parents, shares
+
+
+def _clipped(
+    vertices: Floats, faces: Ints, parents: Ints, axis: int, sign: float, limit: float
+) -> tuple[Floats, Ints, Ints]:
+    """Keep what of triangles lies where ``sign * (coordinate - limit) <= 0``.
+
+    A triangle with one corner there becomes a smaller one, one with two becomes two.
+    """
+    beyond = sign * (vertices[:, axis] - limit)
+    out = beyond[faces] > 0  # (f, 3)
+    count = out.sum(axis=1)
+    kept, origins = [faces[count == 0]], [parents[count == 0]]
+    for number in (1, 2):  # corners that are beyond
+        rows = np.flatnonzero(count == number)
+        # The corner that is alone comes first.
+        first = np.argmax(out[rows] == (number == 1), axis=1)
+        a, b, c = (faces[rows, (first + k) % 3] for k in range(3))
+        ends = []
+        for other in (b, c):
+            share = beyond[a] / (beyond[a] - beyond[other])
+            ends.append(len(vertices) + np.arange(len(rows)))
+            new = vertices[a] + share[:, None] * (vertices[other] - vertices[a])
+            vertices = np.concatenate([vertices, new])
+            beyond = np.append(beyond, np.zeros(len(rows)))
+        ab, ac = ends
+        pieces = [(a, ab, ac)] if number == 2 else [(ab, b, c), (ab, c, ac)]
+        kept += [np.stack(piece, axis=1) for piece in pieces]
+        origins += [parents[rows]] * len(pieces)
+    return vertices, np.concatenate(kept), np.concatenate(origins)
+
+
+def _areas(vertices: Floats, faces: NDArray[np.integer]) -> Floats:
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1))
