@@ -21,7 +21,6 @@ from . import ploc
 
 PAD = 20 * 2.0**-24  # local units
 LEAF_BITS = 3
-MAX_LEAF = 1 << LEAF_BITS
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,7 @@ def build_tree(corners: NDArray[np.float64], width: int, leaf_size: int) -> Wide
     width
         Most children of a node.
     leaf_size
-        Most triangles of a leaf, at most `MAX_LEAF`.
+        Most triangles of a leaf, at most ``1 << LEAF_BITS``.
     """
     low = np.ascontiguousarray((corners.min(axis=1) - PAD).T, dtype=np.float32)
     high = np.ascontiguousarray((corners.max(axis=1) + PAD).T, dtype=np.float32)

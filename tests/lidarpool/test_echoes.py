@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import trimesh
-from tests.lidarpool.carts import Cart
+from tests.lidarpool.casting import Cart, cast_between
 
 from lidarpool import (
     Beams,
@@ -356,20 +355,12 @@ def test_batches_and_chunks_leave_no_trace(options, path, per_turn, monkeypatch)
     survey = Survey(sensor, steps=14, keep_every=3, columns=COLUMNS, **options, **path)
     scene = Scene.from_meshes(seed_objects(rings=8, segments=12))
     rig = Rig(RigPlan(scene, survey, "numpy"))
-
-    def columns(cuts):
-        batches = [batch for span in itertools.pairwise(cuts) for batch in rig.cast(*span)]
-        return [
-            np.concatenate([column.make(batch) for batch in batches]).tobytes()
-            for column in survey.stored_columns
-        ]
-
-    whole = columns([0, 28])
-    assert len(whole[0]) > 200
-    assert columns([0, 1, 5, 14, 17, 28]) == whole
+    whole = cast_between(rig, survey, [0, 28])
+    assert len(whole[0]["x"]) > 200
+    assert cast_between(rig, survey, [0, 1, 5, 14, 17, 28]) == whole
     monkeypatch.setattr("lidarpool.scan.echoes.CHUNK_RAYS", 100)
     monkeypatch.setattr("lidarpool.scan.echoes.BLOCK_RAYS", 7)
-    assert columns(list(range(29))) == whole
+    assert cast_between(rig, survey, list(range(29))) == whole
 
 
 def test_returns_are_thinned_out_scan_by_scan():

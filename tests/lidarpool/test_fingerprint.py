@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import doctest
 import enum
 import os
 import subprocess
@@ -20,7 +19,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-import lidarpool.base.fingerprint
 from lidarpool import Beams, LidarpoolError, Sensor, Spin
 from lidarpool.base.fingerprint import fingerprint
 from lidarpool.sensor import Head
@@ -42,11 +40,6 @@ class Box:
     @cached_property
     def half(self):
         return 0.5
-
-
-def test_examples_in_the_docstrings():
-    found = doctest.testmod(lidarpool.base.fingerprint)
-    assert found.attempted and not found.failed
 
 
 DIFFERENT = [

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import doctest
 import json
 from fractions import Fraction
 
 import numpy as np
 import pytest
 
-import lidarpool.sensor.models
 from lidarpool import LidarpoolError
 from lidarpool.sensor.models import load_sensor, model_names, read_model
 from lidarpool.sensor.rays import ListedSensor, PrismSensor
@@ -21,11 +19,6 @@ def angles(directions):
     """Azimuth and elevation of directions (…, 3), degrees."""
     x, y, z = np.moveaxis(directions, -1, 0)
     return np.degrees(np.arctan2(y, x)), np.degrees(np.arcsin(z))
-
-
-def test_examples_in_the_docstrings():
-    found = doctest.testmod(lidarpool.sensor.models)
-    assert found.attempted and not found.failed
 
 
 @pytest.mark.parametrize("name", READY)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.lidarpool.casting import cast_between
 
 from lidarpool import (
     LidarpoolError,
@@ -179,15 +179,9 @@ def test_an_actor_behind_glass_is_where_it_is_without(street, backend):
 def test_however_scans_are_batched_actors_have_the_same_bits(street):
     survey = Survey(load_sensor("velodyne/vlp16"), trajectory=DRIVE, columns=COLUMNS)
     rig = Rig(RigPlan(replace(street, actors=(CAR,)), survey, "numpy"))
-
-    def columns(cuts):
-        batches = [batch for span in itertools.pairwise(cuts) for batch in rig.cast(*span)]
-        tally = np.sum([batch.found.tally for batch in batches], axis=0)
-        made = [[column.make(batch) for batch in batches] for column in survey.stored_columns]
-        return [np.concatenate(parts).tobytes() for parts in made], tally.tolist()
-
     count = survey.scan_count
-    assert columns([0, count]) == columns([0, 1, 7, 30, count - 3, count])
+    whole = cast_between(rig, survey, [0, count])
+    assert cast_between(rig, survey, [0, 1, 7, 30, count - 3, count]) == whole
 
 
 def test_an_actor_must_be_there_as_long_as_the_survey_lasts(street):

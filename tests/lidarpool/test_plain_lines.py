@@ -3,8 +3,6 @@
 from dataclasses import replace
 from io import StringIO
 
-import pytest
-
 from lidarpool.cli.terminal import PlainLines
 from lidarpool.run.progress import Progress
 
@@ -57,14 +55,3 @@ def test_plain_lines_tell_why_nothing_goes_on():
     words = "waits for slots of LIDAR, which other runs hold"
     assert run == [f"run  {words}, 20 scans are done", "run  goes on, 40 scans are done"]
     assert len(said(stream)) - len(run) == 4
-
-
-@pytest.mark.parametrize(
-    ("done", "after_s", "sure"), [(1, 2.0, False), (5, 2.0, True), (1, 30.0, True)]
-)
-def test_time_left_is_told_when_enough_is_known(done, after_s, sure):
-    stream = StringIO()
-    show = PlainLines(stream)
-    show(progress(0.0, 0, 1))
-    show(progress(after_s, done, 1))
-    assert ("/s" in stream.getvalue(), " left" in stream.getvalue()) == (True, sure)

@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidarpool.plan.axes import PathAxes
-from lidarpool.plan.geometry import clearance, path_length, segment_distances
+from lidarpool.plan.geometry import clearance, segment_distances
 
 coordinate = st.floats(-50, 50)
 point = st.tuples(coordinate, coordinate)
@@ -43,16 +42,3 @@ def test_clearance_signs():
     assert clearance(path, centre, np.array([1.5])) == pytest.approx(0.5)
     assert clearance(path, centre, np.array([3.0])) == pytest.approx(-1)
     assert clearance(path, np.empty((0, 2)), np.empty(0)) == math.inf
-
-
-@given(start=point, target=point, points=st.lists(point, min_size=1, max_size=5))
-def test_axes_put_the_ends_half_a_unit_from_the_middle(start, target, points):
-    if math.dist(start, target) < 1e-3:
-        return
-    axes = PathAxes(start, target)
-    ends = axes.to_local(np.array([start, target]))
-    assert ends == pytest.approx(np.array([[-0.5, 0], [0.5, 0]]), abs=1e-9)
-    points = np.array(points)
-    assert axes.to_plane(axes.to_local(points)) == pytest.approx(points, abs=1e-9)
-    there = path_length(axes.to_local(points)) * axes.unit_m
-    assert there == pytest.approx(path_length(points), abs=1e-9)

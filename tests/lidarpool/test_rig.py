@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.lidarpool.carts import Cart
+from tests.lidarpool.casting import Cart, cast_between
 
 from lidarpool import Beams, Column, Mounted, Pose, Scene, Sensor, Spin, Survey
 from lidarpool.scan.failures import naming_scans
@@ -156,18 +155,9 @@ def test_what_is_cast_is_what_each_ray_by_itself_meets(name, scene):
 def test_however_scans_are_batched_their_columns_have_the_same_bits(name, scene):
     survey = (SURVEYS | MODELS)[name]
     rig = Rig(RigPlan(scene, survey, "numpy"))
-
-    def columns(cuts):
-        spans = itertools.pairwise(cuts)
-        batches = [batch for span in spans for batch in rig.cast(*span)]
-        return [
-            np.concatenate([column.make(batch) for batch in batches]).tobytes()
-            for column in survey.stored_columns
-        ]
-
-    whole = columns([0, survey.scan_count])
-    assert columns([0, 1, 5, 14, 17, 28]) == whole
-    assert columns(list(range(29))) == whole
+    whole = cast_between(rig, survey, [0, 28])
+    assert cast_between(rig, survey, [0, 1, 5, 14, 17, 28]) == whole
+    assert cast_between(rig, survey, list(range(29))) == whole
 
 
 def test_a_worker_that_leaves_is_not_a_failure_of_its_scans():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import doctest
 import itertools
 from dataclasses import replace
 from fractions import Fraction
@@ -12,15 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import lidarpool.sensor.beams
-import lidarpool.sensor.sensor
 from lidarpool import Beams, LidarpoolError, Sensor, Spin
-
-
-@pytest.mark.parametrize("module", [lidarpool.sensor.beams, lidarpool.sensor.sensor])
-def test_examples_in_the_docstrings(module):
-    found = doctest.testmod(module)
-    assert found.attempted and not found.failed
 
 
 @given(rays=st.integers(1, 5000), steps=st.integers(1, 720))

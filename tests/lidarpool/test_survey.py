@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
-import doctest
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.lidarpool.carts import Cart
+from tests.lidarpool.casting import Cart
 
-import lidarpool.sensor.survey
 from lidarpool import LidarpoolError, Pose, Sensor, Spin, Survey
 from lidarpool.sensor import Stations
-
-
-def test_examples_in_the_docstrings():
-    found = doctest.testmod(lidarpool.sensor.survey)
-    assert found.attempted and not found.failed
 
 
 def test_the_default_survey_fires_every_ray_of_every_turn_once():

@@ -2,20 +2,12 @@
 
 from __future__ import annotations
 
-import doctest
-
 import numpy as np
 import pytest
 
-import lidarpool.scene.terrain
 from lidarpool import LidarpoolError
 from lidarpool.scene.terrain import terrain
 from raybeam import RayCaster
-
-
-def test_examples_in_the_docstrings():
-    found = doctest.testmod(lidarpool.scene.terrain)
-    assert found.failed == 0 < found.attempted
 
 
 @pytest.mark.parametrize("triangles", [2, 7, 1999, 20_000])

@@ -17,8 +17,8 @@ def test_the_up_axis_becomes_z(axis):
 def test_scale_then_x_then_y_then_z_then_translation():
     placed = Transform.place((10, 20, 30), (90, 0, 90), (2, 3, 4))
     # x: scaled to 2, stays under the turn about x, goes to y under the turn about z.
-    points = placed.apply(np.eye(3)) - [10, 20, 30]
-    np.testing.assert_allclose(points, [[0, 2, 0], [0, 0, 3], [4, 0, 0]], atol=1e-12)
+    np.testing.assert_allclose(placed.linear.T, [[0, 2, 0], [0, 0, 3], [4, 0, 0]], atol=1e-12)
+    assert placed.offset.tolist() == [10, 20, 30]
 
 
 @pytest.mark.parametrize(

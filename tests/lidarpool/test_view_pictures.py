@@ -151,14 +151,6 @@ def planned():
     return planning, best(trials, planning), [trial.waypoints for trial in trials]
 
 
-def test_the_path_is_drawn_with_its_discs_and_trials(pixels, planned):
-    planning, plan, trials = planned
-    bare, full = (
-        pixels(draw_path, planning, plan, some, np.zeros(2), SIZE) for some in ([], trials)
-    )
-    assert colourful(bare) > 100 and (bare != full).any()
-
-
 def test_the_path_plot_has_equal_axes_in_world_coordinates(tmp_path, planned, figures):
     draw_path(tmp_path, *planned, np.array([500_003, 4_000_000]), (1600, 1000))
     (axes,) = figures[0].axes

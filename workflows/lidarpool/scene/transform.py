@@ -87,7 +87,3 @@ class Transform:
                 f"given: {array.tolist()}."
             )
         return cls(array[:3, :3], array[:3, 3])
-
-    def apply(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the transformed points, float64 (n, 3)."""
-        return points @ self.linear.T + self.offset

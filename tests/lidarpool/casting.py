@@ -1,7 +1,8 @@
-"""A trajectory that moves, for tests."""
+"""What tests of casting share: a trajectory that moves, and batches cut anywhere."""
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,3 +31,13 @@ class Cart:
         poses = [self.pose(station, time) for time in times_ns]
         rotations = [np.eye(3) if p.rotation is None else p.rotation for p in poses]
         return np.array([p.position for p in poses]), np.array(rotations)
+
+
+def cast_between(rig, survey, cuts):
+    """Columns as bytes, and hits of each triangle, of scans that are cast from cut to cut."""
+    batches = [batch for span in itertools.pairwise(cuts) for batch in rig.cast(*span)]
+    columns = {
+        column.name: np.concatenate([column.make(batch) for batch in batches]).tobytes()
+        for column in survey.stored_columns
+    }
+    return columns, np.sum([batch.found.tally for batch in batches], axis=0).tolist()
