@@ -8,16 +8,7 @@ import numpy as np
 import pytest
 from tests.lidarpool.casting import cast_between
 
-from lidarpool import (
-    LidarpoolError,
-    Material,
-    Mounted,
-    Pose,
-    Scene,
-    Survey,
-    Track,
-    load_sensor,
-)
+from lidarpool import LidarpoolError, Material, Mounted, Pose, Scene, Survey, Track, load_sensor
 from lidarpool.run.identity import identity_of
 from lidarpool.run.job import Job
 from lidarpool.scan.motion import into_axes

@@ -11,17 +11,7 @@ import click
 import numpy as np
 import pytest
 
-from lidarpool import (
-    Cloud,
-    LidarpoolError,
-    Mounted,
-    Planning,
-    Pose,
-    Scene,
-    Sensor,
-    Survey,
-    Track,
-)
+from lidarpool import Cloud, LidarpoolError, Mounted, Planning, Pose, Scene, Sensor, Survey, Track
 from lidarpool.cli.commands import cli
 from lidarpool.columns.table import Column
 from lidarpool.export.cloud_file import CloudFile

@@ -7,28 +7,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarpool.base.errors import LidarpoolError
-from lidarpool.scene.shapes import (
-    SEED_POSITIONS,
-    revolve,
-    seed_objects,
-)
+from lidarpool.scene.shapes import SEED_POSITIONS, revolve, seed_objects
 
 
-def closed(mesh):
-    """Whether every edge belongs to two faces that run along it in opposite directions."""
-    edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
-    forth = {tuple(edge) for edge in edges.tolist()}
-    return len(forth) == len(edges) and forth == {(b, a) for a, b in forth}
-
-
-def areas(mesh):
-    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
-    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-
-
-def volume(mesh):
-    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
-    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+def solid(mesh):
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
 
 
 @pytest.mark.parametrize("index", range(6))
@@ -36,16 +19,15 @@ def test_each_seed_object(index):
     mesh = seed_objects()[index]
     assert len(mesh.faces) == 12_800
     assert len(mesh.vertices) == 80 * 80 + 2
-    assert closed(mesh)
-    assert areas(mesh).min() > 1e-5
+    assert solid(mesh).is_volume, "closed, faces outward"
+    assert solid(mesh).area_faces.min() > 1e-5
     assert len(np.unique(mesh.vertices.round(9), axis=0)) == len(mesh.vertices)
     local = mesh.vertices - [*SEED_POSITIONS[index], 0]
     assert np.hypot(local[:, 0], local[:, 1]).max() == pytest.approx(2.0, abs=1e-12)
     assert local[:, 2].min() == 0.0
     assert 2.0 <= local[:, 2].max() <= 5.2
-    assert volume(mesh) > 6  # outward faces
     if mesh.name == "Sphere":
-        assert volume(mesh) == pytest.approx(4 / 3 * np.pi * 8, rel=3e-3)
+        assert solid(mesh).volume == pytest.approx(4 / 3 * np.pi * 8, rel=3e-3)
 
 
 @settings(max_examples=40)
@@ -58,9 +40,7 @@ def test_revolved_profiles_are_watertight(steps, segments):
     radii = [0.0, *(radius for radius, _ in steps), 0.0]
     mesh = revolve(np.column_stack([radii, heights]), segments)
     assert len(mesh.faces) == 2 * len(steps) * segments
-    assert closed(mesh)
-    assert volume(mesh) > 0
-    assert trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).is_watertight
+    assert solid(mesh).is_volume
 
 
 @pytest.mark.parametrize(

@@ -73,20 +73,6 @@ def test_points_behind_a_box_are_hidden_and_before_it_seen(row, shot):
     assert seen.tolist() == [True, False, False]
 
 
-def test_a_line_that_passes_behind_a_box_is_broken(row, shot):
-    middle = row.object_bounds[1].mean(axis=0)
-    middle[2] = row.object_bounds[1, 1, 2] - 0.3
-    right = shot.camera.axes[0]
-    runs = shot.runs(np.array([[middle - 3 * right, middle + 3 * right]]), shot.visible)
-    assert len(runs) == 2
-    ends, _ = shot.camera.project(np.array([middle - 3 * right, middle + 3 * right]))
-    np.testing.assert_allclose(runs[0][0], ends[0], atol=0.5)
-    np.testing.assert_allclose(runs[1][1], ends[1], atol=0.5)
-    above = middle + np.array([0, 0, 2])
-    whole = shot.runs(np.array([[above - 3 * right, above + 3 * right]]), shot.visible)
-    assert len(whole) == 1
-
-
 def drawn(shot, points):
     """Whether points, each by itself, leave something in the picture."""
     blank = np.ones((*SIZE[::-1], 3), np.float32)
