@@ -1,10 +1,9 @@
 """Adaptive clusters: the scheduler offers none to stop that a partition needs."""
 
 from distributed import Event
+from tests.poolpart.helpers import wait_for
 
 from poolpart import Pool, n_workers, per_host, rest
-
-LONG_S = 120.0
 
 
 def to_close(client):
@@ -14,10 +13,6 @@ def to_close(client):
         return dask_scheduler.handlers["workers_to_close"]()
 
     return client.run_on_scheduler(ask)
-
-
-def wait_for(event):
-    return Event(event).wait(LONG_S)
 
 
 def test_a_partition_keeps_its_minimum(start):

@@ -7,15 +7,10 @@ import sys
 import time
 
 import pytest
-from distributed import Client, get_worker
+from distributed import Client
+from tests.poolpart.helpers import LONG_S, here
 
 from poolpart import Pool, n_workers, named, rest, worker_identities
-
-LONG_S = 120.0
-
-
-def here():
-    return str(get_worker().name)
 
 
 class CommandLine:

@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 
 from poolpart import Pool, assign_devices, devices, own_device, probe
 
-LONG_S = 120.0
 QUIET = 50
 
 # What a worker sees is in an environment variable: a letter for each device.

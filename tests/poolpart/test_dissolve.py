@@ -1,12 +1,11 @@
 """Undoing partitions: what the scheduler and workers know is what they knew before."""
 
 import asyncio
-import os
-import signal
 import threading
 
 import pytest
-from distributed import Event, get_worker
+from distributed import Event
+from tests.poolpart.helpers import LONG_S, declared, here, join, kill, wait_for
 
 from poolpart import (
     Pool,
@@ -18,16 +17,6 @@ from poolpart import (
     steward,
     worker_identities,
 )
-
-LONG_S = 120.0
-
-
-def here():
-    return str(get_worker().name)
-
-
-def wait_for(event):
-    return Event(event).wait(LONG_S)
 
 
 def known(client):
@@ -51,6 +40,8 @@ def known(client):
         "streams": set(scheduler.stream_handlers),
         "callbacks": set(scheduler.periodic_callbacks),
         "overridden": {name for name in vars(scheduler) if hasattr(type(scheduler), name)},
+        "overridden of extensions": [sorted(vars(e)) for e in scheduler.extensions.values()],
+        "idle": type(scheduler.idle_task_count),
         "unrunnable": set(scheduler.unrunnable),
         "tasks": {
             key: (task.state, task.resource_restrictions, task.worker_restrictions)
@@ -68,11 +59,6 @@ def _on_worker(dask_worker):
         {name: slots for name, slots in state.available_resources.items() if slots},
         sorted(dask_worker.plugins),
     )
-
-
-def declared(client):
-    workers = worker_identities(client).values()
-    return {str(worker["name"]): worker["resources"] for worker in workers}
 
 
 def test_everything_is_as_before(start, wait_until):
@@ -98,8 +84,7 @@ def test_a_worker_that_comes_back_after_all_is_as_it_was(nannies, wait_until):
     """There is no partition any more by then."""
     before = known(nannies)
     Pool.from_client(nannies).divide({"A": per_host(1), "B": rest()})
-    address, pid = nannies.run(os.getpid).popitem()
-    os.kill(pid, signal.SIGKILL)
+    address = kill(nannies, "0")
     wait_until(lambda: address not in worker_identities(nannies))
     assert Pool(nannies, []).dissolve(timeout_s=LONG_S) == ["A", "B"]
     nannies.wait_for_workers(2, timeout=LONG_S)
@@ -119,8 +104,7 @@ def test_a_worker_that_is_just_being_told_to_belong(start, wait_until, monkeypat
         return answer
 
     monkeypatch.setattr(steward, "call", call_and_linger)
-    client.cluster.worker_spec["b"] = client.cluster.worker_spec["a"]
-    client.sync(client.cluster._correct_state)
+    join(client, "b")
     assert told.wait(LONG_S)
     Pool(client, []).dissolve()
     assert not any(dict(declares) for _, declares, *_ in client.run(_on_worker).values())

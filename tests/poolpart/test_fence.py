@@ -9,21 +9,10 @@ import dask
 import dask.array
 import pytest
 from distributed import get_worker, wait, worker_client
+from tests.poolpart.helpers import LONG_S
 
-from poolpart import Partition, Pool
-from poolpart.fence import (
-    NAME,
-    enclose,
-    lower,
-)
+from poolpart import Pool, named
 
-LONG_S = 120.0
-CLUSTER = {
-    "A-0": {"resources": {"A": 1}},
-    "A-1": {"resources": {"A": 1}},
-    "B-0": {"resources": {"B": 1}},
-    "plain": {},
-}
 OUTSIDE = {"B-0", "plain"}
 
 
@@ -47,23 +36,19 @@ class Counting:
 def client(start, monkeypatch):
     # How long workers may take to answer, and after which time tasks that wait are told of again.
     monkeypatch.setattr("poolpart.fence.COMPLAIN_EVERY_S", 3600.0)
-    client = start(CLUSTER)
+    client = start({key: {} for key in ("A-0", "A-1", "B-0", "plain")})
     client.cluster.scheduler.validate = True  # Dask checks itself after each step
     return client
 
 
-def raise_fence(client, name):
-    async def on_scheduler(dask_scheduler):
-        enclose(dask_scheduler, name)
+def enclose(client, **partitions):
+    """Make exclusive partitions of workers by name."""
+    rules = {n: named(*workers, exclusive=True) for n, workers in partitions.items()}
+    return Pool.from_client(client).divide(rules)
 
-    client.run_on_scheduler(on_scheduler)
 
-
-def lower_fence(client, name):
-    async def on_scheduler(dask_scheduler):
-        lower(dask_scheduler, name)
-
-    client.run_on_scheduler(on_scheduler)
+A = {"A": ("A-0", "A-1")}
+B = {"B": ("B-0",)}
 
 
 def scheduler_of(client):
@@ -106,8 +91,7 @@ def mapped_on_a_scheduler_without_a_queue(client):
 
 
 def from_inside_others(client):
-    by_resource = client.submit(inside, 20, resources={"B": 1}, pure=False)
-    return [*by_resource.result(LONG_S), *client.submit(inside, 20, pure=False).result(LONG_S)]
+    return client.submit(inside, 40, pure=False).result(LONG_S)
 
 
 def delayed(client):
@@ -140,9 +124,10 @@ def actors(client):
 
 def array(client):
     blocks = dask.array.ones((40, 40), chunks=(4, 4)).map_blocks(
-        lambda block: block * 0 + ord(here()[0]), dtype=float, meta=dask.array.ones((0, 0))._meta
+        lambda block: block * 0 + len(here()), dtype=float, meta=dask.array.ones((0, 0))._meta
     )
-    return [chr(int(code)) for code in set(blocks.compute().ravel())]
+    names = {len(name): name for name in ("B-0", "plain")}
+    return [names[int(length)] for length in set(blocks.compute().ravel())]
 
 
 def shuffled(client):
@@ -163,37 +148,31 @@ def shuffled(client):
         dependent,
         preferring_the_partition,
         actors,
+        array,
+        shuffled,
     ],
 )
 def test_other_tasks_stay_out(client, way):
-    raise_fence(client, "A")
+    enclose(client, **A)
     assert set(way(client)) == OUTSIDE
-
-
-def test_arrays_stay_out(client):
-    raise_fence(client, "A")
-    assert set(array(client)) == {"B", "p"}
-    assert set(shuffled(client)) == OUTSIDE
 
 
 def test_without_a_fence_they_come_in(client):
     """Else the tests above would say nothing."""
-    for way in (submitted, mapped, delayed, dependent, preferring_the_partition, shuffled):
+    for way in (submitted, mapped, delayed, preferring_the_partition, shuffled):
         assert not set(way(client)) <= OUTSIDE, way.__name__
 
 
 def test_tasks_of_the_partition_pass(client):
-    raise_fence(client, "A")
-    raise_fence(client, "B")
-    assert set(Partition("A", client).map(here, range(20))) == {"A-0", "A-1"}
-    assert set(Partition("B", client).map(here, range(5))) == {"B-0"}
+    parts = enclose(client, **A, **B)
+    assert set(parts["A"].map(here, range(20))) == {"A-0", "A-1"}
+    assert set(parts["B"].map(here, range(5))) == {"B-0"}
     assert set(submitted(client)) == {"plain"}
     assert len(client.run(os.getpid)) == 4  # not a task
 
 
 def test_root_tasks_are_held_back_as_before(client, wait_until):
-    raise_fence(client, "A")
-    raise_fence(client, "B")
+    enclose(client, **A, **B)
     go.clear()
     futures = client.map(here_after_all, range(200), pure=False)
     scheduler = scheduler_of(client)
@@ -212,7 +191,7 @@ async def steal(dask_scheduler):
 
 
 def test_nothing_is_stolen_into_a_partition(client, wait_until):
-    raise_fence(client, "A")
+    enclose(client, **A)
     futures = pile_up(client, wait_until, 60)
     go.set()
     assert {client.run_on_scheduler(steal) for _ in range(20)} <= {"", *OUTSIDE}
@@ -226,10 +205,10 @@ def complaints(warned):
 
 
 def test_what_is_computed_again_stays_out(start):
-    client = start({"A-0": {"resources": {"A": 1}}, "one": {}, "two": {}})
+    client = start({"A-0": {}, "one": {}, "two": {}})
     first = client.submit(here, workers=["one"], allow_other_workers=True, pure=False)
     assert first.result() == "one"
-    raise_fence(client, "A")
+    enclose(client, A=["A-0"])
     scheduler = scheduler_of(client)
     address = state_of(client, "one").address
 
@@ -242,9 +221,7 @@ def test_what_is_computed_again_stays_out(start):
 
 
 def test_tasks_wait_where_all_workers_are_behind_fences_and_everybody_is_told(client, wait_until):
-    for name in ("A", "B", "C"):
-        raise_fence(client, name)
-    Pool.from_client(client).partition("C", workers=["plain"])
+    parts = enclose(client, **A, **B, C=["plain"])
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         one = client.submit(here, pure=False)
@@ -253,7 +230,7 @@ def test_tasks_wait_where_all_workers_are_behind_fences_and_everybody_is_told(cl
     [complaint] = complaints(caught)  # not one for each task
     assert "exclusive partitions (A, B, C)" in complaint
     assert not one.done()
-    lower_fence(client, "B")
+    parts["B"].dissolve()
     assert {one.result(LONG_S), *client.gather(many)} == {"B-0"}
 
 
@@ -291,31 +268,4 @@ def test_nothing_is_lost_while_workers_move_to_and_fro(start):
     settled = client.gather([client.submit(place, i, pure=False) for i in range(50)])
     assert settled == [[]] * 50
     pool.dissolve()
-    assert NAME not in client.cluster.scheduler.plugins
-
-
-def test_a_lowered_fence_leaves_nothing(client):
-    scheduler = scheduler_of(client)
-    stealing, shuffle = scheduler.extensions["stealing"], scheduler.extensions["shuffle"]
-    client.sync(stealing.stop)  # it counts, and remembers the workers of, what it steals
-
-    def look():
-        return (
-            [set(vars(owner)) for owner in (scheduler, stealing, shuffle)],
-            set(scheduler.plugins),
-            type(scheduler.idle_task_count),
-            {str(worker.name) for worker in scheduler.idle_task_count},
-            dict(stealing.in_flight_tasks),
-        )
-
-    before = look()
-    raise_fence(client, "A")
-    raise_fence(client, "B")
-    raise_fence(client, "A")
-    assert look() != before
-    lower_fence(client, "A")
-    assert set(submitted(client)) == {"A-0", "A-1", "plain"}
-    lower_fence(client, "B")
-    lower_fence(client, "B")
-    assert look() == before
-    assert set(mapped(client)) == {*CLUSTER}
+    assert "poolpart-fences" not in client.cluster.scheduler.plugins

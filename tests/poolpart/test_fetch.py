@@ -11,6 +11,7 @@ import numpy as np
 from distributed import Event, wait
 from distributed.comm import tcp
 from distributed.comm.addressing import parse_host_port
+from tests.poolpart.helpers import LONG_S, twice, wait_for
 
 from poolpart import (
     Partition,
@@ -20,16 +21,6 @@ from poolpart import (
     take_held,
     worker_identities,
 )
-
-LONG_S = 120.0
-
-
-def twice(x):
-    return 2 * x
-
-
-def wait_for(event):
-    return Event(event).wait(120)
 
 
 def test_only_what_is_finished_comes(client):

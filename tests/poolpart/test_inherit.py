@@ -4,31 +4,10 @@ from itertools import chain
 
 import dask
 import pytest
-from distributed import get_client, get_worker, secede, worker_client
+from distributed import get_client, secede, worker_client
+from tests.poolpart.helpers import LONG_S, here
 
-from poolpart import Partition, Pool
-from poolpart.inherit import begin_inheritance, end_inheritance
-
-LONG_S = 120.0
-CLUSTER = {"A-0": {"resources": {"A": 1}}, "B-0": {"resources": {"B": 1}}, "plain": {}}
-
-
-def inherit(client, name):
-    async def begin(dask_scheduler):
-        begin_inheritance(dask_scheduler, name)
-
-    client.run_on_scheduler(begin)
-
-
-def disinherit(client, name):
-    async def end(dask_scheduler):
-        end_inheritance(dask_scheduler, name)
-
-    client.run_on_scheduler(end)
-
-
-def here(*_):
-    return str(get_worker().name)
+from poolpart import Partition, Pool, named
 
 
 def descend(depth, way):
@@ -52,25 +31,26 @@ def descend(depth, way):
 
 @pytest.fixture
 def client(start):
-    client = start(CLUSTER)
+    """Client of a cluster with partitions A and B of a worker each, and a plain worker."""
+    client = start({key: {} for key in ("A-0", "B-0", "plain")})
     client.cluster.scheduler.validate = True
+    Pool.from_client(client).divide({"A": named("A-0"), "B": named("B-0")})
     return client
 
 
 @pytest.mark.parametrize("way", ["get_client", "worker_client", "compute"])
 def test_at_any_depth_and_without_waiting_for_a_slot(client, way):
-    inherit(client, "A")
     names = Partition("A", client).submit(descend, 3, way).result(LONG_S)
     assert names == ["A-0"] * 15
-    # What submits nothing itself, or belongs to no partition, is where Dask wants it.
+    by_resource = client.submit(descend, 3, way, resources={"B": 1}, pure=False)
+    assert set(by_resource.result(LONG_S)) == {"B-0"}
+    # What belongs to no partition is where Dask wants it, and so is everything in the end.
     assert len(set(client.submit(descend, 4, way, pure=False).result(LONG_S))) > 1
-
-
-def test_those_of_another_partition_and_of_resources_alone(client):
-    inherit(client, "A")
-    inherit(client, "B")
-    task = client.submit(descend, 3, "worker_client", resources={"B": 1}, pure=False)
-    assert set(task.result(LONG_S)) == {"B-0"}
+    Partition("A", client).dissolve()
+    by_resource = client.submit(descend, 3, way, resources={"B": 1}, pure=False)
+    assert set(by_resource.result(LONG_S)) == {"B-0"}
+    Pool.from_client(client).dissolve()
+    assert "_create_taskstate_from_graph" not in vars(client.cluster.scheduler)
 
 
 def say_otherwise():
@@ -92,7 +72,6 @@ def say_otherwise():
 
 
 def test_unless_they_say_otherwise(client):
-    inherit(client, "A")
     anywhere, named, mixed = Partition("A", client).submit(say_otherwise).result(LONG_S)
     assert anywhere > {"A-0"}
     assert named == ["B-0", "B-0", "plain", "A-0"]
@@ -109,26 +88,3 @@ def test_a_worker_that_left_the_partition_gets_none(start, wait_until):
     wait_until(lambda: client.cluster.scheduler.unrunnable)
     part.grow()
     assert nested.result(LONG_S) == "a"
-
-
-def test_pools_do_it_and_dissolving_undoes_it(start):
-    client = start({"one": {}, "two": {}, "three": {}})
-    before = set(vars(client.cluster.scheduler)), set(client.cluster.scheduler.plugins)
-    pool = Pool.from_client(client)
-    part, _ = pool.partition("P", workers=["two"])
-    assert set(part.submit(descend, 3, "worker_client").result(LONG_S)) == {"two"}
-    pool.dissolve()
-    assert (set(vars(client.cluster.scheduler)), set(client.cluster.scheduler.plugins)) == before
-    assert len(set(client.submit(descend, 4, "worker_client", pure=False).result(LONG_S))) > 1
-
-
-def test_disinherit(client):
-    inherit(client, "A")
-    inherit(client, "B")
-    disinherit(client, "A")
-    disinherit(client, "A")
-    names = Partition("A", client).submit(descend, 4, "worker_client").result(LONG_S)
-    assert len(set(names)) > 1
-    assert set(Partition("B", client).submit(descend, 2, "get_client").result(LONG_S)) == {"B-0"}
-    disinherit(client, "B")
-    assert "_create_taskstate_from_graph" not in vars(client.cluster.scheduler)

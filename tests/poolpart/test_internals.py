@@ -9,13 +9,12 @@ import textwrap
 from pathlib import Path
 
 import pytest
-from distributed import Client, get_worker, scheduler, worker_client
+from distributed import Client, scheduler, worker_client
+from tests.poolpart.helpers import LONG_S, here
 
 import poolpart
 from poolpart import Partition, Pool, PoolError, n_workers, rest
-from poolpart.internals import Rules
 
-LONG_S = 120.0
 PACKAGE = Path(poolpart.__file__).parent
 
 # Names that belong to the inside of Dask, or that its documentation does not mention.
@@ -24,10 +23,6 @@ INSIDE = (
     r"idle_task_count|valid_workers\b|future_refcount|stream_comms|http_application|"
     "transitions|stimulus|bulk_schedule|check_idle|run_spec|gather_from_workers|to_serialize"
 )
-
-
-def here(*_):
-    return str(get_worker().name)
 
 
 def nested():
@@ -50,61 +45,6 @@ def test_the_tests_that_the_documentation_names_are_there():
     for file, name in set(re.findall(r"(test_\w+\.py)::(test_\w+)", page)):
         sources = [path.read_text(encoding="utf-8") for path in root.glob(f"tests/*/{file}")]
         assert any(f"def {name}(" in source for source in sources), (file, name)
-
-
-class Owner:
-    def __init__(self):
-        self.calls = 0
-
-    def value(self, more):
-        self.calls += 1
-        if more is None:
-            raise LookupError("of the method itself")
-        return [more]
-
-    def by_keyword(self, *, one, other):
-        return one, other
-
-
-def test_rules_of_two_for_one_method():
-    owner, first, second = Owner(), Rules(), Rules()
-    first.after(owner, "value", lambda result, more: [*result, "first", more], "more")
-    second.after(owner, "value", lambda result, more: [*result, "second"], "more")
-    second.before(owner, "by_keyword", lambda given: {**given, "one": 7}, "one")
-    assert owner.value(0) == [0, "first", 0, "second"]
-    assert owner.by_keyword(one=1, other=2) == (7, 2)
-    first.take_back()
-    assert owner.value(0) == [0, "second"]
-    second.take_back()
-    assert owner.value(0) == [0]
-    assert vars(owner) == {"calls": 4 - 1}
-
-
-def test_a_rule_that_raises_steps_aside_and_is_told_of_once(caplog):
-    owner, rules = Owner(), Rules()
-    rules.after(owner, "value", lambda result, more: 1 / 0, "more")
-    rules.before(owner, "by_keyword", lambda given: given["lacking"], "other")
-    assert [owner.value(1), owner.value(2)] == [[1], [2]]
-    assert owner.by_keyword(one=1, other=2) == (1, 2)
-    said = [record.getMessage() for record in caplog.records]
-    assert [text.split(" failed")[0] for text in said] == [
-        "A rule of poolpart for value",
-        "A rule of poolpart for by_keyword",
-    ]
-    with pytest.raises(LookupError, match="of the method itself"):  # once, and as it is
-        owner.value(None)
-    assert (owner.calls, len(caplog.records)) == (3, 2)
-
-
-@pytest.mark.parametrize(
-    ("name", "parameters"), [("value", ("less",)), ("value", ("more", "and")), ("lacking", ())]
-)
-def test_another_signature_is_refused_and_nothing_is_left(name, parameters):
-    owner, rules = Owner(), Rules()
-    rules.before(owner, "by_keyword", lambda given: given, "one", "other")
-    with pytest.raises(PoolError, match=rf"Owner of distributed [0-9.]+.* has no {name}\("):
-        rules.after(owner, name, lambda result: result, *parameters)
-    assert vars(owner) == {"calls": 0}
 
 
 # -- another Dask ----------------------------------------------------------------------

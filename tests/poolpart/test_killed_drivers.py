@@ -6,10 +6,10 @@ import time
 
 import pytest
 from distributed import Client, Scheduler, SpecCluster, Worker
+from tests.poolpart.helpers import LONG_S, declared_by_themselves
 
 from poolpart import Partition, Pool, n_workers, rest, steward
 
-LONG_S = 120.0
 QUIET = 50
 
 # Says that it is ready, does one thing when it is told to, and stays.
@@ -74,12 +74,8 @@ def known(client):
         "by resource": {name: set(has) for name, has in scheduler.resources.items() if has},
         "plugins": set(scheduler.plugins),
         "overridden": {name for name in vars(scheduler) if hasattr(type(scheduler), name)},
-        "themselves": client.run(_told),
+        "themselves": declared_by_themselves(client),
     }
-
-
-def _told(dask_worker):
-    return {name: slots for name, slots in dask_worker.state.total_resources.items() if slots}
 
 
 def sizes(client):

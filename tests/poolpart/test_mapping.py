@@ -14,12 +14,9 @@ from typing import ClassVar
 import pytest
 from distributed import CancelledError, Client, Event, get_worker
 from distributed.comm import tcp
+from tests.poolpart.helpers import twice, wait_for
 
 from poolpart import Partition, Pool
-
-
-def twice(x):
-    return 2 * x
 
 
 def add(x, y):
@@ -48,10 +45,6 @@ def stop_at_3(x):
     if x == 3:
         raise StopIteration
     return x
-
-
-def wait_for(event):
-    return Event(event).wait(120)
 
 
 def pid_slowly(_):

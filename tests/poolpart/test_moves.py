@@ -7,7 +7,8 @@ import threading
 import time
 
 import pytest
-from distributed import Event, get_worker, secede
+from distributed import Event, secede
+from tests.poolpart.helpers import LONG_S, declared, declared_by_themselves, here, wait_for
 
 from poolpart import (
     Partition,
@@ -21,20 +22,10 @@ from poolpart import (
     worker_identities,
 )
 
-LONG_S = 120.0
-
-
-def here():
-    return str(get_worker().name)
-
 
 def brief(_=None):
     time.sleep(0.01)
     return here()
-
-
-def wait_for(event):
-    return Event(event).wait(LONG_S)
 
 
 begun = queue.SimpleQueue()  # the workers are threads of this process
@@ -48,22 +39,6 @@ def begin_and_wait_for(event):
 def hold_on(event):
     secede()
     return Event(event).wait(LONG_S)
-
-
-def declared(client):
-    """Resources by worker, as the scheduler knows them."""
-    workers = worker_identities(client).values()
-    return {str(worker["name"]): worker["resources"] for worker in workers}
-
-
-def declared_by_themselves(client):
-    answers = client.run(_told)
-    names = {w["name"]: a for a, w in worker_identities(client).items()}
-    return {str(name): answers[address] for name, address in names.items()}
-
-
-def _told(dask_worker):
-    return {name: slots for name, slots in dask_worker.state.total_resources.items() if slots}
 
 
 def used(client):

@@ -8,10 +8,10 @@ from html import escape
 
 import pytest
 from distributed import Client, Scheduler, SpecCluster, Worker, get_worker
+from tests.poolpart.helpers import LONG_S
 
 from poolpart import Partition, Pipe, Pool, PoolError
 
-LONG_S = 120.0
 NASTY = "<script>alert('x')</script>&\"'"
 
 

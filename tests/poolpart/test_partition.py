@@ -9,25 +9,14 @@ import dask.array as da
 import dask.bag
 import numpy as np
 import pytest
-from distributed import Client, Event, Variable, get_worker, secede
+from distributed import Client, Event, Variable, secede
+from tests.poolpart.helpers import here, twice, wait_for
 
 from poolpart import Partition, Pool, PoolError, own_client
 
 
-def here(_=None):
-    return str(get_worker().name)
-
-
-def twice(x):
-    return 2 * x
-
-
 def options(key=None, priority=None, workers=None):
     return key, priority, workers
-
-
-def wait_for(event):
-    return Event(event).wait(120)
 
 
 def stamp():

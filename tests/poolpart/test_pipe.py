@@ -11,6 +11,7 @@ import pytest
 from distributed import Client
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.poolpart.helpers import LONG_S
 
 from poolpart import (
     Partition,
@@ -20,8 +21,6 @@ from poolpart import (
     take_news,
 )
 from poolpart import pipe as pipe_module
-
-LONG_S = 120.0  # for what happens at once, or the test fails
 
 
 def again(pipe):

@@ -10,10 +10,9 @@ import uuid
 
 import pytest
 from distributed import Queue
+from tests.poolpart.helpers import LONG_S
 
 from poolpart import Partition, Pipe, PipeFailed
-
-LONG_S = 120.0
 
 
 def consume(pipe):

@@ -3,21 +3,12 @@
 import logging
 
 import pytest
-from distributed import Client, LocalCluster, get_worker
+from distributed import Client, LocalCluster
+from tests.poolpart.helpers import declared, here, join
 
-from poolpart import Partition, Pool, PoolError, probe, worker_identities
+from poolpart import Partition, Pool, PoolError, probe
 
 PLAIN = {name: {} for name in ("a", "b", "c")}
-
-
-def here():
-    return str(get_worker().name)
-
-
-def declared(client):
-    """Resources by worker, as the scheduler knows them."""
-    workers = worker_identities(client).values()
-    return {str(worker["name"]): worker["resources"] for worker in workers}
 
 
 def test_what_a_pool_knows(start):
@@ -134,9 +125,7 @@ def test_tasks_that_wait_for_a_partition_run_once_it_is_made(start, wait_until):
 def test_workers_that_join_later_with_the_resource_belong(start, wait_until):
     client = start({"a": {"resources": {"P": 1}}, "b": {}})
     part = Pool.from_client(client).partitions()["P"]
-    options = client.cluster.worker_spec["a"]
-    client.cluster.worker_spec["late"] = options
-    client.sync(client.cluster._correct_state)
+    join(client, "late")
     wait_until(lambda: len(part) == 2)
     assert [worker.name for worker in part.workers] == ["a", "late"]
 

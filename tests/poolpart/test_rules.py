@@ -3,9 +3,10 @@
 from collections import Counter
 
 import pytest
-from distributed import Client, get_worker
+from distributed import Client
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.poolpart.helpers import declared, here, join, leave
 
 from poolpart import (
     Partition,
@@ -19,7 +20,6 @@ from poolpart import (
     probe,
     rest,
     steward,
-    worker_identities,
 )
 from poolpart.rules import check_rules, divide, partition_for
 
@@ -30,10 +30,6 @@ def worker(name, *gpus, host="h", **resources):
 
 def names(rules, pool):
     return {name: [w.name for w in group] for name, group in divide(rules, pool)[0].items()}
-
-
-def here():
-    return str(get_worker().name)
 
 
 # -- whom they choose ------------------------------------------------------------------
@@ -177,23 +173,6 @@ def test_whoever_joins_finds_a_place_and_no_rule_gets_more_than_it_wants(gpus, o
 
 
 # -- on a cluster ----------------------------------------------------------------------
-
-
-def declared(client):
-    workers = worker_identities(client).values()
-    return {str(worker["name"]): worker["resources"] for worker in workers}
-
-
-def join(client, name, **options):
-    """Start one more worker."""
-    spec = next(iter(client.cluster.worker_spec.values()))
-    client.cluster.worker_spec[name] = {**spec, "options": {**spec["options"], **options}}
-    client.sync(client.cluster._correct_state)
-
-
-def leave(client, name):
-    del client.cluster.worker_spec[name]
-    client.sync(client.cluster._correct_state)
 
 
 def test_workers_that_join_later(start, wait_until):

@@ -4,12 +4,12 @@ import dask
 import numpy as np
 import pytest
 from distributed import get_worker, worker_client
+from tests.poolpart.helpers import LONG_S
 
 from poolpart import Partition, Pool, n_workers, rest
 
 da = pytest.importorskip("dask.array")
 
-LONG_S = 120.0
 CLUSTER = {name: {"nthreads": 2} for name in "abcd"}
 
 

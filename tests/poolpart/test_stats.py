@@ -4,6 +4,7 @@ import threading
 
 import pytest
 from distributed import Client, get_worker, worker_client
+from tests.poolpart.helpers import LONG_S
 
 from poolpart import Partition
 from poolpart.stats import (
@@ -11,7 +12,6 @@ from poolpart.stats import (
     partition_stats,
 )
 
-LONG_S = 120.0
 CLUSTER = {"A-0": {"resources": {"A": 2}, "nthreads": 2}, "B-0": {"resources": {"B": 1}}}
 
 go = threading.Event()  # the workers are threads of this process

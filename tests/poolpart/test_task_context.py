@@ -4,29 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import threading
-import time
-from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from distributed import Status
 from distributed.diagnostics.plugin import SchedulerPlugin
 
 from poolpart import WorkerLeft, own_client, telling_departure, worker_identities
-
-
-def test_one_asks_at_a_time(monkeypatch):
-    inside, together = threading.Semaphore(1), []
-
-    def slow() -> str:
-        together.append(not inside.acquire(blocking=False))
-        time.sleep(0.01)
-        inside.release()
-        return "client"
-
-    monkeypatch.setattr("poolpart.task_context.get_client", slow)
-    with ThreadPoolExecutor(4) as threads:
-        assert [*threads.map(lambda _: own_client(), range(8))] == ["client"] * 8
-    assert together == [False] * 8
 
 
 def test_a_coroutine_does_not_wait_for_a_thread_that_needs_its_loop(monkeypatch):

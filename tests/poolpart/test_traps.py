@@ -6,19 +6,13 @@ fails in its first half, Dask has got better, and something here may be left out
 
 from __future__ import annotations
 
-import asyncio
-import os
-import signal
 import time
-import types
 
-import distributed.queues
 import pytest
-from distributed import Event, Queue, wait
+from distributed import Event, wait
+from tests.poolpart.helpers import LONG_S, addresses, kill
 
-from poolpart import Partition, Pipe, Pool, fetch_available, own_client, worker_identities
-
-LONG_S = 120.0
+from poolpart import Partition, Pool, own_client
 
 
 def slowly(number: int) -> int:
@@ -31,19 +25,6 @@ def slowly_after(number: int, event: str) -> int:
     if number:
         Event(event, client=own_client()).wait(LONG_S)
     return slowly(number)
-
-
-def addresses(client) -> dict[str, str]:
-    """Addresses of the workers by name."""
-    workers = worker_identities(client).items()
-    return {str(worker["name"]): address for address, worker in workers}
-
-
-def kill(client, name: str) -> str:
-    """Kill a worker's process; returns the address that it had."""
-    address = addresses(client)[name]
-    os.kill(client.run(os.getpid, workers=[address])[address], signal.SIGKILL)
-    return address
 
 
 def kill_and_wait(client, name: str, wait_until) -> None:
@@ -110,48 +91,3 @@ def test_two_deaths_condemn_a_pile_of_innocent_tasks_and_not_a_window(
         taken += [next(results), next(results), next(results)]
         kill_and_wait(nannies, "1", wait_until)
     assert taken + list(results) == list(range(count))
-
-
-def test_a_future_put_at_once_keeps_the_scheduler_waiting_and_a_key_does_not(
-    client, make_pipe, monkeypatch
-):
-    naps: list[float] = []
-
-    async def sleep(seconds: float) -> None:
-        naps.append(seconds)
-        await asyncio.sleep(seconds)
-
-    watched = types.SimpleNamespace(**vars(asyncio) | {"sleep": sleep})
-    monkeypatch.setattr(distributed.queues, "asyncio", watched)
-    queue, pipe = Queue("at-once", client=client), make_pipe(client, capacity=100)
-    for number in range(20):
-        queue.put(client.submit(slowly, number, pure=False))
-    assert naps  # mostly 20: now and then a task is there before its future
-    naps.clear()
-    futures = [Partition("A", client).submit(pow, 2, number) for number in range(20)]
-    for future in futures:
-        pipe.put(future.key)
-    assert naps == []
-    wait(futures, timeout=LONG_S)
-    keys = pipe.poll()
-    assert sorted(fetch_available(client, keys, LONG_S).values()) == [2**n for n in range(20)]
-    for future in queue.get(batch=True):
-        future.cancel()
-    queue.close()
-
-
-def test_a_restart_leaves_lost_futures_in_a_queue_and_keys_that_say_so_in_a_pipe(nannies):
-    queue = Queue("restarted", client=nannies)
-    with Pipe("restarted-pipe", 4, nannies).create() as pipe:
-        future = nannies.submit(slowly, 1)
-        wait([future], timeout=LONG_S)
-        queue.put(future)
-        pipe.put(future.key)
-        nannies.restart()
-        lost = queue.get(timeout=LONG_S)
-        assert lost.status == "lost"
-        with pytest.raises(TimeoutError):
-            lost.result(timeout=0.5)  # and without a time-out never
-        key = pipe.get(timeout_s=LONG_S)
-        assert fetch_available(nannies, [key], patience_s=1.0) == {}
-    queue.close()

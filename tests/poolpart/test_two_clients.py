@@ -2,19 +2,12 @@
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 
 import pytest
 from distributed import Client
+from tests.poolpart.helpers import LONG_S, declared
 
-from poolpart import Partition, Pool, PoolError, n_workers, pool, rest
-
-LONG_S = 120.0
-
-
-def declared(client):
-    workers = client.cluster.scheduler.workers.values()
-    return {str(worker.name): dict(worker.resources) for worker in workers}
+from poolpart import Partition, Pool, PoolError, pool
 
 
 @pytest.fixture
@@ -74,15 +67,6 @@ def test_one_name(two, both, others):
     # The same call again takes what there is, as by one client.
     again, _ = Pool.from_client(two[1]).partition("P", workers=sorted(members))
     assert {worker.name for worker in again.workers} == members
-
-
-def test_the_same_rules(two, both):
-    rules = {"A": n_workers(2, exclusive=True), "B": rest()}
-    pools = [Pool.from_client(client) for client in two]
-    outcomes = both(*(partial(pool.divide, rules) for pool in pools))
-    assert "meanwhile" in told(outcomes)
-    assert sorted(str(d) for d in declared(two[0]).values()) == ["{'A': 1}"] * 2 + ["{'B': 1}"] * 2
-    assert Pool.from_client(two[1]).dissolve() == ["A", "B"]
 
 
 def test_the_same_workers_under_different_names(two, both):
