@@ -15,10 +15,6 @@ from tests.poolpart.helpers import here, twice, wait_for
 from poolpart import Partition, Pool, PoolError, own_client
 
 
-def options(key=None, priority=None, workers=None):
-    return key, priority, workers
-
-
 def stamp():
     return time.monotonic()
 
@@ -44,11 +40,6 @@ def test_members_are_what_the_workers_declare(a, b):
     assert (len(a), a.slots, len(b), b.slots) == (2, 4, 1, 1)
 
 
-def test_repr(a, client):
-    assert repr(a) == "<Partition 'A'>"
-    assert repr(Partition("B", client, note="no GPU")) == "<Partition 'B'; no GPU>"
-
-
 def test_equal_calls_run_each_by_itself(a):
     futures = [a.submit(uuid.uuid4) for _ in range(20)]
     assert len({future.result() for future in futures}) == 20
@@ -56,12 +47,6 @@ def test_equal_calls_run_each_by_itself(a):
 
 def test_futures_are_arguments_across_partitions(a, b):
     assert b.submit(twice, a.submit(twice, 5)).result() == 20
-
-
-def test_arguments_named_like_options_can_be_bound(a):
-    task = a.submit(partial(options, workers=3, key=1, priority=2), key="bound")
-    assert (task.key, task.result()) == ("bound", (1, 2, 3))
-    assert a.submit(options, 1, 2, 3).result() == (1, 2, 3)
 
 
 def test_higher_priority_runs_first(b, client, wait_until):

@@ -6,11 +6,7 @@ import pytest
 from distributed import Client, get_worker, worker_client
 from tests.poolpart.helpers import LONG_S
 
-from poolpart import Partition
-from poolpart.stats import (
-    StageStats,
-    partition_stats,
-)
+from poolpart import Partition, StageStats
 
 CLUSTER = {"A-0": {"resources": {"A": 2}, "nthreads": 2}, "B-0": {"resources": {"B": 1}}}
 
@@ -61,15 +57,10 @@ def test_tasks_that_wait_run_and_end(client, wait_until):
     assert stats.stages["held"].done == 5
     assert 0 < stats.stages["held"].seconds <= stats.seconds
 
-
-def test_failures(client, wait_until):
-    part = Partition("A", client)
-    Partition("A", client).stats()  # counts from here on
-    tasks = [part.submit(broken, i) for i in range(3)]
-    dependent = part.submit(after, tasks[0])
-    wait_until(lambda: dependent.status == "error" and all(t.done() for t in tasks))
-    stats = part.stats()
-    assert (stats.failed, stats.done) == (3, 0)  # the dependent one never ran
+    failing = [part.submit(broken, i) for i in range(3)]
+    dependent = part.submit(after, failing[0])
+    wait_until(lambda: dependent.status == "error" and all(task.done() for task in failing))
+    assert (part.stats().failed, part.stats().done) == (3, 6)  # the dependent one never ran
 
 
 def test_partitions_are_counted_apart_and_from_any_client(client):
@@ -78,9 +69,9 @@ def test_partitions_are_counted_apart_and_from_any_client(client):
     kept = client.gather([a.submit(after), b.submit(after), client.submit(after, 1)])
     with Client(client.scheduler.address, set_as_default=False) as other:
         assert Partition("A", other).stats().done == 1
-        assert partition_stats(other, "B").stages["after"].done == 1
-        assert partition_stats(other, "").done == 1  # asks for no resource
-        assert partition_stats(other, "nobody's").workers == 0
+        assert Partition("B", other).stats().stages["after"].done == 1
+        assert Partition("", other).stats().done == 1  # asks for no resource
+        assert Partition("nobody's", other).stats().workers == 0
     assert kept[0] == "A-0"
 
 
