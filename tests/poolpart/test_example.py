@@ -69,13 +69,6 @@ def test_a_writer_goes_on_where_one_has_died(start, tmp_path):
     assert path.read_bytes() == thumbnails(9)
 
 
-def test_an_error_of_the_writer_reaches_the_driver(start, tmp_path):
-    client = start({name: {} for name in "abc"})
-    with pytest.raises(FileNotFoundError):
-        runpy.run_path(str(EXAMPLE))["run"](client, tmp_path / "none" / "out.bin", 3)
-    assert not client.cluster.scheduler.extensions["queues"].queues
-
-
 def test_an_error_of_a_picture_reaches_the_driver(start, tmp_path):
     client = start({name: {} for name in "abc"})
     example = runpy.run_path(str(EXAMPLE))

@@ -2,11 +2,10 @@
 
 import subprocess
 import sys
-import time
 
 import pytest
 from distributed import Client, Scheduler, SpecCluster, Worker
-from tests.poolpart.helpers import LONG_S, declared_by_themselves
+from tests.poolpart.helpers import LONG_S, declared, declared_by_themselves
 
 from poolpart import Partition, Pool, n_workers, rest, steward
 
@@ -66,16 +65,10 @@ def tell(process):
 
 
 def known(client):
-    """All that the scheduler and the workers know of partitions."""
+    """What the scheduler and the workers know of partitions."""
     scheduler = client.cluster.scheduler
-    return {
-        "workers": {w.name: dict(w.resources) for w in scheduler.workers.values()},
-        # Not those that nobody has: a task that a driver sent in the end names them again.
-        "by resource": {name: set(has) for name, has in scheduler.resources.items() if has},
-        "plugins": set(scheduler.plugins),
-        "overridden": {name for name in vars(scheduler) if hasattr(type(scheduler), name)},
-        "themselves": declared_by_themselves(client),
-    }
+    overridden = {name for name in vars(scheduler) if hasattr(type(scheduler), name)}
+    return declared(client), declared_by_themselves(client), set(scheduler.plugins), overridden
 
 
 def sizes(client):
@@ -102,14 +95,6 @@ def kill_when_told(process, monkeypatch):
 def await_that_it_is_gone(client, wait_until):
     clients = client.cluster.scheduler.clients
     wait_until(lambda: [name for name in clients if name.startswith("Client-")] == [client.id])
-
-
-def await_state(client, expected):
-    """Wait until the scheduler and the workers know what they should, or tell what else."""
-    deadline = time.monotonic() + LONG_S
-    while (found := known(client)) != expected and time.monotonic() < deadline:
-        time.sleep(0.01)
-    assert found == expected
 
 
 @pytest.mark.parametrize(
@@ -141,4 +126,4 @@ def test_what_was_asked_is_done_whole(cluster, driver, wait_until, monkeypatch, 
         wait_until(lambda: not cluster.cluster.scheduler.tasks)
     pool.dissolve()
     # The scheduler may still be about to answer the driver, and keeps its book as long.
-    await_state(cluster, before)
+    wait_until(lambda: known(cluster) == before)

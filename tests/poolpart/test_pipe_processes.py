@@ -9,7 +9,6 @@ import time
 import uuid
 
 import pytest
-from distributed import Queue
 from tests.poolpart.helpers import LONG_S
 
 from poolpart import Partition, Pipe, PipeFailed
@@ -30,21 +29,12 @@ def greet_and_get(greetings, pipe):
     return pipe.get()
 
 
-def greet_and_get_from_queue(greetings, name):
-    """Do the same with a bare Queue."""
-    queue = Queue(name)
-    greetings.put(os.getpid())
-    return queue.get()
-
-
-def kill_a_waiting_consumer(client, function, greetings, what, waits=lambda: True):
+def kill_a_waiting_consumer(client, greetings, pipe):
     """Start a consumer on OTHER, kill its worker while it waits, and let nobody run it again."""
     other = Partition("OTHER", client)
-    consumer = other.submit(function, greetings, what, key=f"consumer-{uuid.uuid4().hex}")
+    consumer = other.submit(greet_and_get, greetings, pipe, key=f"consumer-{uuid.uuid4().hex}")
     pid = greetings.get(timeout_s=LONG_S)
     time.sleep(0.1)  # let it begin to wait
-    while not waits():
-        time.sleep(0.01)
     consumer.cancel()
     os.kill(pid, signal.SIGKILL)
     assert other.submit(os.getpid).result(LONG_S) != pid  # the nanny has started another
@@ -80,25 +70,11 @@ def test_large_items_and_nested_ones(processes, make_pipe):
 
 def test_a_consumer_that_is_killed_while_it_waits_swallows_nothing(processes, make_pipe):
     greetings, pipe = make_pipe(processes), make_pipe(processes, capacity=10)
-    kill_a_waiting_consumer(processes, greet_and_get, greetings, pipe)
+    kill_a_waiting_consumer(processes, greetings, pipe)
     for item in range(8):
         pipe.put(item)
     pipe.close()
     assert list(pipe) == list(range(8))
-
-
-def test_a_consumer_of_a_bare_queue_does(processes, make_pipe):
-    """The test above can fail: this is what it would see."""
-    greetings, queue = make_pipe(processes), Queue(f"bare-{uuid.uuid4().hex}", client=processes)
-
-    def waits():
-        queues = processes.cluster.scheduler.extensions["queues"].queues
-        return bool(queues[queue.name]._getters)
-
-    kill_a_waiting_consumer(processes, greet_and_get_from_queue, greetings, queue.name, waits)
-    for item in range(8):
-        queue.put(item)
-    assert len(queue.get(batch=True)) < 8
 
 
 def test_deleting_forgets_consumers_that_were_killed(processes, make_pipe, wait_until):
@@ -108,7 +84,7 @@ def test_deleting_forgets_consumers_that_were_killed(processes, make_pipe, wait_
         return {*queues.queues, *queues.client_refcount, *variables.variables}
 
     greetings, pipe = make_pipe(processes), make_pipe(processes)
-    kill_a_waiting_consumer(processes, greet_and_get, greetings, pipe)
+    kill_a_waiting_consumer(processes, greetings, pipe)
     assert {pipe.name, greetings.name} <= processes.run_on_scheduler(names)
     pipe.delete()
     greetings.delete()

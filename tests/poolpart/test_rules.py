@@ -1,7 +1,5 @@
 """Rules: whom they choose, now and when a worker joins, without a cluster and on one."""
 
-from collections import Counter
-
 import pytest
 from distributed import Client
 from hypothesis import given
@@ -82,25 +80,6 @@ def test_fewer_than_the_minimum():
 def test_rules_that_make_no_sense(rules, message):
     with pytest.raises(PoolError, match=message):
         check_rules(rules)
-
-
-HOSTS = st.lists(
-    st.tuples(st.integers(0, 3), st.integers(1, 6)), max_size=4, unique_by=lambda host: host[1]
-)
-
-
-@given(hosts=HOSTS, most=st.integers(1, 4))
-def test_plain_workers_take_up_each_gpu_so_often(hosts, most):
-    pool = [
-        worker(f"{h}-{i}", *(f"{h}:{g}" for g in range(gpus)), host=str(h))
-        for h, (gpus, count) in enumerate(hosts)
-        for i in range(count)
-    ]
-    if not any(w.gpus for w in pool):
-        return
-    chosen = Counter(w.host for w in per_gpu(most).choose(pool))
-    for h, (gpus, count) in enumerate(hosts):
-        assert chosen[str(h)] == min(count, most * gpus)
 
 
 # -- whom a worker that joins belongs to -----------------------------------------------

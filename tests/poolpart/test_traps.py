@@ -8,29 +8,14 @@ from __future__ import annotations
 
 import time
 
-import pytest
-from distributed import Event, wait
 from tests.poolpart.helpers import LONG_S, addresses, kill
 
-from poolpart import Partition, Pool, own_client
+from poolpart import Partition, Pool
 
 
 def slowly(number: int) -> int:
     time.sleep(0.1)
     return number
-
-
-def slowly_after(number: int, event: str) -> int:
-    """Do the same; only the first does not wait for an event."""
-    if number:
-        Event(event, client=own_client()).wait(LONG_S)
-    return slowly(number)
-
-
-def kill_and_wait(client, name: str, wait_until) -> None:
-    """Kill a worker's process, and wait until its nanny has started another."""
-    killed = kill(client, name)
-    wait_until(lambda: addresses(client).get(name, killed) != killed)
 
 
 def test_a_resource_that_is_set_wakes_no_task_and_a_partition_does(start, wait_until):
@@ -60,34 +45,8 @@ def test_a_task_for_a_worker_by_name_waits_for_its_old_address_and_one_for_a_par
     partition, _ = Pool.from_client(nannies).partition("P", workers=["1"])
     tied = nannies.submit(slowly, 1, workers=["1"], pure=False)
     members = [partition.submit(slowly, number) for number in range(3)]
-    kill_and_wait(nannies, "1", wait_until)
+    killed = kill(nannies, "1")
+    wait_until(lambda: addresses(nannies).get("1", killed) != killed)
     assert nannies.gather(members) == [0, 1, 2]
     # A task that had the time to end is gone with its worker, and is to be computed again.
     assert nannies.cluster.scheduler.tasks[tied.key].state == "no-worker"
-
-
-@pytest.mark.slow
-def test_two_deaths_condemn_a_pile_of_innocent_tasks_and_not_a_window(
-    nannies, wait_until, monkeypatch
-):
-    monkeypatch.setattr(nannies.cluster.scheduler, "allowed_failures", 1)
-    partition, _ = Pool.from_client(nannies).partition("P", workers=["1"])
-    count = 40
-    # What has ended is lost with the worker, but is not to blame: most are not to end before.
-    gate = Event("innocent", nannies)
-    pile = [partition.submit(slowly_after, number, gate.name) for number in range(count)]
-    for _ in range(2):
-        wait_until(lambda: any(future.done() for future in pile))
-        kill_and_wait(nannies, "1", wait_until)
-    gate.set()
-    wait(pile, timeout=LONG_S)
-    condemned = [future for future in pile if future.status == "error"]
-    assert len(condemned) > count // 2
-    assert {type(future.exception()).__name__ for future in condemned} == {"KilledWorker"}
-
-    results = partition.map(slowly, range(count), chunk=1, window=2)
-    taken = [next(results)]
-    for _ in range(2):
-        taken += [next(results), next(results), next(results)]
-        kill_and_wait(nannies, "1", wait_until)
-    assert taken + list(results) == list(range(count))
