@@ -24,3 +24,23 @@ UNITS_M = {
 
 WAIT_S = 10.0  # for partitions that are empty when a run begins
 PATIENCE_S = 60.0  # for those that become empty; a nanny needs a few seconds
+
+# Formats that a cloud is exported to: the file or folder of each in that of a result, and the
+# columns that it needs.
+FORMATS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "las": ("cloud.las", ()),
+    "laz": ("cloud.laz", ()),
+    "parquet": ("cloud.parquet", ()),
+    "pcd": ("pcd", ()),
+    "e57": ("cloud.e57", ()),
+    "kitti": ("kitti", ("intensity", "class")),
+    "nuscenes": ("nuscenes", ("intensity",)),
+    "mcap": ("cloud.mcap", ()),
+    "rosbag2": ("rosbag2", ()),
+}
+# Point layouts of mcap and rosbag2, and the columns that each needs.
+LAYOUTS: dict[str, tuple[str, ...]] = {
+    "velodyne": ("intensity", "time"),
+    "autoware": ("intensity", "time", "azimuth", "elevation", "range"),
+    "ouster": ("intensity", "time", "reflectivity", "range"),
+}

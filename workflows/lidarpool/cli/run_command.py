@@ -15,6 +15,7 @@ from distributed import Client
 
 from ..base.vocabulary import PATIENCE_S, WAIT_S
 from ..base.words import counted
+from ..export.formats import Format
 from ..report.output import result_folder, write_result
 from ..report.report import summary
 from ..run.checks import check_backend_here
@@ -105,6 +106,9 @@ def _simulate(
 
     As soon as the result is in its place, an error or interrupt that ends `whole` says so.
     """
+    formats = [Format(w.format, w.layout) for w in scenario.output.write if w.format != "ply"]
+    for one in formats:
+        one.check_installed()
     with result_folder(options.out):
         store = _store(job, options)
 
@@ -132,6 +136,7 @@ def _simulate(
                     scenario,
                     in_place,
                     only_cloud=only_cloud,
+                    formats=formats,
                 )
     return result, report
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..base.choice import one_of_each_part
 from ..base.errors import LidarpoolError
-from ..columns.cloud import Cloud
+from ..columns.cloud import CHUNK_POINTS, Cloud
 from ..columns.table import TABLE, Column
 from .ply_format import AXES, layout
 
@@ -53,6 +53,21 @@ class CloudFile:
 
     def __len__(self) -> int:
         return len(self._rows)
+
+    @property
+    def bounds(self) -> NDArray[np.floating]:
+        """Lowest and highest coordinates, (2, 3), metres; all points are read for it."""
+        each = [chunk.bounds for chunk in self.chunks()] or [np.zeros((2, 3))]
+        lows, highs = zip(*each, strict=True)
+        return np.stack([np.min(lows, axis=0), np.max(highs, axis=0)])
+
+    def chunks(self, points: int = CHUNK_POINTS) -> Iterator[Cloud]:
+        """Give the points in order, at most so many at a time."""
+        for first in range(0, len(self), points):
+            rows = self._rows[first : first + points]
+            positions = np.stack([rows[axis] for axis in AXES], axis=1)
+            columns = {column.name: rows[column.in_files] for column in self.table}
+            yield Cloud(positions, columns, self.table)
 
     def choose(self, most: int, scans: tuple[int, int] | None = None) -> tuple[Cloud, int]:
         """Choose at most so many points, evenly; of the first to the last of these scans.

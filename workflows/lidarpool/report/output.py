@@ -9,7 +9,7 @@ import os
 import secrets
 import shutil
 import tempfile
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,9 +17,11 @@ from typing import Any
 
 from ..base.errors import LidarpoolError
 from ..base.interrupts import deferred_interrupts
-from ..base.vocabulary import PICTURES
+from ..base.vocabulary import FORMATS, PICTURES
 from ..columns.storage import flush
+from ..export.formats import Format, remove
 from ..export.ply import save_cloud
+from ..export.sweeps import SWEEPS_FILE, Sweeps
 from ..plan import Planning
 from ..run.picture_file import PICTURE_FILE, Pictured
 from ..run.result import Result
@@ -34,7 +36,8 @@ ROOM_BYTES = 32 << 20  # what pictures and report may take
 CLOUD, PAGE, REPORT = "cloud.ply", "report.html", "report.json"
 OF_CLOUD = "cloud.png"  # the picture that is drawn from the cloud's file
 _IMAGES = tuple(f"{name}.png" for name in PICTURES)
-FILES = (CLOUD, *_IMAGES, PICTURE_FILE, PAGE, REPORT)
+FILES = (CLOUD, SWEEPS_FILE, *_IMAGES, PICTURE_FILE, PAGE, REPORT)
+EXPORTS = tuple(file for file, _ in FORMATS.values())
 _WRITING = ".writing-"  # folder of a result being made; one of a killed run goes at the next
 
 
@@ -84,6 +87,7 @@ def write_result(
     scenario: Scenario | None = None,
     then: Callable[[], object] = lambda: None,
     only_cloud: bool = False,
+    formats: Sequence[Format] = (),
 ) -> dict[str, Any]:
     """Write cloud, pictures and report, and return the report.
 
@@ -91,7 +95,7 @@ def write_result(
     and on the disk, so that an earlier result stays whole if one cannot be written. A picture
     that an earlier run made and this one does not is removed. `then` is called when all are in
     place, before an interrupt that came meanwhile is let through. `only_cloud` leaves pictures
-    and page out.
+    and page out; `formats` are written as well.
 
     Raises
     ------
@@ -114,11 +118,16 @@ def write_result(
         makers = {f"{name}.png": draw for name, draw in pictures.items()} | {
             PICTURE_FILE: shown.save
         }
-    files = [CLOUD, *makers, *([] if only_cloud else [PAGE]), REPORT]
+    exported = [one.file for one in formats]
+    files = [CLOUD, SWEEPS_FILE, *exported, *makers, *([] if only_cloud else [PAGE]), REPORT]
     try:
         staged.mkdir()
         drawn = [beside.submit(make, staged / n) for n, make in makers.items() if n != OF_CLOUD]
         save_cloud(staged / CLOUD, counted, precision_m=survey.precision_m)
+        sweeps = Sweeps.of(survey, scene)
+        sweeps.save(staged / SWEEPS_FILE)
+        for one in formats:
+            one.write(staged / one.file, result.points, sweeps)
         report = make_report(result, scene, survey, planning, files, counted)
         if not only_cloud:
             drawn.append(beside.submit(makers[OF_CLOUD], staged / OF_CLOUD))
@@ -154,11 +163,12 @@ def _publish(staged: Path, folder: Path, files: Collection[str]) -> None:
     for name in (REPORT, PAGE):
         (folder / name).unlink(missing_ok=True)
     flush(folder)
-    for name in FILES:
+    for name in (*EXPORTS, *FILES):
+        # A path of an earlier run would pass for this one's; and folders are not replaced.
+        if name not in files or name in EXPORTS:
+            remove(folder / name)
         if name in files:
             (staged / name).replace(folder / name)
-        else:  # a path of an earlier run would pass for this one's
-            (folder / name).unlink(missing_ok=True)
     flush(folder)
 
 

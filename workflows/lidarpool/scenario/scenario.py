@@ -30,6 +30,7 @@ from .sections import (
     MaterialSection,
     MeshFile,
     NoiseSection,
+    OutputSection,
     PlanningSection,
     PoolSection,
     PoseEntry,
@@ -63,7 +64,7 @@ class Scenario(Section):
 
     Parameters
     ----------
-    scene, sensor, materials, returns, noise, weather, cloud, planning, pool
+    scene, sensor, materials, returns, noise, weather, cloud, output, planning, pool
         See `lidarpool.scenario.sections`.
     poses
         Where the sensor scans from, in world coordinates. Where none are given it stands at
@@ -149,6 +150,7 @@ class Scenario(Section):
     noise: Annotated[NoiseSection, may_be_empty(NoiseSection)] = NoiseSection()
     weather: Annotated[WeatherSection, may_be_empty(WeatherSection)] = WeatherSection()
     cloud: Annotated[CloudSection, may_be_empty(CloudSection)] = CloudSection()
+    output: Annotated[OutputSection, may_be_empty(OutputSection)] = OutputSection()
     planning: Annotated[PlanningSection, may_be_empty(PlanningSection)] = PlanningSection()
     pool: Annotated[PoolSection, may_be_empty(PoolSection)] = PoolSection()
 
@@ -307,7 +309,7 @@ class Scenario(Section):
                 steps=self.steps,
                 keep_every=self.cloud.keep_every,
                 precision_m=self.cloud.precision_m,  # type: ignore[arg-type]  # the sensor's
-                columns=self.cloud.columns,
+                columns=(*self.cloud.columns, *self.output.needs),
                 materials=self._materials(),
                 returns=Returns(**self.returns.model_dump()),
                 noise=Noise(**self.noise.model_dump()),

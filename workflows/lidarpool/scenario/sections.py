@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, Strict, model_validator
 
-from ..base.vocabulary import BACKENDS
+from ..base.vocabulary import BACKENDS, FORMATS, LAYOUTS
 from ..columns.table import COORDINATES, OPTIONAL
 from ..scene.transform import Transform
 from ..sensor import Sensor
@@ -297,6 +297,50 @@ class CloudSection(Section):
             examples=[["time", "range", "intensity"]],
         ),
     ] = ()
+
+
+class ExportSection(Section):
+    """A format that the cloud is exported to; in YAML its name alone will do."""
+
+    format: Annotated[
+        Literal["ply", *FORMATS],  # type: ignore[valid-type]
+        Field(description="; ".join(f"{name}: {file}" for name, (file, _) in FORMATS.items())),
+    ]
+    layout: Annotated[
+        Literal[tuple(LAYOUTS)],  # type: ignore[valid-type]
+        Field(description="of the points of mcap and rosbag2"),
+    ] = "velodyne"
+
+
+class OutputSection(Section):
+    """Files of the result beside cloud.ply; the columns that they need are kept."""
+
+    write: Annotated[
+        tuple[
+            Annotated[
+                ExportSection, _short(_is_text, lambda v: {"format": v}, Text | ExportSection)
+            ],
+            ...,
+        ],
+        Strict(False),
+        Field(
+            description="formats that the cloud is exported to as well",
+            examples=[["laz", {"format": "mcap", "layout": "autoware"}]],
+        ),
+    ] = ()
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Names of the columns that the formats need."""
+        names = [
+            name
+            for one in self.write
+            if one.format != "ply"
+            for name in (
+                LAYOUTS[one.layout] if one.format in ("mcap", "rosbag2") else FORMATS[one.format][1]
+            )
+        ]
+        return tuple(dict.fromkeys(names))
 
 
 Names = Annotated[tuple[Text, ...], Strict(False)]

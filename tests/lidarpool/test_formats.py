@@ -1,0 +1,293 @@
+"""Clouds in other formats, read back by the libraries of those formats."""
+
+from dataclasses import replace
+
+import laspy
+import numpy as np
+import pandas as pd
+import pye57
+import pytest
+from pypcd4.pypcd4 import PointCloud
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+from lidarpool import (
+    Cloud,
+    LidarpoolError,
+    Mounted,
+    Pose,
+    Scene,
+    Sensor,
+    Survey,
+    Track,
+    save_cloud,
+)
+from lidarpool.base.vocabulary import FORMATS
+from lidarpool.columns.table import TABLE
+from lidarpool.export.cloud_file import CloudFile
+from lidarpool.export.formats import Format
+from lidarpool.export.sweeps import Sweeps
+from lidarpool.scene.actors import Actor, box
+from lidarpool.sensor.trajectory import matrices
+from raybeam.open3d_module import load_open3d
+
+COLUMNS = ("time", "intensity", "reflectivity", "range", "azimuth", "elevation", "class",
+           "return_number", "returns", "sensor")  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def survey() -> Survey:
+    """Two sensors, five turns of 36 scans each, on a carrier that moves and turns."""
+    half = np.sqrt(0.5)
+    track = Track([0, 1], [[0, 0, 1], [10, 5, 1]], [[0, 0, 0, 1], [0, 0, half, half]])
+    lidar = Sensor.grid(360, 4)
+    front = Mounted(lidar, Pose((1, 0, 0.5), 30.0), "front")
+    return Survey(
+        sensors=[front, Mounted(lidar, name="rear")], trajectory=track, steps=180, columns=COLUMNS
+    )
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    track = Track([0, 2], [[5, 5, 0], [9, 5, 0]])
+    return replace(Scene.seed(), actors=(Actor(box("Car", (4, 2, 1.5)), track),))
+
+
+@pytest.fixture(scope="module")
+def sweeps(survey, scene) -> Sweeps:
+    return Sweeps.of(survey, scene)
+
+
+@pytest.fixture(scope="module")
+def cloud(survey) -> Cloud:
+    """Points of all sweeps but the fourth."""
+    rng = np.random.default_rng(5)
+    scan = np.sort(rng.integers(0, survey.scan_count, 3000))
+    scan = scan[scan // 36 != 3]
+    count = len(scan)
+    begins = np.array([survey.begins_ns(k) for k in range(survey.scan_count)])[scan]
+    columns = {
+        "scan": scan,
+        "channel": rng.integers(0, 4, count),
+        "object": rng.integers(0, 7, count),
+        "time": begins.astype(np.int64) + rng.integers(0, 2_000_000, count),
+        "intensity": rng.uniform(0, 1, count).astype(np.float32),
+        "reflectivity": rng.uniform(0, 1, count).astype(np.float32),
+        "range": rng.uniform(1, 50, count).astype(np.float32),
+        "azimuth": rng.uniform(0, 360, count).astype(np.float32),
+        "elevation": rng.uniform(-30, 30, count).astype(np.float32),
+        "class": rng.integers(0, 300, count),
+        "return_number": np.ones(count),
+        "returns": np.ones(count) * 2,
+        "sensor": scan // 180,
+    }
+    return Cloud(np.round(rng.uniform(-60, 60, (count, 3)), 2), columns)
+
+
+@pytest.fixture
+def written(cloud, sweeps, tmp_path):
+    """Write the cloud in a format, from its file as `lidarpool export` does."""
+    save_cloud(tmp_path / "cloud.ply", cloud)
+
+    def write(name, layout="velodyne"):
+        one = Format(name, layout)
+        one.write(tmp_path / one.file, CloudFile(tmp_path / "cloud.ply"), sweeps)
+        assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
+        return tmp_path / one.file
+
+    return write
+
+
+def of_sweep(cloud, sweep):
+    return cloud.part(np.flatnonzero(cloud.scan // 36 == sweep))
+
+
+def test_a_sweep_is_a_turn_and_has_the_pose_of_its_first_ray(survey, sweeps):
+    np.testing.assert_array_equal(sweeps.scans, np.arange(11) * 36)
+    np.testing.assert_allclose(sweeps.begins_ns, np.tile(np.arange(5) * 1e8, 2))
+    for sweep in (0, 3, 7):
+        pose = survey.pose(36 * sweep)
+        np.testing.assert_allclose(sweeps.pose.positions[sweep], pose.position, atol=1e-12)
+        turn = matrices(sweeps.pose.quaternions[sweep, None])[0]
+        np.testing.assert_allclose(turn, pose.rotation, atol=1e-12)
+    np.testing.assert_allclose(sweeps.actor_poses[0].positions[4], [5.8, 5, 0])
+
+
+def test_sweeps_come_back(sweeps, tmp_path):
+    sweeps.save(tmp_path / "s.npz")
+    again = Sweeps.load(tmp_path / "s.npz")
+    np.testing.assert_array_equal(again.pose.quaternions, sweeps.pose.quaternions)
+    assert (again.sensors, again.actors) == (("front", "rear"), ("Car",))
+    (tmp_path / "s.npz").write_bytes((tmp_path / "s.npz").read_bytes()[:300])
+    with pytest.raises(LidarpoolError, match="damaged"):
+        Sweeps.load(tmp_path / "s.npz")
+
+
+@pytest.mark.parametrize("name", ["las", "laz"])
+def test_las_has_fields_of_its_own_and_the_rest_in_extra_bytes(written, cloud, name):
+    las = laspy.read(written(name))
+    assert (las.header.point_format.id, str(las.header.version)) == (6, "1.4")
+    np.testing.assert_allclose(las.xyz, cloud.positions, atol=1e-6)
+    np.testing.assert_allclose(las.gps_time, cloud.time / 1e9, atol=1e-12)
+    np.testing.assert_allclose(las.intensity / 65_535, cloud.intensity, atol=1e-5)
+    turned = (cloud.azimuth.astype(float) + 180) % 360 - 180
+    np.testing.assert_allclose(las.scan_angle * 0.006, turned, atol=0.0031)
+    np.testing.assert_array_equal(las.return_number, 1)
+    np.testing.assert_array_equal(las.number_of_returns, 2)
+    np.testing.assert_array_equal(las.point_source_id, cloud.sensor + 1)
+    np.testing.assert_array_equal(
+        las.classification, np.where(cloud["class"] < 256, cloud["class"], 0)
+    )
+    for column in ("scan", "object", "class", "range", "elevation", "sensor"):
+        np.testing.assert_array_equal(las[column], cloud[column])
+    np.testing.assert_array_equal(las["ring"], cloud.channel)
+    np.testing.assert_array_equal(las["energy"], cloud.intensity)
+
+
+def test_parquet_holds_every_column(written, cloud):
+    frame = pd.read_parquet(written("parquet"))
+    np.testing.assert_allclose(frame[["x", "y", "z"]], cloud.positions, atol=1e-5)
+    for column in cloud.table:
+        np.testing.assert_array_equal(frame[column.in_files], cloud[column.name])
+
+
+def test_pcd_has_a_file_for_each_sweep_in_the_sensors_axes(written, cloud, sweeps):
+    folder = written("pcd")
+    assert len(list(folder.iterdir())) == 10
+    read = load_open3d().t.io.read_point_cloud
+    for sweep in (0, 6):
+        points = of_sweep(cloud, sweep)
+        found = read(str(folder / f"{sweep:06}.pcd")).point
+        inside = found["positions"].numpy().astype(float)
+        file = PointCloud.from_path(folder / f"{sweep:06}.pcd")
+        x, y, z, *turn = file.metadata.viewpoint
+        back = inside @ matrices(np.array([[*turn[1:], turn[0]]]))[0].T + (x, y, z)
+        np.testing.assert_allclose(back, points.positions, atol=2e-5)
+        np.testing.assert_array_equal(found["ring"].numpy()[:, 0], points.channel)
+        since = (points.time - sweeps.begins_ns[sweep]) / 1e9
+        np.testing.assert_allclose(file.numpy(("time",))[:, 0], since, atol=1e-8)
+    assert PointCloud.from_path(folder / "000003.pcd").points == 0
+
+
+def test_kitti_poses_bring_the_sweeps_of_a_sensor_together(written, cloud):
+    folder = written("kitti") / "sequences"
+    for sensor in (0, 1):
+        sequence = folder / f"{sensor:02}"
+        poses = np.loadtxt(sequence / "poses.txt").reshape(-1, 3, 4)
+        np.testing.assert_allclose(poses[0], np.eye(4)[:3], atol=1e-9)
+        np.testing.assert_allclose(np.loadtxt(sequence / "times.txt"), np.arange(5) / 10)
+        firsts = []
+        for number, pose in enumerate(poses):
+            points = of_sweep(cloud, 5 * sensor + number)
+            rows = np.fromfile(sequence / f"velodyne/{number:06}.bin", "<f4").reshape(-1, 4)
+            np.testing.assert_array_equal(rows[:, 3], points.intensity)
+            labels = np.fromfile(sequence / f"labels/{number:06}.label", "<u4")
+            np.testing.assert_array_equal(labels & 0xFFFF, points["class"])
+            np.testing.assert_array_equal(labels >> 16, points.object + 1)
+            firsts.append(rows[:, :3] @ pose[:, :3].T + pose[:, 3])
+        # All in the axes of the first pose: distances are those in the world.
+        own = cloud.part(np.flatnonzero(cloud.sensor == sensor)).positions
+        placed = np.concatenate(firsts)
+        apart = np.linalg.norm(placed[1:] - placed[:-1], axis=1)
+        np.testing.assert_allclose(apart, np.linalg.norm(own[1:] - own[:-1], axis=1), atol=1e-4)
+
+
+def test_nuscenes_has_a_folder_for_each_sensor(written, cloud):
+    folder = written("nuscenes")
+    assert {path.name for path in folder.iterdir()} == {"front", "rear"}
+    rows = np.fromfile(folder / "rear/000002.pcd.bin", "<f4").reshape(-1, 5)
+    points = of_sweep(cloud, 7)
+    np.testing.assert_allclose(rows[:, 3], points.intensity * 255, rtol=1e-6)
+    np.testing.assert_array_equal(rows[:, 4], points.channel)
+
+
+@pytest.mark.parametrize("name", ["mcap", "rosbag2"])
+@pytest.mark.parametrize(("layout", "step"), [("velodyne", 22), ("autoware", 32), ("ouster", 48)])
+def test_bags_have_points_frames_and_a_clock(written, cloud, sweeps, name, layout, step):
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    clouds, frames, clocks = {}, {}, []
+    with AnyReader([written(name, layout)], default_typestore=store) as bag:
+        for connection, when, data in bag.messages():
+            message = bag.deserialize(data, connection.msgtype)
+            if connection.topic.endswith("/points"):
+                clouds[connection.topic, when] = message
+            elif connection.topic == "/tf":
+                for transform in message.transforms:
+                    frames[transform.child_frame_id, when] = transform
+            else:
+                clocks.append(when)
+    assert {topic for topic, _ in clouds} == {"/front/points", "/rear/points"}
+    assert {frame for frame, _ in frames} == {"front", "rear", "Car"}
+    assert len(clouds) == len(clocks) == 10
+    sweep, when = 7, 200_000_000
+    message, points = clouds["/rear/points", when], of_sweep(cloud, sweep)
+    assert (message.point_step, message.header.frame_id) == (step, "rear")
+    kinds = {2: "u1", 4: "u2", 6: "u4", 7: "f4"}
+    row = np.dtype({
+        "names": [field.name for field in message.fields],
+        "formats": [kinds[field.datatype] for field in message.fields],
+        "offsets": [field.offset for field in message.fields],
+        "itemsize": step,
+    })  # fmt: skip
+    rows = message.data.view(row)
+    place = frames["rear", when].transform
+    turn = [getattr(place.rotation, axis) for axis in "xyzw"]
+    inside = np.stack([rows[axis] for axis in "xyz"], axis=1).astype(float)
+    back = inside @ matrices(np.array([turn]))[0].T
+    back += [getattr(place.translation, axis) for axis in "xyz"]
+    np.testing.assert_allclose(back, points.positions, atol=2e-5)
+    channel, time = {
+        "velodyne": ("ring", "time"), "autoware": ("channel", "time_stamp"), "ouster": ("ring", "t")
+    }[layout]  # fmt: skip
+    np.testing.assert_array_equal(rows[channel], points.channel)
+    since = points.time - sweeps.begins_ns[sweep]
+    np.testing.assert_allclose(rows[time] * (1e9 if time == "time" else 1), since, atol=10)
+    if layout == "autoware":
+        np.testing.assert_allclose(rows["azimuth"], np.radians(points.azimuth), rtol=1e-6)
+        np.testing.assert_array_equal(rows["intensity"], np.round(points.intensity * 255))
+    if layout == "ouster":
+        np.testing.assert_array_equal(rows["range"], np.round(points.range * 1000))
+
+
+def test_e57_has_a_scan_with_its_pose_for_each_sweep(written, cloud):
+    with pye57.E57(str(written("e57"))) as file:
+        assert file.scan_count == 9  # of which none is empty
+        found = file.read_scan(4, intensity=True, ignore_missing_fields=True)
+    points = of_sweep(cloud, 5)
+    placed = np.stack([found[f"cartesian{axis}"] for axis in "XYZ"], axis=1)
+    np.testing.assert_allclose(placed, points.positions, atol=1e-5)
+    np.testing.assert_allclose(found["intensity"], points.intensity)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_an_empty_cloud_can_be_written(sweeps, tmp_path, name):
+    columns = {
+        key: np.empty(0, TABLE[key].dtype) for key in ("scan", "channel", "object", *COLUMNS)
+    }
+    one = Format(name)
+    one.write(tmp_path / one.file, Cloud(np.empty((0, 3)), columns), sweeps)
+    assert (tmp_path / one.file).exists()
+
+
+def test_what_cannot_be_written_is_one_line_and_leaves_nothing(
+    cloud, sweeps, tmp_path, monkeypatch
+):
+    bare = Cloud(cloud.positions, {name: cloud[name] for name in ("scan", "channel", "object")})
+    with pytest.raises(
+        LidarpoolError, match=r"kitti needs intensity, class, which the cloud lacks"
+    ):
+        Format("kitti").write(tmp_path / "kitti", bare, sweeps)
+    (tmp_path / "cloud.laz").write_text("mine")
+    with pytest.raises(LidarpoolError, match=r"is there already: .* --overwrite"):
+        Format("laz").write(tmp_path / "cloud.laz", cloud, sweeps)
+    assert (tmp_path / "cloud.laz").read_text() == "mine"
+    Format("laz").write(tmp_path / "cloud.laz", cloud, sweeps, overwrite=True)
+    assert len(laspy.read(tmp_path / "cloud.laz")) == len(cloud)
+    with pytest.raises(LidarpoolError, match="cannot be written: No such file"):
+        Format("pcd").write(tmp_path / "gone/pcd", cloud, sweeps)
+    with pytest.raises(LidarpoolError, match="There is no format 'xyz': use las, laz"):
+        Format("xyz")
+    monkeypatch.setattr("lidarpool.export.formats.find_spec", lambda name: None)
+    with pytest.raises(LidarpoolError, match=r'laspy and lazrs: pip install "lidarpool\[las\]"'):
+        Format("las").check_installed()
+    assert {path.name for path in tmp_path.iterdir()} == {"cloud.laz"}

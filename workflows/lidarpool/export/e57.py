@@ -1,0 +1,33 @@
+"""E57, a scan for each sweep, through pye57."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pye57
+
+from ..columns.cloud import CloudLike
+from .sweeps import Sweeps
+
+
+def write_e57(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
+    """Write each sweep that has points, in the sensor's axes, with its pose and intensity."""
+    with pye57.E57(str(path), mode="w") as file:
+        for sweep, points in enumerate(sweeps.points(cloud)):
+            if not len(points):
+                continue
+            inside = sweeps.in_sensor(sweep, points.positions)
+            data = {
+                f"cartesian{axis}": column
+                for axis, column in zip("XYZ", inside.T.copy(), strict=True)
+            }
+            if "intensity" in points.columns:
+                data["intensity"] = points["intensity"]
+            x, y, z, w = sweeps.pose.quaternions[sweep]
+            file.write_scan_raw(
+                data,
+                name=f"sweep {sweep}",
+                rotation=np.array([w, x, y, z]),
+                translation=sweeps.pose.positions[sweep],
+            )

@@ -1,0 +1,166 @@
+"""The formats that a cloud is exported to, and what they have in common."""
+
+from __future__ import annotations
+
+import secrets
+import shutil
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from ..base.errors import LidarpoolError
+from ..base.vocabulary import FORMATS, LAYOUTS
+from ..columns.cloud import CloudLike
+from ..columns.storage import flush
+from .sweeps import Sweeps
+
+# The module of each that writes it, and what has to be installed for it.
+_MODULES = {
+    "las": ("las", "las"),
+    "laz": ("las", "las"),
+    "parquet": ("parquet", "parquet"),
+    "pcd": ("pcd", "pcd"),
+    "e57": ("e57", "e57"),
+    "kitti": ("kitti", ""),
+    "nuscenes": ("kitti", ""),
+    "mcap": ("ros", "ros"),
+    "rosbag2": ("ros", "ros"),
+}
+_PACKAGES = {
+    "las": ("laspy", "lazrs"),
+    "parquet": ("pyarrow",),
+    "pcd": ("pypcd4",),
+    "e57": ("pye57",),
+    "ros": ("rosbags",),
+}
+# Columns that are held, of those formats that do not hold all.
+_HELD = {
+    "e57": {"intensity"},
+    "kitti": {"object", "intensity", "class"},
+    "nuscenes": {"intensity", "channel"},
+    "velodyne": {"channel", "intensity", "time"},
+    "autoware": {"channel", "intensity", "time", "azimuth", "elevation", "range"},
+    "ouster": {"channel", "intensity", "time", "reflectivity", "range"},
+}
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format that a cloud is exported to.
+
+    Parameters
+    ----------
+    name
+        One of `lidarpool.base.vocabulary.FORMATS`.
+    layout
+        Of the points of mcap and rosbag2: velodyne, autoware or ouster.
+
+    Raises
+    ------
+    LidarpoolError
+        If there is no such format or layout.
+    """
+
+    name: str
+    layout: str = "velodyne"
+
+    def __post_init__(self) -> None:
+        for what, given, known in (
+            ("format", self.name, FORMATS),
+            ("layout", self.layout, LAYOUTS),
+        ):
+            if given not in known:
+                raise LidarpoolError(f"There is no {what} {given!r}: use {', '.join(known)}.")
+
+    @property
+    def file(self) -> str:
+        """Its file or folder in the folder of a result."""
+        return FORMATS[self.name][0]
+
+    @property
+    def _laid_out(self) -> bool:
+        """Whether the layout counts."""
+        return _MODULES[self.name][0] == "ros"
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Names of the columns that a cloud must have."""
+        return LAYOUTS[self.layout] if self._laid_out else FORMATS[self.name][1]
+
+    def left_out(self, cloud: CloudLike) -> list[str]:
+        """Names of the cloud's columns that it cannot hold."""
+        names = [column.name for column in cloud.table]
+        held = _HELD.get(self.layout if self._laid_out else self.name, set(names))
+        return [name for name in names if name not in held]
+
+    def check_installed(self) -> None:
+        """Check that it can be written here; LidarpoolError if a package is missing."""
+        extra = _MODULES[self.name][1]
+        absent = [package for package in _PACKAGES.get(extra, ()) if find_spec(package) is None]
+        if absent:
+            raise LidarpoolError(
+                f"The format {self.name} needs {' and '.join(absent)}: "
+                f'pip install "lidarpool[{extra}]".'
+            )
+
+    def check(self, cloud: CloudLike) -> None:
+        """Check that a cloud can be written here; LidarpoolError if a package or column lacks."""
+        self.check_installed()
+        there = {column.name for column in cloud.table}
+        if missing := [name for name in self.needs if name not in there]:
+            raise LidarpoolError(
+                f"The format {self.name} needs {', '.join(missing)}, which the cloud lacks: "
+                f"run the survey again with cloud: {{columns: [{', '.join(missing)}]}}."
+            )
+
+    def write(
+        self, path: Path, cloud: CloudLike, sweeps: Sweeps, *, overwrite: bool = False
+    ) -> None:
+        """Write a cloud whole, or not at all.
+
+        Parameters
+        ----------
+        path
+            The file, or the folder of a format that has many.
+        cloud
+            Its points, read in order a piece at a time.
+        sweeps
+            When and where its sweeps began.
+        overwrite
+            Whether what is there may be replaced.
+
+        Raises
+        ------
+        LidarpoolError
+            If a package or column is missing, if something is there, or if it cannot be written.
+        """
+        self.check(cloud)
+        if path.exists() and not overwrite:
+            raise LidarpoolError(
+                f"{path} is there already: give another place with --out, or --overwrite."
+            )
+        writers = import_module(f".{_MODULES[self.name][0]}", __package__)
+        more: dict[str, Any] = {"layout": self.layout} if self._laid_out else {}
+        beside = path.parent / f".export-{secrets.token_hex(4)}"
+        staged = beside / path.name  # bags hold the name of their file
+        try:
+            try:
+                beside.mkdir()
+                getattr(writers, f"write_{self.name}")(staged, cloud, sweeps, **more)
+                remove(path)
+                staged.replace(path)
+                flush(path.parent)
+            finally:
+                shutil.rmtree(beside, ignore_errors=True)
+        except OSError as error:
+            raise LidarpoolError(f"{path} cannot be written: {error.strerror or error}.") from error
+
+
+def remove(path: Path) -> None:
+    """Remove a file or folder, if it is there."""
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)

@@ -1,0 +1,95 @@
+"""LAS and LAZ 1.4, point format 6, through laspy."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import laspy
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.errors import LidarpoolError
+from ..columns.cloud import Cloud, CloudLike
+from ..columns.table import TABLE
+from .sweeps import Sweeps
+
+ANGLE_DEG = 0.006  # of one step of the format's scan angle
+FULL = 65_535  # the format's intensity of 1, and all that is brighter
+_OF_FORMAT = ("return_number", "returns", "azimuth")  # held by fields of the format alone
+_FAR = 2**31 - 1  # steps from the offset to the farthest point
+
+
+def write_las(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
+    """Write a LAS file; see `_write`."""
+    _write(path, cloud, sweeps, compress=False)
+
+
+def write_laz(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
+    """Write a LAZ file; see `_write`."""
+    _write(path, cloud, sweeps, compress=True)
+
+
+def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> None:
+    """Write a cloud: what the format has a field for goes there, the rest into extra bytes.
+
+    `time` is the GPS time in seconds, `return_number` and `returns` are as they are, `azimuth`
+    (-180 to 180 degrees) is the scan angle, `sensor` + 1 the point source. Intensity is the
+    column `intensity` times 65,535, at most that, and classification `class` where it is below
+    256; as those lose something, both columns are in the extra bytes as well.
+    """
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.generating_software = "lidarpool"
+    header.creation_date = None  # the same points give the same bytes
+    low, high = np.asarray(cloud.bounds, np.float64)
+    header.scales = np.full(3, sweeps.precision_m)
+    header.offsets = np.floor((low + high) / 2)
+    if np.abs(np.stack([low, high]) - header.offsets).max() / sweeps.precision_m > _FAR:
+        raise LidarpoolError(
+            f"{path.suffix[1:].upper()} holds 2^32 steps of {sweeps.precision_m} m along an axis, "
+            f"and the cloud is {(high - low).max():.6g} m wide: use a coarser precision_m."
+        )
+    extra = [column for column in cloud.table if column.name not in _OF_FORMAT]
+    header.add_extra_dims(
+        [
+            laspy.ExtraBytesParams(_name(c.in_files), c.dtype, f"{c.unit} {c.meaning}".strip()[:32])
+            for c in extra
+        ]
+    )
+    names = [column.name for column in extra]
+    with laspy.open(path, "w", header=header, do_compress=compress) as writer:
+        for chunk in cloud.chunks():
+            writer.write_points(_points(chunk, header, names))
+
+
+def _points(chunk: Cloud, header: laspy.LasHeader, extra: list[str]) -> Any:
+    record = laspy.ScaleAwarePointRecord.zeros(len(chunk), header=header)
+    record.x, record.y, record.z = chunk.positions.T.astype(np.float64)
+    there = chunk.columns
+    one = np.ones(len(chunk), np.uint8)
+    record.return_number = _at_most(there.get("return_number", one), 15)
+    record.number_of_returns = _at_most(there.get("returns", one), 15)
+    if "time" in there:
+        record.gps_time = there["time"] / 1e9
+    if "intensity" in there:
+        record.intensity = np.round(np.clip(there["intensity"], 0, 1) * FULL).astype(np.uint16)
+    if "azimuth" in there:
+        turned = (there["azimuth"].astype(np.float64) + 180) % 360 - 180
+        record.scan_angle = np.round(turned / ANGLE_DEG).astype(np.int16)
+    if "class" in there:
+        record.classification = np.where(there["class"] < 256, there["class"], 0).astype(np.uint8)
+    if "sensor" in there:
+        record.point_source_id = there["sensor"].astype(np.uint16) + 1
+    for name in extra:
+        column = TABLE.get(name)
+        record[_name(column.in_files if column else name)] = there[name]
+    return record
+
+
+def _name(name: str) -> str:
+    """Name of a column in the extra bytes, where one of a field of the format is taken."""
+    return {"intensity": "energy", "returns": "of_returns"}.get(name, name)[:32]
+
+
+def _at_most(values: NDArray[Any], most: int) -> NDArray[np.uint8]:
+    return np.minimum(values, most).astype(np.uint8)

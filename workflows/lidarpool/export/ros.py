@@ -1,0 +1,162 @@
+"""Bags of ROS 2, as MCAP, through rosbags: PointCloud2, /tf and /clock."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from ..columns.cloud import Cloud, CloudLike
+from .sweeps import Placed, Sweeps
+
+WORLD = "map"  # the frame of the world
+_KINDS = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+# Fields of a point: name, type, offset, and the column that it is made of.
+_LAYOUTS: dict[str, tuple[int, tuple[tuple[str, str, int], ...]]] = {
+    "velodyne": (
+        22,
+        (("x", "f4", 0), ("y", "f4", 4), ("z", "f4", 8), ("intensity", "f4", 12),
+         ("ring", "u2", 16), ("time", "f4", 18)),
+    ),
+    "autoware": (
+        32,
+        (("x", "f4", 0), ("y", "f4", 4), ("z", "f4", 8), ("intensity", "u1", 12),
+         ("return_type", "u1", 13), ("channel", "u2", 14), ("azimuth", "f4", 16),
+         ("elevation", "f4", 20), ("distance", "f4", 24), ("time_stamp", "u4", 28)),
+    ),
+    "ouster": (
+        48,
+        (("x", "f4", 0), ("y", "f4", 4), ("z", "f4", 8), ("intensity", "f4", 16), ("t", "u4", 20),
+         ("reflectivity", "u2", 24), ("ring", "u2", 26), ("ambient", "u2", 28),
+         ("range", "u4", 32)),
+    ),
+}  # fmt: skip
+
+
+def write_rosbag2(path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str) -> None:
+    """Write a bag, a folder that `ros2 bag play` takes; see `write_mcap`."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        topics: dict[str, Any] = {}
+        for topic, message, time_ns in _messages(cloud, sweeps, layout, store.types):
+            kind = message.__msgtype__
+            if topic not in topics:
+                topics[topic] = bag.add_connection(topic, kind, typestore=store)
+            bag.write(topics[topic], time_ns, store.serialize_cdr(message, kind))
+
+
+def write_mcap(path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str) -> None:
+    """Write an MCAP file.
+
+    Each sweep is a PointCloud2 on `/NAME/points`, NAME that of its sensor, or on `/points`. Points
+    are in the sensor's axes when the sweep began. `/tf` has the frames of sensors and actors in
+    `map`, and `/clock` the time, both at each sweep. The survey begins at time 0.
+
+    Layouts of a point: `velodyne` (22 bytes; its time in seconds since the sweep began),
+    `autoware` (PointXYZIRCAEDT, 32 bytes; angles in radians, time_stamp in ns since the sweep
+    began) and `ouster` (48 bytes; range in mm, t in ns since the sweep began). Whole numbers of
+    intensity and reflectivity are of 255 and 65,535 at 1, and no more than that.
+    """
+    folder = path.with_name(f"{path.name}.bag")
+    try:
+        write_rosbag2(folder, cloud, sweeps, layout)
+        (written,) = folder.glob("*.mcap")
+        written.replace(path)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _messages(
+    cloud: CloudLike, sweeps: Sweeps, layout: str, types: Any
+) -> Iterator[tuple[str, Any, int]]:
+    """Topics, messages and times in nanoseconds, sweep by sweep."""
+    step, described = _LAYOUTS[layout]
+    offset_of = {name: offset for name, _, offset in described}
+    row = np.dtype({
+        "names": list(offset_of), "formats": [f"<{kind}" for _, kind, _ in described],
+        "offsets": list(offset_of.values()), "itemsize": step,
+    })  # fmt: skip
+    field = types["sensor_msgs/msg/PointField"]
+    fields = [field(name, offset, _KINDS[kind], 1) for name, kind, offset in described]
+    make = _Messages(types)
+    for sweep, points in enumerate(sweeps.points(cloud)):
+        time_ns = round(sweeps.begins_ns[sweep])
+        name = sweeps.sensors[sweeps.sensor[sweep]]
+        rows = _rows(row, points, sweeps, sweep)
+        frames = [(name or "lidar", sweeps.pose)]
+        frames += list(zip(sweeps.actors, sweeps.actor_poses, strict=True))
+        yield "/clock", types["rosgraph_msgs/msg/Clock"](make.stamp(time_ns)), time_ns
+        yield "/tf", make.transforms(frames, sweep, time_ns), time_ns
+        message = types["sensor_msgs/msg/PointCloud2"](
+            make.header(name or "lidar", time_ns), 1, len(rows), fields, False, step,
+            step * len(rows), rows.view(np.uint8).ravel(), True,
+        )  # fmt: skip
+        yield f"/{name}/points" if name else "/points", message, time_ns
+
+
+def _rows(row: np.dtype[np.void], points: Cloud, sweeps: Sweeps, sweep: int) -> NDArray[np.void]:
+    """Points of a sweep in a layout."""
+    rows = np.zeros(len(points), row)
+    there, since = points.columns, points["time"] - sweeps.begins_ns[sweep]
+    light = np.clip(there["intensity"], 0, 1)
+    inside = sweeps.in_sensor(sweep, points.positions)
+    values = {"x": inside[:, 0], "y": inside[:, 1], "z": inside[:, 2], "ring": there["channel"]}
+    if "time_stamp" in (row.names or ()):
+        values |= {
+            "intensity": np.round(light * 255),
+            "return_type": np.ones(len(points)),
+            "channel": there["channel"],
+            "azimuth": np.radians(there["azimuth"]),
+            "elevation": np.radians(there["elevation"]),
+            "distance": there["range"],
+            "time_stamp": np.clip(since, 0, None),
+        }
+    elif "t" in (row.names or ()):
+        values |= {
+            "intensity": there["intensity"],
+            "t": np.clip(since, 0, None),
+            "reflectivity": np.round(np.clip(there["reflectivity"], 0, 1) * 65_535),
+            "range": np.round(there["range"] * 1000),
+        }
+    else:
+        values |= {"intensity": there["intensity"], "time": since / 1e9}
+    for name in set(values) & set(row.names or ()):
+        rows[name] = values[name]
+    return rows
+
+
+class _Messages:
+    """Parts of messages that several have."""
+
+    def __init__(self, types: Any) -> None:
+        self._types = types
+
+    def stamp(self, time_ns: int) -> Any:
+        """Time of a message."""
+        return self._types["builtin_interfaces/msg/Time"](*divmod(time_ns, 1_000_000_000))
+
+    def header(self, frame: str, time_ns: int) -> Any:
+        """Header of a message."""
+        return self._types["std_msgs/msg/Header"](self.stamp(time_ns), frame)
+
+    def transforms(self, frames: list[tuple[str, Placed]], sweep: int, time_ns: int) -> Any:
+        """Where frames are in the world when a sweep begins."""
+        kind = "geometry_msgs/msg/"
+        vector, turn = self._types[f"{kind}Vector3"], self._types[f"{kind}Quaternion"]
+        transform, stamped = self._types[f"{kind}Transform"], self._types[f"{kind}TransformStamped"]
+        return self._types["tf2_msgs/msg/TFMessage"]([
+            stamped(
+                self.header(WORLD, time_ns), name,
+                transform(
+                    vector(*placed.positions[sweep].tolist()),
+                    turn(*placed.quaternions[sweep].tolist()),
+                ),
+            )
+            for name, placed in frames
+        ])  # fmt: skip

@@ -1,0 +1,247 @@
+"""When and where each sweep began: what formats of single sweeps need beside points."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.errors import LidarpoolError
+from ..columns.cloud import Cloud, CloudLike
+from ..scene.scene import Scene
+from ..sensor import Sensor, Survey
+from ..sensor.trajectory import matrices, quaternions_of
+
+Floats = NDArray[np.float64]
+SWEEPS_FILE = "sweeps.npz"
+_FORMAT = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """Where something was when each sweep began.
+
+    Parameters
+    ----------
+    positions
+        float64 (n, 3): metres, world coordinates.
+    quaternions
+        float64 (n, 4): x, y, z, w of the rotation from its own axes to the world's.
+    """
+
+    positions: Floats
+    quaternions: Floats
+
+    def inward(self, sweep: int, points: Floats) -> Floats:
+        """Points (k, 3) of the world in its axes when a sweep began."""
+        turn = matrices(self.quaternions[sweep, None])[0]
+        turned: Floats = (points - self.positions[sweep]) @ turn
+        return turned
+
+
+@dataclass(frozen=True, eq=False)
+class Sweeps:
+    """All sweeps of a survey. A sweep is the scans of one turn, or of one frame, of a sensor.
+
+    Parameters
+    ----------
+    scans
+        int64 (n + 1,): the first scan of each, and one past the last of all.
+    begins_ns
+        float64 (n,): when each begins, nanoseconds since the survey's start.
+    sensor
+        uint8 (n,): which sensor it is of.
+    pose
+        Where that was.
+    sensors, objects, actors
+        Names; those of actors follow those of objects in the column `object`.
+    actor_poses
+        Where each actor was.
+    actor_bounds
+        float64 (a, 2, 3): corners of each actor's box in its own axes, metres.
+    coordinates
+        Of the cloud's points, "world" or "sensor".
+    precision_m
+        What positions were rounded to, metres.
+    """
+
+    scans: NDArray[np.int64]
+    begins_ns: Floats
+    sensor: NDArray[np.uint8]
+    pose: Placed
+    sensors: tuple[str, ...]
+    objects: tuple[str, ...]
+    actors: tuple[str, ...]
+    actor_poses: tuple[Placed, ...]
+    actor_bounds: Floats
+    coordinates: str
+    precision_m: float
+
+    def __len__(self) -> int:
+        return len(self.begins_ns)
+
+    def in_sensor(self, sweep: int, points: NDArray[np.floating]) -> Floats:
+        """Points (k, 3) of a sweep in its sensor's axes: when it began, or as they were kept."""
+        exact = points.astype(np.float64)
+        return exact if self.coordinates == "sensor" else self.pose.inward(sweep, exact)
+
+    @classmethod
+    def of(cls, survey: Survey, scene: Scene) -> Sweeps:
+        """Return the sweeps of a survey of a scene."""
+        path = survey.path
+        scans, begins, sensors, places, turns, done = [], [], [], [], [], 0
+        for number, (carried, steps) in enumerate(
+            zip(survey.carried, survey.steps_each, strict=True)
+        ):
+            firsts, since = _of_head(carried.sensor, steps)
+            mount = carried.mount
+            turned = np.eye(3) if mount.rotation is None else mount.rotation
+            for station in range(path.stations):
+                positions, rotations = _poses(survey, station, since)
+                places.append(positions + rotations @ np.array(mount.position))
+                turns.append(rotations @ turned)
+                begins.append(station * survey.station_ns + since)
+                scans.append(done + firsts)
+                done += steps
+            sensors.append(np.full(len(since) * path.stations, number, np.uint8))
+        when = np.concatenate(begins)
+        actor_poses = []
+        for actor in scene.actors:
+            at, turned_by = actor.trajectory.poses(0, when)
+            actor_poses.append(_placed(at + scene.origin, _full(turned_by, len(when))))
+        bounds = [
+            np.stack([a.mesh.vertices.min(axis=0), a.mesh.vertices.max(axis=0)])
+            for a in scene.actors
+        ]
+        return cls(
+            np.append(np.concatenate(scans), done),
+            when,
+            np.concatenate(sensors),
+            _placed(np.concatenate(places) + scene.origin, np.concatenate(turns)),
+            tuple(carried.name for carried in survey.carried),
+            tuple(scene.names),
+            tuple(actor.name for actor in scene.actors),
+            tuple(actor_poses),
+            np.array(bounds).reshape(-1, 2, 3),
+            survey.coordinates,
+            survey.precision_m,
+        )
+
+    def points(self, cloud: CloudLike) -> Iterator[Cloud]:
+        """Give the points of each sweep in order, also of those without any."""
+        held: list[Cloud] = []
+        empty = Cloud(np.empty((0, 3)), {c.name: np.empty(0, c.dtype) for c in cloud.table})
+        current = 0
+        for chunk in cloud.chunks():
+            sweep = np.searchsorted(self.scans, chunk["scan"], "right") - 1
+            for first, end in pairwise([0, *(np.flatnonzero(np.diff(sweep)) + 1), len(sweep)]):
+                while current < sweep[first]:
+                    yield Cloud.joined(held) if held else empty
+                    held, current = [], current + 1
+                held.append(chunk.part(slice(first, end)))
+        while current < len(self):
+            yield Cloud.joined(held) if held else empty
+            held, current = [], current + 1
+
+    def save(self, path: Path) -> None:
+        """Write it as a NumPy archive; OSError if it cannot be written."""
+        words = {
+            "format": _FORMAT,
+            "sensors": self.sensors,
+            "objects": self.objects,
+            "actors": self.actors,
+            "coordinates": self.coordinates,
+            "precision_m": self.precision_m,
+        }
+        arrays: dict[str, Any] = {
+            "words": np.frombuffer(json.dumps(words).encode(), np.uint8),
+            "scans": self.scans,
+            "begins_ns": self.begins_ns,
+            "sensor": self.sensor,
+            "positions": self.pose.positions,
+            "quaternions": self.pose.quaternions,
+            "actor_bounds": self.actor_bounds,
+        }
+        for number, placed in enumerate(self.actor_poses):
+            arrays[f"actor{number}_positions"] = placed.positions
+            arrays[f"actor{number}_quaternions"] = placed.quaternions
+        memory = io.BytesIO()  # NumPy leaves a file open that it opened itself and cannot write
+        np.savez_compressed(memory, **arrays)
+        path.write_bytes(memory.getbuffer())
+
+    @classmethod
+    def load(cls, path: Path) -> Sweeps:
+        """Read what `save` wrote; nothing in the file is run.
+
+        Raises
+        ------
+        LidarpoolError
+            If it cannot be read, is damaged, or of another version.
+        """
+        try:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+                words = json.loads(arrays["words"].tobytes())
+                if words["format"] != _FORMAT:
+                    raise ValueError(f"it is of format {words['format']}, not {_FORMAT}")
+                poses = [
+                    Placed(arrays[f"actor{k}_positions"], arrays[f"actor{k}_quaternions"])
+                    for k in range(len(words["actors"]))
+                ]
+                return cls(
+                    arrays["scans"],
+                    arrays["begins_ns"],
+                    arrays["sensor"],
+                    Placed(arrays["positions"], arrays["quaternions"]),
+                    tuple(words["sensors"]),
+                    tuple(words["objects"]),
+                    tuple(words["actors"]),
+                    tuple(poses),
+                    arrays["actor_bounds"],
+                    words["coordinates"],
+                    words["precision_m"],
+                )
+        except OSError as error:
+            raise LidarpoolError(f"{path} cannot be read: {error.strerror or error}.") from error
+        except Exception as error:  # zipfile, zlib and NumPy have many
+            raise LidarpoolError(
+                f"{path} is damaged or not of this version of lidarpool "
+                f"({' '.join(str(error).split())}): run the survey again."
+            ) from error
+
+
+def _of_head(sensor: Sensor, steps: int) -> tuple[NDArray[np.int64], Floats]:
+    """First time step of each sweep of so many, and when they begin since the head started."""
+    begins = sensor.begins_ns(np.array([sensor.firings(step)[0] for step in range(steps)]))
+    rate_hz = getattr(sensor.head, "rate_hz", None)
+    if rate_hz is None:  # a head of one's own: nobody knows when it has been everywhere
+        return np.arange(steps), begins + sensor.lead_ns
+    turn = np.floor(begins * (rate_hz / 1e9) + 1e-6)
+    firsts = np.flatnonzero(np.diff(turn, prepend=-1))
+    return firsts, begins[firsts] + sensor.lead_ns
+
+
+def _poses(survey: Survey, station: int, since: Floats) -> tuple[Floats, Floats]:
+    if survey.path.moves:
+        positions, rotations = survey.path.poses(station, since)
+        return positions, _full(rotations, len(since))
+    pose = survey.path.pose(station)
+    positions = np.broadcast_to(np.array(pose.position), (len(since), 3))
+    rotation = None if pose.rotation is None else np.broadcast_to(pose.rotation, (len(since), 3, 3))
+    return positions, _full(rotation, len(since))
+
+
+def _full(rotations: Floats | None, count: int) -> Floats:
+    return np.broadcast_to(np.eye(3), (count, 3, 3)) if rotations is None else rotations
+
+
+def _placed(positions: Floats, rotations: Floats) -> Placed:
+    quaternions = quaternions_of(rotations)
+    quaternions[quaternions[:, 3] < 0] *= -1  # of the two that mean the same
+    return Placed(np.array(positions), quaternions)
