@@ -31,6 +31,8 @@ _SECTIONS = {
     "noise": "NoiseSection",
     "weather": "WeatherSection",
     "cloud": "CloudSection",
+    "output": "OutputSection",
+    "output: write": "ExportSection",
     "planning": "PlanningSection",
     "planning: obstacles": "Obstacle",
     "pool": "PoolSection",

@@ -61,7 +61,7 @@ def export(
         ) from error
     wanted = [Format(name, layout) for name in formats]
     for one in wanted:  # before the first of them takes its time
-        one.check(cloud)
+        one.check(out / one.file, cloud, overwrite=overwrite)
     for one in wanted:
         one.write(out / one.file, cloud, sweeps, overwrite=overwrite)
         if left := one.left_out(cloud):

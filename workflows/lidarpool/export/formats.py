@@ -105,9 +105,13 @@ class Format:
                 f'pip install "lidarpool[{extra}]".'
             )
 
-    def check(self, cloud: CloudLike) -> None:
-        """Check that a cloud can be written here; LidarpoolError if a package or column lacks."""
+    def check(self, path: Path, cloud: CloudLike, *, overwrite: bool = False) -> None:
+        """Check what `write` needs, before anything is written; LidarpoolError if it lacks."""
         self.check_installed()
+        if path.exists() and not overwrite:
+            raise LidarpoolError(
+                f"{path} is there already: give another place with --out, or --overwrite."
+            )
         there = {column.name for column in cloud.table}
         if missing := [name for name in self.needs if name not in there]:
             raise LidarpoolError(
@@ -136,11 +140,7 @@ class Format:
         LidarpoolError
             If a package or column is missing, if something is there, or if it cannot be written.
         """
-        self.check(cloud)
-        if path.exists() and not overwrite:
-            raise LidarpoolError(
-                f"{path} is there already: give another place with --out, or --overwrite."
-            )
+        self.check(path, cloud, overwrite=overwrite)
         writers = import_module(f".{_MODULES[self.name][0]}", __package__)
         more: dict[str, Any] = {"layout": self.layout} if self._laid_out else {}
         beside = path.parent / f".export-{secrets.token_hex(4)}"

@@ -36,7 +36,7 @@ ROOM_BYTES = 32 << 20  # what pictures and report may take
 CLOUD, PAGE, REPORT = "cloud.ply", "report.html", "report.json"
 OF_CLOUD = "cloud.png"  # the picture that is drawn from the cloud's file
 _IMAGES = tuple(f"{name}.png" for name in PICTURES)
-FILES = (CLOUD, SWEEPS_FILE, *_IMAGES, PICTURE_FILE, PAGE, REPORT)
+FILES = (CLOUD, *_IMAGES, PICTURE_FILE, SWEEPS_FILE, PAGE, REPORT)
 EXPORTS = tuple(file for file, _ in FORMATS.values())
 _WRITING = ".writing-"  # folder of a result being made; one of a killed run goes at the next
 
@@ -119,7 +119,8 @@ def write_result(
             PICTURE_FILE: shown.save
         }
     exported = [one.file for one in formats]
-    files = [CLOUD, SWEEPS_FILE, *exported, *makers, *([] if only_cloud else [PAGE]), REPORT]
+    shown_on = [] if only_cloud else [PAGE]
+    files = [CLOUD, *exported, *makers, SWEEPS_FILE, *shown_on, REPORT]
     try:
         staged.mkdir()
         drawn = [beside.submit(make, staged / n) for n, make in makers.items() if n != OF_CLOUD]

@@ -1,0 +1,64 @@
+"""Clouds in other formats, by scenarios and by the command."""
+
+import json
+
+import laspy
+import numpy as np
+
+from lidarpool import read_cloud
+
+SCENARIO = """
+trajectory: {points: [{time_s: 0, position: [0, 0, 1]}, {time_s: 0.3, position: [3, 0, 1]}]}
+sensors:
+  front: {model: velodyne/vlp16, mount: {position: [1, 0, 0]}}
+  rear: {model: velodyne/vlp16}
+cloud: {keep_every: 7}
+output: {write: [ply, laz, {format: mcap, layout: ouster}, kitti]}
+planning: {enabled: false}
+"""
+
+
+def test_a_run_writes_what_its_scenario_asks_for_and_a_result_is_exported(
+    cluster, lidarpool, tmp_path
+):
+    (tmp_path / "s.yaml").write_text(SCENARIO)
+    out = tmp_path / "out"
+    run = ("run", tmp_path / "s.yaml", "--out", out, "--scheduler", cluster, "--only", "cloud")
+    done = lidarpool(*run, "-q")
+    assert done.code == 0, done.err
+    made = {"cloud.ply", "sweeps.npz", "cloud.laz", "cloud.mcap", "kitti", "report.json"}
+    assert {path.name for path in out.iterdir()} == made
+    assert {*json.loads((out / "report.json").read_text())["files"]} == made
+    cloud = read_cloud(out / "cloud.ply")
+    assert {"intensity", "time", "range", "class", "reflectivity"} <= set(cloud.columns)
+    np.testing.assert_allclose(laspy.read(out / "cloud.laz").xyz, cloud.positions, atol=1e-5)
+    assert len(list((out / "kitti/sequences/01/velodyne").iterdir())) == 3  # turns of 0.1 s
+
+    before = laspy.read(out / "cloud.laz")
+    refused = lidarpool("export", out, "-f", "pcd", "-f", "laz")
+    assert refused.code == 2 and "cloud.laz is there already" in refused.err
+    assert not (out / "pcd").exists()
+    done = lidarpool("export", out, "-f", "pcd", "-f", "laz", "--overwrite")
+    assert (done.code, done.out) == (0, f"{out}/pcd\n{out}/cloud.laz\n")
+    again = laspy.read(out / "cloud.laz")
+    for name in before.point_format.dimension_names:
+        np.testing.assert_array_equal(again[name], before[name])
+    elsewhere = lidarpool("export", out, "-f", "nuscenes", "--out", tmp_path / "other")
+    assert elsewhere.code == 0 and "nuscenes does not hold" in elsewhere.err
+    assert len(list((tmp_path / "other/nuscenes/rear").iterdir())) == 3
+
+    # What an earlier run or export left would pass for this one's.
+    (tmp_path / "s.yaml").write_text(SCENARIO.replace("laz, ", ""))
+    assert lidarpool(*run, "-q").code == 0
+    assert {path.name for path in out.iterdir()} == made - {"cloud.laz"}
+
+
+def test_what_is_no_result_or_has_been_cut_is_one_line(lidarpool, tmp_path):
+    told = lidarpool("export", tmp_path, "-f", "laz")
+    assert told.code == 2 and "holds no sweeps.npz: give the folder of a finished run" in told.err
+    (tmp_path / "sweeps.npz").write_bytes(b"PK")
+    told = lidarpool("export", tmp_path, "-f", "laz")
+    assert told.code == 2 and "sweeps.npz is damaged" in told.err
+    (tmp_path / "s.yaml").write_text("output: {write: [xyz]}")
+    told = lidarpool("check", tmp_path / "s.yaml")
+    assert told.code == 2 and "output.write" in told.err
