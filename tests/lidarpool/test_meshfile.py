@@ -47,6 +47,20 @@ end_header
 """
 
 
+@pytest.fixture
+def two_objects():
+    """Return a trimesh scene: a box at x = 10 of 1 x 2 x 3 m, and a ball at the origin."""
+    scene = trimesh.Scene()
+    scene.add_geometry(
+        trimesh.creation.box((1, 2, 3)),
+        node_name="Box A",
+        geom_name="box",
+        transform=trimesh.transformations.translation_matrix((10, 0, 0)),
+    )
+    scene.add_geometry(trimesh.creation.icosphere(1), node_name="Ball", geom_name="ball")
+    return scene
+
+
 def write(path, content):
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
     return path
@@ -162,8 +176,8 @@ def test_a_scene_farther_than_anything_on_earth(tmp_path):
         load_meshes(path, unit="km")
 
 
-def test_mirrored_objects_keep_their_outside(tmp_path, tetrahedron):
-    mesh = trimesh.Trimesh(*tetrahedron, process=False)
+def test_mirrored_objects_keep_their_outside(tmp_path, two_objects):
+    mesh = two_objects.to_mesh()
     path = write(tmp_path / "t.ply", mesh.export(file_type="ply"))
     mirrored = load_meshes(path, transform=Transform.place(scale=(-1, 1, 1)))[0]
     assert trimesh.Trimesh(mirrored.vertices, mirrored.faces, process=False).volume == (

@@ -1,39 +1,37 @@
-"""What is said to a terminal: progress as long as there is one, and nothing that commands it."""
+"""What is said of a run: bars as long as there is a terminal, or else lines that come seldom."""
 
 import os
 import sys
 from contextlib import suppress
+from dataclasses import replace
+from io import StringIO
 
 import pytest
 
 import lidarpool.cli.commands
-from lidarpool.cli.terminal import shown_progress, shown_status
+from lidarpool.cli.terminal import PlainLines, shown_progress, shown_status
 from lidarpool.run.progress import Progress
 
-pty = pytest.importorskip("pty", reason="there are no pseudo-terminals here", exc_type=ImportError)
 
-
-def progress(done):
-    return Progress(
-        scans=9, generated=done, cast=done, framed=done, collected=done, points=done,
-        trials=3, trials_done=done // 3, seconds=60.0 * done,
-    )  # fmt: skip
+def progress(seconds: float, scans: int, trials: int = 0) -> Progress:
+    return Progress(100, scans, scans, scans, scans, 7 * scans, 10, trials, seconds)
 
 
 @pytest.mark.parametrize("kind", ["xterm", "dumb"])
 def test_a_terminal_that_is_closed_ends_nothing(kind, monkeypatch):
+    pty = pytest.importorskip("pty", reason="no pseudo-terminals here", exc_type=ImportError)
     master, slave = pty.openpty()
     monkeypatch.setenv("TERM", kind)
     stream = os.fdopen(slave, "w")
     monkeypatch.setattr(sys, "stderr", stream)
     with shown_progress() as show:
-        show(progress(3))
+        show(progress(60.0 * 3, 3))
         said = os.read(master, 1 << 16)
         os.close(master)
         with pytest.raises(OSError, match="Input/output error"):
             os.write(slave, b"x")
-        show(progress(6))
-        show(progress(9))
+        show(progress(60.0 * 6, 6))
+        show(progress(60.0 * 9, 9))
     with shown_status("writing"):
         pass
     assert said
@@ -51,3 +49,49 @@ def test_a_complaint_commands_no_terminal(tmp_path, capsys, monkeypatch):
     said = capsys.readouterr().err
     assert "title" in said
     assert all(line.isprintable() for line in said.splitlines())
+
+
+def lines_of(stream: StringIO) -> list[str]:
+    """Lines without their times."""
+    return [line[10:] for line in stream.getvalue().splitlines()]
+
+
+def test_plain_lines_come_seldom_and_tell_rate_and_time_left():
+    stream = StringIO()
+    show = PlainLines(stream)
+    for tenth in range(0, 51):
+        show(progress(tenth / 10, 2 * tenth))
+    stages = "(1 generate {0}, 2 intersect {0}, 3 sort {0}, 4 collect {0})"
+    assert lines_of(stream) == [
+        f"survey  40 of 100 scans {stages.format(40)}  20/s  3 s left",
+        "planning  0 of 10 trials",
+        f"survey  80 of 100 scans {stages.format(80)}  20/s  1 s left",
+        "planning  0 of 10 trials",
+        "survey  done: 100 scans, 700 points in 5.0 s",
+    ]
+
+
+def test_plain_lines_say_once_that_something_is_done():
+    stream = StringIO()
+    show = PlainLines(stream)
+    for second in range(600):
+        show(progress(float(second), 100, min(10, second // 60)))
+    text = stream.getvalue()
+    assert text.count("survey") == text.count("survey  done") == 1
+    assert text.count("planning  done") == 0 and 20 < text.count("planning") < 60
+    show(progress(600.0, 100, 10))
+    show(progress(601.0, 100, 10))
+    assert stream.getvalue().count("planning  done: 10 trials in 600.0 s") == 1
+
+
+def test_plain_lines_tell_why_nothing_goes_on():
+    stream = StringIO()
+    show = PlainLines(stream)
+    show(progress(1.0, 10))
+    for second in range(2, 4):
+        show(replace(progress(float(second), 20), waits_for="LIDAR"))
+    show(progress(4.1, 40))
+    run = [line for line in lines_of(stream) if line.startswith("run")]
+    words = "waits for slots of LIDAR, which other runs hold"
+    assert run == [f"run  {words}, 20 scans are done", "run  goes on, 40 scans are done"]
+    assert len(lines_of(stream)) - len(run) == 4
