@@ -94,7 +94,9 @@ class ResultView:
             lines.append(f"relative to {away} m")
         lines += [described(self._sensors)] if self._sensors else []
         lines += [escape(self._note)] if self._note else []
-        self._facts.content = f'<div style="padding:0 0.8em">{"<br>".join(lines)}</div>'
+        self._facts.content = (
+            f'<div style="padding:0 0.8em 0.6em;font-size:0.85em">{"<br>".join(lines)}</div>'
+        )
 
 
 def _around(file: CloudFile) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -37,7 +37,7 @@ BUSY_SHARE, IDLE_SHARE = 0.06, 0.7  # of a core, while the run goes on and when 
 ASK_EVERY_S = 2.0  # how busy the partitions are
 FRAMES_SHOWN = 40  # whose rays are shown
 
-_BOX = '<div style="padding:0 0.8em;font-size:0.85em;font-variant-numeric:tabular-nums">'
+_BOX = '<div style="padding:0 0.8em 0.6em;font-size:0.85em;font-variant-numeric:tabular-nums">'
 
 
 class LiveRun:

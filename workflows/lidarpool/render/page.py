@@ -30,7 +30,7 @@ FONT = "DejaVu Sans"  # comes with matplotlib
 MANY_POSES = 40  # more than this are drawn as small dots
 PATH_PIECES = 200  # of which the way of a sensor is drawn
 MOST_NAMES = 12  # of actors beside what they name
-NAME_ABOVE, NAME_ROOM = 26.0, (150.0, 22.0)  # pixels of a picture 1600 wide
+NAME_ABOVE, NAME_ROOM = 26.0, (150.0, 26.0)  # pixels of a picture 1600 wide
 LEGEND_ROWS = 30
 LEGEND_LETTERS = 18
 # Of the numbers along the axes, in pixels of a picture 1600 wide.
@@ -128,7 +128,7 @@ class Page:
             )  # fmt: skip
 
     def _actors(self, axes: Axes, shot: Shot) -> None:
-        """Name the actors, if they are few, each above its place."""
+        """Name the actors, if they are few, each above its place; paler where it is hidden."""
         boxes, taken = shot.scene.object_bounds, np.empty((0, 2))
         some = np.arange(len(boxes) - shot.actors, len(boxes))
         some = some[np.isfinite(boxes[some]).all(axis=(1, 2))]
@@ -137,20 +137,21 @@ class Page:
         tops = np.column_stack([boxes[some, :, :2].mean(axis=1), boxes[some, 1, 2]])
         halo = [withStroke(linewidth=1.6 * self.unit, foreground=theme.PAGE)]
         names = [shot.scene.names[k] for k in some]
-        places = shot.camera.project(tops)[0]
+        places, seen = shot.visible(tops)
         for k in np.argsort(-places[:, 1]).tolist():  # those in front first
-            pixel, name = places[k], names[k]
+            pixel, name, colour = places[k], names[k], theme.INK if seen[k] else theme.LINE
             place = pixel - (0, NAME_ABOVE * self.unit)
             while (np.abs(taken - place) < np.array(NAME_ROOM) * self.unit).all(axis=1).any():
                 place = place - (0, NAME_ROOM[1] * self.unit)
             taken = np.vstack([taken, place])
             axes.plot(
-                *np.stack([pixel, place]).T, color=theme.INK, lw=0.7 * self.unit, zorder=6,
+                *np.stack([pixel, place]).T, color=colour, lw=0.7 * self.unit, zorder=6,
                 path_effects=halo,
             )  # fmt: skip
             text = axes.text(
                 float(place[0]), float(place[1]), shortened(name), ha="center", va="bottom",
-                color=theme.INK, family=FONT, fontsize=6.6 * self.unit, path_effects=halo, zorder=7,
+                color=theme.INK if seen[k] else theme.MUTED, family=FONT,
+                fontsize=6.6 * self.unit, path_effects=halo, zorder=7,
             )  # fmt: skip
             text.set_parse_math(False)  # names come from files
 
@@ -163,17 +164,19 @@ class Page:
             )
         )
 
-    def title(self, text: str, detail: str) -> None:
-        """Write a title at the top left, and a line of detail under it."""
+    def title(self, text: str, *details: str) -> None:
+        """Write a title at the top left, and lines of detail under it."""
         line = 0.05 * self.size[0] / self.size[1] / 1.6
         self.figure.text(
             0.03, 1 - line, text, fontsize=11 * self.unit, weight="bold", color=theme.INK,
             va="center", family=FONT,
         )  # fmt: skip
-        self.figure.text(
-            0.03, 1 - 1.84 * line, detail, fontsize=7.2 * self.unit, color=theme.MUTED,
-            va="center", family=FONT,
-        )  # fmt: skip
+        for number, detail in enumerate(details):
+            text_ = self.figure.text(
+                0.03, 1 - (1.84 + 0.62 * number) * line, detail, fontsize=7.2 * self.unit,
+                color=theme.MUTED, va="center", family=FONT,
+            )  # fmt: skip
+            text_.set_parse_math(False)  # names come from files
 
     def legend(self, entries: Sequence[tuple[str, Any]]) -> None:
         """Name colours, as (name, colour), in the right margin; many are counted in a last line."""

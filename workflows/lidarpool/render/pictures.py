@@ -48,6 +48,7 @@ def draw_scene(path: Path, shot: Shot, triangles: int) -> None:
     page.title(
         "Scene",
         f"{counted(len(scene.names), 'object')} · {counted(triangles, 'triangle')} · {shot.when}",
+        shot.models,
     )
     page.save(path)
 
@@ -83,7 +84,9 @@ def draw_intensity(
     some = np.linspace(0, len(sample_rays) - 1, min(len(sample_rays), MOST_RAYS)).astype(int)
     page.lines(axes, shot, sample_rays[some].astype(np.float64), 0.45, 0.5)
     page.colour_bar(TURBO, LogNorm(low, high), "hits per square metre")
-    page.title("Ray intensity", f"{counted(count, 'hit')} · {shot.when} · grey: hit by no ray")
+    page.title(
+        "Ray intensity", f"{counted(count, 'hit')} · {shot.when} · grey: hit by no ray", shot.models
+    )
     page.save(path)
 
 
@@ -125,7 +128,7 @@ def draw_cloud(
             )
     page.show(shot, image)
     by = "height" if column is Z else column.name.replace("_", " ")
-    page.title(f"Point cloud by {by}", f"{counted(count, 'point')} · {shot.when}")
+    page.title(f"Point cloud by {by}", f"{counted(count, 'point')} · {shot.when}", shot.models)
     page.save(path)
 
 

@@ -69,6 +69,7 @@ class Shot:
     paths: tuple[Floats, ...]  # of sensors that move, (k, 3) each
     actors: int  # the last objects of the scene, which are named in the pictures
     when: str  # what is drawn, for a caption: how many sensors there are, and at what time
+    models: str  # what the sensors are, for a caption
     stage: Stage
     camera: Camera
     whole: Samples  # through the middle of each pixel
@@ -147,6 +148,7 @@ def take_shot(
     paths: Sequence[Floats] = (),
     actors: int = 0,
     when: str = "",
+    models: str = "",
     size: tuple[int, int] = SIZE,
     backend: str = "auto",
 ) -> Shot:
@@ -167,6 +169,8 @@ def take_shot(
         How many of the last objects are actors.
     when
         How many sensors there are, and at what time they are shown; by default how many.
+    models
+        What the sensors are.
     size
         Width and height of the picture in pixels.
     backend
@@ -221,7 +225,9 @@ def take_shot(
             samples.triangle[there] == GROUND,
         )  # fmt: skip
     when = when or counted(len(sensors), "sensor position")
-    return Shot(scene, sensors, tuple(paths), actors, when, stage, camera, whole, edges, finer)
+    return Shot(
+        scene, sensors, tuple(paths), actors, when, models, stage, camera, whole, edges, finer
+    )
 
 
 def _stage(scene: Scene, sensors: Floats) -> Stage:

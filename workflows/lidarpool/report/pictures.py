@@ -66,6 +66,7 @@ def picture_makers(
             paths=ways,
             actors=len(shown.scene.actors),
             when=shown.when + words,
+            models=shown.models,
             size=size,
         )
 

@@ -25,6 +25,7 @@ from .result import Result
 
 PICTURE_FILE = "pictures.npz"
 
+MODELS_MOST = 4  # sensors that are named in a picture
 PLACES_MOST = 1000  # of a sensor or an actor that moves
 _FORMAT = 3
 _ACTOR = ("vertices", "faces", "times", "positions", "quaternions")
@@ -126,6 +127,13 @@ class Pictured:
                 return words
         words += f" and {counted(actors, 'actor')}" if actors else ""
         return f"{words}, at {self.duration_ns / 2e9:.3g} s of {self.duration_ns / 1e9:.3g} s"
+
+    @property
+    def models(self) -> str:
+        """Say what the sensors are, by their names where they have one."""
+        words = [f"{way.name}: {way.model}" if way.name else way.model for way in self.sensors]
+        more = len(words) - MODELS_MOST
+        return " · ".join(words[:MODELS_MOST]) + (f" · and {more:,} more" if more > 0 else "")
 
     def names_of(self, column: Column) -> Sequence[str]:
         """Names of the values 0, 1, 2, … of a column, where they have some."""

@@ -44,7 +44,11 @@ class Actor:
         try:
             self.trajectory.poses(0, np.array([0.0, duration_ns]))
         except LidarpoolError as error:
-            raise LidarpoolError(f"Actor {self.name!r}: {error}") from error
+            words = str(error).rstrip(".")
+            raise LidarpoolError(
+                f"Actor {self.name!r}: {words}: let its trajectory begin before the survey and end "
+                "after it."
+            ) from error
 
 
 def one_mesh(name: str, meshes: Iterable[Mesh]) -> Mesh:
