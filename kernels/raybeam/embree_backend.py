@@ -72,14 +72,11 @@ class _Hits:
         (n,): local distance of each ray's hit; where it does not count, anything.
     place
         uint32 (n,): row of the mesh's corners; likewise.
-    refined
-        (n,): whether the distance is refined; None if all are rough.
     """
 
     counts: NDArray[np.bool_]
     t: NDArray[np.floating[Any]]
     place: NDArray[np.uint32]
-    refined: NDArray[np.bool_] | None
 
 
 class EmbreeBackend(Backend):
@@ -171,7 +168,7 @@ class EmbreeBackend(Backend):
             unclear &= counts
         ray = np.flatnonzero(unclear)
         if not len(ray):
-            return _Hits(counts, t, place, None)
+            return _Hits(counts, t, place)
         exact = self._refined(ray, t[ray], place[ray], unit, starts)
         t = t.astype(np.float64)
         t[ray] = exact
@@ -180,7 +177,7 @@ class EmbreeBackend(Backend):
         if early.any():
             again, t[again], place[again] = self._beyond(desk, ray[early], unit, starts, limits)
             counts[again] = t[again] <= limits.t_max
-        return _Hits(counts, t, place, unclear)
+        return _Hits(counts, t, place)
 
     def _beyond(
         self,
@@ -219,7 +216,7 @@ class EmbreeBackend(Backend):
         """
         n = unit.shape[1]
         ways: Float | None = None
-        if begin > 0 or max(starts.points.max(), -starts.points.min()) > _NEAR:
+        if begin > 0 or starts.reach > _NEAR:
             points = starts.of(np.arange(n))
             entry, _ = self._mesh.clip(points, unit.T)
             near = np.abs(points).max(axis=1) <= _NEAR
@@ -248,11 +245,11 @@ class EmbreeBackend(Backend):
     ) -> tuple[Float, NDArray[np.intp]]:
         """Refined distances of some hits that count, and their places."""
         rough, place = hits.t.take(ray), hits.place.take(ray)
-        if hits.refined is None:
-            t = self._refined(ray, rough, place, unit, starts)
+        if 2 * len(ray) > len(hits.t):  # to choose directions and starts takes longer
+            every = hits.place.astype(np.intp)
+            t = self._refine.distance(starts.points, unit, every, hits.t).take(ray)
         else:
-            t, rows = rough.astype(np.float64), np.flatnonzero(~hits.refined.take(ray))
-            t[rows] = self._refined(ray[rows], rough[rows], place[rows], unit, starts)
+            t = self._refined(ray, rough, place, unit, starts)
         beyond = np.flatnonzero((t < limits.t_min) | (t > limits.t_max))
         t[beyond] = rough[beyond]
         return t, place.astype(np.intp)

@@ -24,8 +24,9 @@ class Refiner:
         first = mesh.corners[:, 0]
         normal = np.cross(mesh.corners[:, 1] - first, mesh.corners[:, 2] - first)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        # One row a triangle: unit normal, and the plane's distance from zero along it.
-        self._planes = np.column_stack([normal, (normal * first).sum(axis=1)])
+        # One column a triangle: unit normal, and the plane's distance from zero along it. Rays
+        # beside each other meet the same triangles, or such as lie together.
+        self._planes = np.stack([*normal.T, (normal * first).sum(axis=1)])
 
     def distance(
         self,
@@ -45,16 +46,20 @@ class Refiner:
         place
             (m,): rows of the mesh's corners.
         rough
-            (m,): distances in float32 accuracy.
+            (m,): distances in float32 accuracy; inf for a ray that meets nothing.
         """
-        # A row of planes is in one cache line; columns of them are what arithmetic is fast on.
-        x, y, z, offset = np.ascontiguousarray(self._planes.take(place, axis=0).T)
+        x, y, z, offset = (column.take(place, mode="clip") for column in self._planes)
         ox, oy, oz = origins.T
         dx, dy, dz = directions
         offset -= (x * ox + y * oy) + z * oz
+        x *= dx
+        y *= dy
+        z *= dz
+        x += y
+        x += z
         with np.errstate(divide="ignore", invalid="ignore"):
-            t: Float = offset / ((x * dx + y * dy) + z * dz)
-        far = np.flatnonzero(~(np.abs(t - rough) <= _TRUST))
+            t = np.divide(offset, x, out=offset)
+        far = np.flatnonzero(~(np.abs(t - rough) <= _TRUST) & (rough < np.inf))
         if len(far):
             # A grazing ray: the plane alone may be met anywhere, the triangle is not.
             at = origins if len(origins) == 1 else origins[far]

@@ -59,13 +59,13 @@ class Order:
         self.blocks = list(_blocks(skip, skip + rays, each))
 
     def _by_beam(self, length: int, poses: int) -> bool:
-        return not self._plain and poses > length // poses
+        return not self._plain and 1 < poses >= length // poses
 
-    def view(self, slots: NDArray[Any], length: int, poses: int) -> NDArray[Any]:
-        """View slots (length, ...) of a block as (poses, rays of a pose, ...)."""
-        if self._by_beam(length, poses):
-            return slots[:length].reshape(-1, poses, *slots.shape[1:]).swapaxes(0, 1)
-        return slots[:length].reshape(poses, -1, *slots.shape[1:])
+    def view(self, slots: NDArray[Any], poses: int) -> NDArray[Any]:
+        """View the slots of a block (..., length) as (..., poses, rays of a pose)."""
+        if self._by_beam(slots.shape[-1], poses):
+            return slots.reshape(*slots.shape[:-1], -1, poses).swapaxes(-1, -2)
+        return slots.reshape(*slots.shape[:-1], poses, -1)
 
     @cached_property
     def slots(self) -> NDArray[np.intp] | None:
@@ -73,16 +73,8 @@ class Order:
         if not any(self._by_beam(length, poses) for _, length, _, poses in self.blocks):
             return None
         table = np.arange(self._rays)
-        parts = [self.view(table[a:], n, k).reshape(-1) for a, n, _, k in self.blocks]
+        parts = [self.view(table[a : a + n], k).reshape(-1) for a, n, _, k in self.blocks]
         return np.concatenate(parts)
-
-    @cached_property
-    def poses(self) -> NDArray[np.intp]:
-        """Pose of what lies in each slot: (rays,)."""
-        pose = (np.arange(self._rays) + self._skip) // self._each
-        table = np.empty_like(pose)
-        table[slice(None) if self.slots is None else self.slots] = pose
-        return table
 
     def of(self, ray: NDArray[np.intp]) -> NDArray[np.intp]:
         """Where some rays lie."""
@@ -99,24 +91,26 @@ class Starts:
     Parameters
     ----------
     points
-        (m, 3): one for all rays, one for each slot; or with `order` one for each pose.
-    order
-        Of the rays.
+        (n, 3): one for each slot; or (1, 3), that of all.
+    reach
+        No coordinate is farther from zero than this; by default it is looked up.
     """
 
-    def __init__(self, points: Float, order: Order | None = None) -> None:
-        self.points, self.order = points, order
+    def __init__(self, points: Float, reach: float | None = None) -> None:
+        self.points = points
+        if reach is None:
+            reach = max(points.max(initial=0), -points.min(initial=0))
+        self.reach = reach
 
     def of(self, slot: NDArray[np.intp]) -> Float:
         """Look up where some rays start: (len(slot), 3), or (1, 3) when one is that of all."""
         if len(self.points) == 1:
             return self.points
-        row = slot if self.order is None else self.order.poses.take(slot)
         # One axis at a time: `take` along an axis copies all points first where they are
         # transposed, which took as long as half of Embree's cast.
-        out = np.empty((3, len(row)))
+        out = np.empty((3, len(slot)))
         for axis in range(3):
-            self.points[:, axis].take(row, out=out[axis], mode="clip")
+            self.points[:, axis].take(slot, out=out[axis], mode="clip")
         return out.T
 
 
@@ -140,13 +134,14 @@ class Workspace:
         self._given, self._turned = np.empty((2, 2, 3, size))
         self._product = np.empty(min(size, _BLOCK))
         self._crosses = np.empty((3, min(size, _BLOCK)))  # of a lidar that moves within a pose
+        self._started: Starts | None = None  # where rows start, if each by itself
         self._origin: Float | None = None  # where all rows start, if at one point
         self._orders: dict[tuple[int, ...], Order] = {}  # of the last few shapes of chunks
 
     def start(self, n: int, starts: Starts) -> NDArray[np.float32]:
         """Write where n rays start, and return their rows as an engine reads them.
 
-        Nothing is written when all start where the last ones did.
+        Nothing is written when they start where the last ones did.
 
         Returns
         -------
@@ -154,18 +149,14 @@ class Workspace:
         """
         points = starts.points
         if len(points) > 1:
-            self._origin, order = None, starts.order
-            if order is None:
+            self._origin = None
+            if starts is not self._started:
                 for axis in range(3):
                     self._rows[:n, axis] = points[:, axis]
-            else:
-                for at, length, pose, count in order.blocks:
-                    rows = order.view(self._rows[at:], length, count)
-                    for axis in range(3):
-                        rows[..., axis] = points[pose : pose + count, axis, None]
         elif self._origin is None or not np.array_equal(points, self._origin):
             self._origin = points.copy()
             self._rows[:, :3] = points
+        self._started = starts
         return self._rows[:n]
 
     def aim(self, unit: Float) -> None:
@@ -209,32 +200,43 @@ class Workspace:
         given = self._rays(scan, pattern.directions.T, start, self._given[0, :, :n])
         unit = self._turn(given, poses, start, order, self._turned[0, :, :n], written=True)
         first, motion = start // poses.rays, poses.motion
-        if pattern.origins is None and motion is None:
-            positions = poses.positions[first : -(-stop // poses.rays)]
-            return order, unit, Starts(mesh.to_local(positions), order)
+        if len(poses) == 1 and pattern.origins is None and motion is None:
+            return order, unit, Starts(mesh.to_local(poses.positions))
         # The scale is a power of two: scaled before or after, the bits are the same.
-        moved = turned = self._turned[1, :, :n]
+        moved, centre = self._turned[1, :, :n], mesh.centre * mesh.scale
         if pattern.origins is not None:
             room = self._given[1, :, :n]
             given = self._rays(scan, pattern.origins.T, start, room)
             given = np.multiply(given, mesh.scale, out=room[:, : given.shape[1]])
             turned = self._turn(given, poses, start, order, moved, written=False)
+        reach = 0.0
         for at, length, pose, count in order.blocks:
-            some = slice(first + pose, first + pose + count)
-            places, product = poses.positions[some] * mesh.scale, self._product
-            for axis in range(3):
-                out = order.view(moved[axis, at:], length, count)
-                place = places[:, axis, None]
-                if pattern.origins is None:
-                    out[:] = place
+            block, some = slice(at, at + length), slice(first + pose, first + pose + count)
+            out, product = (order.view(a, count) for a in (moved[:, block], self._product[:length]))
+            rows = order.view(self._rows[block].T, count)
+            places = (poses.positions[some] * mesh.scale).T[:, :, None]
+            if pattern.origins is None and motion is None:
+                places = places - centre[:, None, None]
+            if motion is not None:
+                speeds = (motion.velocities[some] * mesh.scale).T[:, :, None]
+                delays = _delays(motion, poses.rays, start + at, length // count)
+            vectors = None if pattern.origins is None else order.view(turned[:, block], count)
+            for axis, points in enumerate(out):
+                if vectors is not None:
+                    np.add(vectors[axis], places[axis], out=points)
+                    if motion is not None:
+                        points += np.multiply(delays, speeds[axis], out=product)
+                elif motion is not None:
+                    np.multiply(delays, speeds[axis], out=points)
+                    points += places[axis]
                 else:
-                    np.add(order.view(turned[axis, at:], length, count), place, out=out)
-                if motion is not None:
-                    speed = motion.velocities[some, axis, None] * mesh.scale
-                    delays = _delays(motion, poses.rays, start + at, length // count)
-                    out += np.multiply(delays, speed, out=order.view(product, length, count))
-                out -= mesh.centre[axis] * mesh.scale
-        return order, unit, Starts(moved.T)
+                    points[:] = places[axis]
+                if vectors is not None or motion is not None:
+                    points -= centre[axis]
+                rows[axis] = points
+            reach = max(reach, moved[:, block].max(), -moved[:, block].min())
+        self._started, self._origin = Starts(moved.T, float(reach)), None
+        return order, unit, self._started
 
     def _order(self, start: int, rays: int, poses: Poses) -> Order:
         """Order of a chunk, made once for those of one shape."""
@@ -272,15 +274,16 @@ class Workspace:
             return given
         first = start // poses.rays
         for at, length, pose, count in order.blocks:
-            product = order.view(self._product, length, count)
+            block, some = slice(at, at + length), slice(first + pose, first + pose + count)
+            product, turned = (
+                order.view(a, count) for a in (self._product[:length], out[:, block])
+            )
             if given.shape[1] == n:
-                vectors = given[:, at : at + length].reshape(3, count, -1)
+                vectors = given[:, block].reshape(3, count, -1)
             else:  # those of one pose
                 skip = (start + at) % poses.rays
                 vectors = given[:, None, skip : skip + length // count]
             x, y, z = vectors
-            turned = [order.view(row[at:], length, count) for row in out]
-            some = slice(first + pose, first + pose + count)
             for axis, total in enumerate(turned):
                 if poses.rotations is None:
                     total[:] = vectors[axis]
@@ -291,18 +294,16 @@ class Workspace:
                 total += np.multiply(z, c, out=product)
             if poses.motion is not None:
                 delays = _delays(poses.motion, poses.rays, start + at, length // count)
-                crosses = [order.view(row, length, count) for row in self._crosses]
+                crosses = order.view(self._crosses[:, :length], count)
                 _drift(turned, poses.motion.rates[some], delays, crosses, product)
             if written:
-                rows = order.view(self._rows[at:], length, count)
+                rows = order.view(self._rows[block].T, count)
                 for axis in range(3):
-                    rows[..., 3 + axis] = turned[axis]
+                    rows[3 + axis] = turned[axis]
         return out
 
 
-def _drift(
-    vectors: list[Float], rates: Float, delays: Float, crosses: list[Float], product: Float
-) -> None:
+def _drift(vectors: Float, rates: Float, delays: Float, crosses: Float, product: Float) -> None:
     """Turn vectors of a block on, in place; with the operations of `Poses.drifted`."""
     x, y, z = vectors
     a, b, c = _factors(rates)
@@ -311,8 +312,7 @@ def _drift(
         np.multiply(p, one, out=cross)
         cross -= np.multiply(q, other, out=product)
         cross *= delays
-    for vector, cross in zip(vectors, crosses, strict=True):
-        vector += cross
+    vectors += crosses
 
 
 def _delays(motion: Motion, each: int, ray: int, count: int) -> Float:

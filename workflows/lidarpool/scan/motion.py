@@ -53,18 +53,17 @@ class Poses:
     motion: Motion | None = None
     clock: Clock | None = None
 
-    @property
+    @cached_property
     def given(self) -> dict[str, Any]:
         """Arguments of `RayCaster.scan` and `Pattern.rays`."""
         if self.rays_per_pose is None:
             return {"positions": self.positions, "rotations": self.rotations}
-        return {"positions": self._checked}
-
-    @cached_property
-    def _checked(self) -> raybeam.poses.Poses:
-        """Checked once: that takes as long as casting a hundredth of the rays."""
-        each = self.rays_per_pose
-        return raybeam.poses.check_poses(self.positions, self.rotations, each, 0, self.motion)
+        # Not checked again, see `check_trajectory`: that takes as long as casting a fortieth.
+        return {
+            "positions": raybeam.poses.Poses(
+                self.positions, self.rotations, self.rays_per_pose, self.motion
+            )
+        }
 
     def times(self, ray: NDArray[np.integer[Any]]) -> Float:
         """When rays are fired, nanoseconds since the survey's start; where there are actors."""
@@ -91,6 +90,18 @@ class Poses:
         return pattern.rays(ray, start=start, **self.given)
 
 
+def check_trajectory(path: Trajectory) -> None:
+    """Look at the first poses of a trajectory, which may be somebody's own, before it is used.
+
+    Raises
+    ------
+    ValueError
+        If a position is not finite or a rotation is none.
+    """
+    for station in range(path.stations):
+        raybeam.poses.check_poses(*path.poses(station, np.zeros(1)), None, 0)
+
+
 def poses_of_firings(
     carried: Mounted, path: Trajectory, station: int, first: int, stop: int
 ) -> Poses:
@@ -109,17 +120,19 @@ def poses_of_firings(
     times = np.minimum(sensor.begins_ns(firings) + sensor.lead_ns, path.duration_ns)
     positions, turns = path.poses(station, times)
     turns = np.broadcast_to(np.eye(3), (len(times), 3, 3)) if turns is None else turns
-    heads, rotations = sensor.heads(firings[:-1]), turns[:-1]
-    if heads is not None:
+    spins, rotations = sensor.spins(firings[:-1]), turns[:-1]
+    if spins is not None:
         mount = carried.mount
         if any(mount.position):
             seat = np.broadcast_to(mount.position, positions.shape)
             positions = positions + into_axes(seat, turns.transpose(0, 2, 1))
         if mount.rotation is not None:
-            rotations = _product(rotations, mount.rotation[None])
-        rotations = _product(rotations, heads)
+            rotations = _product(rotations, mount.rotation)
+        if sensor.axes is not None:
+            rotations = _product(rotations, sensor.axes)
+        rotations = spun(rotations, spins)
     places = positions[:-1]
-    if heads is not None and sensor.centre is not None and sensor.centre.any():
+    if spins is not None and sensor.centre is not None and sensor.centre.any():
         centre = np.broadcast_to(sensor.centre, places.shape)
         places = places + into_axes(centre, rotations.transpose(0, 2, 1))
     delays = (sensor.beams.time_ns - sensor.lead_ns) / 1e9
@@ -144,12 +157,25 @@ def into_axes(vectors: Float, rotations: Float | None) -> Float:
     return out
 
 
-def _product(one: Float, other: Float) -> Float:
-    """Products of matrices (k, 3, 3), or (1, 3, 3), in one order of rounding, however many."""
-    out = np.empty((3, 3, max(len(one), len(other)))).transpose(2, 0, 1)
+def spun(rotations: Float, spins: Float) -> Float:
+    """Products of matrices (k, 3, 3) and turns about z, their cosines and sines (2, k)."""
+    (cos, sin), out = spins, np.empty((3, 3, spins.shape[1])).transpose(2, 0, 1)
     for row in range(3):
-        a, b, c = (one[:, row, k, None] for k in range(3))
-        out[:, row] = (a * other[:, 0] + b * other[:, 1]) + c * other[:, 2]
+        x, y = rotations[:, row, 0], rotations[:, row, 1]
+        out[:, row, 0] = x * cos + y * sin
+        out[:, row, 1] = y * cos - x * sin
+    out[:, :, 2] = rotations[:, :, 2]
+    return out
+
+
+def _product(matrices: Float, matrix: Float) -> Float:
+    """Products of matrices (k, 3, 3) and one (3, 3), in one order of rounding, however many."""
+    out = np.empty((3, 3, len(matrices))).transpose(2, 0, 1)
+    for row in range(3):
+        a, b, c = matrices[:, row].T
+        for column in range(3):
+            x, y, z = matrix[:, column]
+            out[:, row, column] = (a * x + b * y) + c * z
     return out
 
 

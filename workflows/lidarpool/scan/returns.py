@@ -13,7 +13,7 @@ from raybeam import Pattern, ScanReturns
 from ..sensor import ScanSpec
 from ..sensor.materials import at_right_angles
 from .echoes import Echoes
-from .motion import Poses, into_axes
+from .motion import Poses
 
 if TYPE_CHECKING:
     from .rig import Rig
@@ -186,9 +186,11 @@ class BatchReturns:
         """Turn vectors (n, 3) in the axes of the carrier, or the head, to those of the sensor."""
         if self._by_head:
             firings, which = np.unique(self.firing, return_inverse=True)
-            heads = self.sensor.heads(firings)
-            assert heads is not None  # or the rig would not cast by head
-            return into_axes(vectors, heads.transpose(0, 2, 1)[which])
+            spins = self.sensor.spins(firings)
+            assert spins is not None  # or the rig would not cast by head
+            (cos, sin), (x, y, z) = spins[:, which], vectors.T
+            looks = np.stack([x * cos - y * sin, x * sin + y * cos, z], axis=1)
+            return turned(looks, self.sensor.axes)
         mount = self.carried.mount.rotation
         return turned(vectors, None if mount is None else mount.T)
 

@@ -25,7 +25,7 @@ from ..base.tracing import trace
 from ..scene.scene import Scene
 from ..sensor import ScanSpec, Survey
 from .echoes import PATTERN_RAYS, EchoCaster
-from .motion import Clock, Poses, poses_of_firings
+from .motion import Clock, Poses, check_trajectory, poses_of_firings
 from .returns import BatchReturns, turned
 from .surfaces import Surfaces
 from .world import World
@@ -78,10 +78,11 @@ class Rig:
         self._echoes: EchoCaster | None = None  # where plain casting will do
         if EchoCaster.needed(plan.survey, self.surfaces):
             self._echoes = EchoCaster(self._caster, plan.scene, plan.survey, self.surfaces)
+        check_trajectory(plan.survey.path)
         self._whole: list[Pattern | None] = []  # one period of each sensor's head
         self.by_head: list[bool] = []  # whether poses of each sensor are those of its head
         for number, sensor in enumerate(carried.sensor for carried in plan.survey.carried):
-            heads = sensor.heads(np.zeros(1, np.int64)) is not None
+            heads = sensor.spins(np.zeros(1, np.int64)) is not None
             self.by_head.append(plan.survey.path.moves and heads)
             period = 1 if self.by_head[-1] else sensor.period or 0
             fits = 0 < period * sensor.channels <= PATTERN_RAYS

@@ -166,15 +166,22 @@ class Sensor:
         origin = self.beams.origin
         return origin[0] if (origin == origin[0]).all() else None
 
-    def heads(self, firings: NDArray[np.int64]) -> NDArray[np.float64] | None:
-        """Return rotations from the head's axes to the sensor's at firings (k,): (k, 3, 3).
+    def spins(self, firings: NDArray[np.int64]) -> NDArray[np.float64] | None:
+        """Return cosines and sines of the angles that the head is turned by at firings: (2, k).
 
-        None where the rays are not those of beams that such a head turns.
+        About its z axis, which lies in the sensor's axes as `axes` tells. None where the rays are
+        not those of beams that such a head turns.
         """
         kind = type(self)
         if kind.directions is not Sensor.directions or kind.origins is not Sensor.origins:
             return None
-        return self._turned(firings, np.eye(3)).transpose(0, 2, 1)
+        azimuth = self.head.azimuths(firings)
+        return np.stack([np.cos(azimuth), np.sin(azimuth)])
+
+    @property
+    def axes(self) -> NDArray[np.float64] | None:
+        """Rotation to the sensor's axes from those that the head turns in; None where the same."""
+        return None
 
     def _turned(
         self, firings: NDArray[np.int64], vectors: NDArray[np.float64]
@@ -186,11 +193,11 @@ class Sensor:
         azimuth = self.head.azimuths(firings)[:, None]
         cos, sin = np.cos(azimuth), np.sin(azimuth)
         x, y, z = vectors.T
-        out = np.empty((3, len(vectors), len(firings))).T  # the longest loops are along firings
+        out = np.empty((len(firings), len(vectors), 3))
         out[..., 0] = cos * x - sin * y
         out[..., 1] = sin * x + cos * y
         out[..., 2] = z
-        return out
+        return out if self.axes is None else out @ self.axes.T
 
     def begins_ns(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
         """When firings (k,) begin, since the head started: (k,)."""
@@ -224,9 +231,7 @@ class LineSensor(Sensor):
 
     cycle: ClassVar[str] = "cycle"
 
-    def _turned(
-        self, firings: NDArray[np.int64], vectors: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        out = super()._turned(firings, vectors)[..., ::-1]
-        out[..., 2] *= -1
-        return out
+    @property
+    def axes(self) -> NDArray[np.float64]:
+        """See `Sensor.axes`."""
+        return np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
