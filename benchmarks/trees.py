@@ -59,18 +59,16 @@ def compiled(folder: Path) -> ctypes.CDLL:
 
 def count(library: ctypes.CDLL, layout: Layout, mesh: LocalMesh, job: Job) -> dict[str, float]:
     """Cast a job's rays; what was seen a ray, and the share that hit."""
-    columns = job.rotation @ job.directions.T
-    n = columns.shape[1]
+    directions = np.ascontiguousarray(job.directions @ job.rotation.T)
+    n = len(directions)
     distance, place = np.empty(n), np.empty(n, np.int32)
     before = _seen(library)
     hits = 0
     for origin in job.origins:
         tables = (layout.nodes, layout.triangles, layout.corners, layout.faces, layout.frame)
-        # One pose for all rays; the pattern is turned already, and not shifted.
-        poses = (np.array(origin), columns, columns, columns)
-        numbers = (ctypes.c_longlong(n), ctypes.c_longlong(0), *map(ctypes.c_int, (n, n, 0, 0)))
+        rays = (np.array(origin), ctypes.c_int(0), directions)  # one origin for all
         limits = (ctypes.c_longlong(n), ctypes.c_double(0.0), ctypes.c_double(np.inf))
-        _run(library.run_cast_pattern, n, *tables, *poses, *numbers, *limits, distance, place)
+        _run(library, "cast_table", n, *tables, *rays, *limits, distance, place)
         hits += int((place >= 0).sum())
     seen = (_seen(library) - before) / job.rays
     return {**dict(zip(KINDS, seen.tolist(), strict=True)), "hit_share": hits / job.rays}
@@ -80,11 +78,12 @@ def _seen(library: ctypes.CDLL) -> np.ndarray[Any, Any]:
     return np.array(library.what_was_seen()[: len(KINDS)])
 
 
-def _run(kernel: Any, threads: int, *arguments: Any) -> None:
+def _run(library: ctypes.CDLL, name: str, threads: int, *arguments: Any) -> None:
     """Launch a kernel, see tests/raybeam/host/launch.h."""
+    assert getattr(library, f"parameters_{name}")() == len(arguments)
     values = [ctypes.c_void_p(a.ctypes.data) if isinstance(a, np.ndarray) else a for a in arguments]
     pointers = (ctypes.c_void_p * len(values))(*(ctypes.addressof(value) for value in values))
-    kernel(ctypes.c_uint(-(-threads // _BLOCK)), pointers)
+    getattr(library, f"run_{name}")(ctypes.c_uint(-(-threads // _BLOCK)), pointers)
 
 
 def measure(library: ctypes.CDLL, job: Job) -> dict[str, Any]:

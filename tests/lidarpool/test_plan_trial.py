@@ -173,12 +173,3 @@ def test_an_enclosed_start_ends_in_an_honest_plan():
     assert plan.clearance < 0
     assert plan.shortest_possible == np.inf
     assert np.isfinite(plan.path).all()
-
-
-def test_the_benchmark_runs(capsys):
-    from benchmarks import planning as benchmark
-
-    options = "--repeats 2 --particles 40 --iterations 5 --discs 0 6 8 --waypoints 2"
-    benchmark.main(options.split())
-    lines = capsys.readouterr().out.splitlines()[1:]
-    assert [line.split()[0] for line in lines] == ["0", "6", "8"]

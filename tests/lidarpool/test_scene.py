@@ -20,20 +20,6 @@ def world(scene):
     return scene.vertices[scene.faces] + scene.origin
 
 
-def test_seed():
-    scene = Scene.seed()
-    assert scene.names == ("Sphere", "Vase", "Bell", "Pawn", "Spindle", "Bowl")
-    assert scene.vertices.dtype == np.float64
-    assert scene.faces.dtype == scene.face_object.dtype == np.int32
-    assert scene.faces.shape == (76_800, 3)
-    np.testing.assert_array_equal(np.bincount(scene.face_object), [12_800] * 6)
-    np.testing.assert_array_equal(scene.origin, [0, 0, 0])
-    centres = [(-20, -20), (20, -20), (-20, 20), (20, 20), (-10, -5), (5, 5)]
-    np.testing.assert_allclose(scene.footprints[:, :2], centres, atol=1e-12)
-    np.testing.assert_allclose(scene.footprints[:, 2], 2.0, atol=1e-12)
-    np.testing.assert_allclose(scene.bounds, [[-22, -22, 0], [22, 22, 5.1]], atol=1e-12)
-
-
 def test_arrays_cannot_be_changed():
     scene = Scene.seed()
     for array in (scene.vertices, scene.faces, scene.face_object, scene.origin):

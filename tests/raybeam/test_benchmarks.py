@@ -1,16 +1,26 @@
-"""The device's benchmark: it says where there is none, and runs where there is one."""
+"""Benchmarks at toy size: the rates mean nothing, that they run and agree does."""
 
 from __future__ import annotations
 
 import json
 
 import pytest
-from benchmarks import cuda_kernel
+from benchmarks import cuda_kernel, raycast_moving
 
 from raybeam import available_backends
 
 
-def test_says_so_without_a_device(capsys):
+@pytest.mark.slow
+def test_moving_sensors_of_all_numbers_of_beams(capsys):
+    if reason := available_backends()["embree"]:
+        pytest.skip(f"embree: {reason}")
+    assert raycast_moving.main(["--quick"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [int(line.split()[0]) for line in lines] == [16, 16, 64, 64, 128, 128]
+    assert all("x bare; moving" in line and "hits 0 %" not in line for line in lines)
+
+
+def test_the_devices_benchmark_says_so_without_a_device(capsys):
     if not available_backends()["cuda"]:
         pytest.skip("there is a device")
     assert cuda_kernel.main(["--rays", "100"]) == 2
@@ -19,8 +29,7 @@ def test_says_so_without_a_device(capsys):
 
 @pytest.mark.gpu
 @pytest.mark.slow
-def test_runs_at_toy_size(tmp_path, capsys):
-    """The rates mean nothing, the checks do."""
+def test_the_devices_benchmark_runs(tmp_path, capsys):
     if reason := available_backends()["cuda"]:
         pytest.skip(f"cuda: {reason}")
     out = tmp_path / "out.json"

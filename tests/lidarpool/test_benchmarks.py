@@ -1,0 +1,93 @@
+"""Benchmarks at toy size: the times mean nothing, that they run and agree does."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from benchmarks import leaks, planning, raycast, sensors, trees
+
+from lidarpool.scene.city import city
+from lidarpool.scene.scene_file import write_scene
+
+
+@pytest.mark.slow
+def test_every_engine_finds_the_same(tmp_path):
+    mesh, out = write_scene(tmp_path / "village.glb", city(1_000)), tmp_path / "out.json"
+    left_out = ["--without", "Warp CPU", "--without", "Warp CUDA"]  # Warp compiles for seconds
+    scenes = ["--scene", "survey", "--scene", "village"]
+    arguments = ["--quick", *left_out, *scenes, "--mesh", str(mesh), "--json", str(out)]
+    assert raycast.main(arguments) == 0
+    jobs = json.loads(out.read_text())["jobs"]
+    rows = [(row["scene"], row["order"]) for row in jobs]
+    scenes = ["default survey", "village"]
+    assert rows == [(scene, order) for scene in scenes for order in ("coherent", "shuffled")]
+    for row in jobs:
+        shares = {
+            name: entry["hit_share"]
+            for name, entry in row["engines"].items()
+            if name != "brute force, NumPy"  # casts a few of the rays only
+        }
+        assert {"numpy", "embree", "embree, cast alone", "Open3D, bare"} <= set(shares)
+        assert 0.01 < shares["numpy"] < 1
+        np.testing.assert_allclose(list(shares.values()), shares["numpy"], atol=2e-3)
+
+
+@pytest.mark.slow
+def test_no_ray_escapes_from_closed_meshes_but_from_embree(tmp_path, capsys):
+    out = tmp_path / "leaks.json"
+    arguments = ["--rays", "90000", "--triangles", "3000", "--json", str(out)]
+    assert leaks.main(arguments) == 0
+    results = json.loads(out.read_text())
+    assert len(results["numpy"]) == 9
+    for name, meshes in results.items():
+        for entry in meshes.values():
+            assert entry["rays"] == 10_000
+            assert entry["escaped"] <= (0.01 * entry["rays"] if name == "embree" else 0)
+    assert "numpy: 0 of " in capsys.readouterr().out
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("g++") is None, reason="needs g++ to compile the kernels")
+def test_trees_are_about_as_good_as_the_best_there_are(tmp_path):
+    out = tmp_path / "out.json"
+    assert trees.main(["--quick", "--json", str(out)]) == 0
+    rows = json.loads(out.read_text())
+    assert [row["scene"] for row in rows] == ["default survey", "city 2e3", "terrain 2e3"]
+    for row in rows:
+        assert 1 < row["ours"]["nodes"] < 1.06 * row["sweep"]["nodes"]
+        assert row["ours"]["triangles"] < 1.1 * row["sweep"]["triangles"]
+        assert row["ours"]["nodes"] < 0.9 * row["clustered"]["nodes"]
+        assert 0 < row["ours"]["hit_share"] < 1
+        assert len({row[name]["hit_share"] for name in trees.TREES}) == 1
+
+
+def test_every_case_of_a_sensor(tmp_path, capsys):
+    out = tmp_path / "out.json"
+    arguments = ["--quick", "--model", "velodyne/vlp16", "--backend", "numpy", "--json", str(out)]
+    assert sensors.main(arguments) == 0
+    [row] = json.loads(out.read_text())["models"]
+    assert tuple(row["seconds"]) == sensors.CASES
+    assert all(len(rounds) == 2 for rounds in row["seconds"].values())
+    assert all(0.1 < share < 1 for share in row["hits"].values())
+    assert row["hits"]["ten actors"] != row["hits"]["moving"], "the actors are seen"
+    said = capsys.readouterr().out
+    assert "mujoco and pyhelios3d: not installed" in said and "the bar of 1.15 x" in said
+
+
+def test_other_simulators_get_the_same_rays(tmp_path):
+    survey = sensors.surveys("ouster/os1-128", 0.02)["moving"]
+    sensors.write_job(survey, city(2_000), tmp_path / "job.npz")
+    job = np.load(tmp_path / "job.npz")
+    assert len(job["directions"]) == survey.ray_count == 128 * len(job["origins"])
+    assert np.ptp(job["origins"], axis=0)[0] == pytest.approx(20 * 0.0019, rel=0.05)
+    assert job["turned"] == pytest.approx(len(job["origins"]) / 1024)
+
+
+def test_planning(capsys):
+    options = "--repeats 2 --particles 40 --iterations 5 --discs 0 6 8 --waypoints 2"
+    planning.main(options.split())
+    lines = capsys.readouterr().out.splitlines()[1:]
+    assert [line.split()[0] for line in lines] == ["0", "6", "8"]
