@@ -79,8 +79,8 @@ def told(job: Job, found: dict[str, Any]) -> Iterator[str]:
 
     sensor, estimate, disk = job.survey.sensor, found["estimate"], found["disk"]
     turn = f"{sensor.channels:,} a firing"
-    if sensor.period is not None:
-        turn = f"{sensor.period:,} x {sensor.channels:,} a turn"
+    if sensor.period is not None and sensor.cycle != "frame":
+        turn = f"{sensor.period:,} x {sensor.channels:,} a {sensor.cycle}"
     yield f"scene       {counted(found['objects'], 'object')}, {found['triangles']:,} triangles"
     sides = list(zip("xyz", *found["bounds"], strict=True))
     yield (

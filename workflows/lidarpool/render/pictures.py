@@ -23,7 +23,7 @@ from .shot import Shot
 Floats = NDArray[np.float64]
 
 MOST_POINTS = 1_000_000  # of a cloud are drawn; a picture has a few more pixels
-MOST_RAYS = 600
+MOST_RAYS, MOST_OF_MOVING = 600, 150  # more from one way would hide what they hit
 # An object that covers this much of the ground, and has the scene in it, is a floor or a hall.
 SURROUNDING = 0.6
 
@@ -81,7 +81,8 @@ def draw_intensity(
     ends = sample_rays[:, 1]
     inside = (ends >= lowest - slack) & (ends <= highest + slack)
     sample_rays = sample_rays[inside.all(axis=1)]
-    some = np.linspace(0, len(sample_rays) - 1, min(len(sample_rays), MOST_RAYS)).astype(int)
+    most = min(len(sample_rays), MOST_OF_MOVING if shot.paths else MOST_RAYS)
+    some = np.linspace(0, len(sample_rays) - 1, most).astype(int)
     page.lines(axes, shot, sample_rays[some].astype(np.float64), 0.45, 0.5)
     page.colour_bar(TURBO, LogNorm(low, high), "hits per square metre")
     page.title(
