@@ -107,10 +107,7 @@ MATERIAL = (
         {"here": f"<rotate>0 0 0 0</rotate>{HERE}"},
         {"here": f"<lookat>0 0 0  0 0 -1  0 1 0</lookat>{HERE}"},
         {"numbers": f"7 7 {SQUARES}", "accessor": 'count="8" stride="3" offset="2"'},
-        {
-            "numbers": SQUARES.replace("  ", " 99 ") + " 99",
-            "accessor": 'count="8" stride="4"',
-        },
+        {"numbers": SQUARES.replace("  ", " 99 ") + " 99", "accessor": 'count="8" stride="4"'},
         {"primitive": f'<tristrips count="1">{V}<p>0 1 3 2</p></tristrips>'},
         {"primitive": f'<trifans count="1">{V}<p>0 1 2 3</p></trifans>'},
         {"primitive": f'<polygons count="1">{V}<p>0 1 2 3</p></polygons>'},

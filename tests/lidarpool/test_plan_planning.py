@@ -26,10 +26,7 @@ BAD = {
     "radii too many": ({"centres": [(0, 0)], "radii": [1, 2]}, "one for each disc or one for all"),
     "radius 0": ({"centres": [(0, 0), (5, 5)], "radii": [1, 0]}, "above 0"),
     "radius below 0": ({"centres": [(0, 0)], "radii": -1}, "above 0"),
-    "radius not finite": (
-        {"centres": [(0, 0)], "radii": np.inf},
-        "radii is inf; it must be fin",
-    ),
+    "radius not finite": ({"centres": [(0, 0)], "radii": np.inf}, "radii is inf; it must be fin"),
     "no trials": ({"trials": 0}, "trials is 0; .* at least 1"),
     "no particles": ({"particles": 0}, "particles is 0; .* at least 1"),
     "no iterations": ({"iterations": -1}, "iterations is -1; .* at least 1"),

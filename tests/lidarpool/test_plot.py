@@ -100,8 +100,7 @@ def test_what_is_pictured_comes_back(planned, unplanned, tmp_path):
 def test_what_moves_is_drawn_where_it_is_halfway(tmp_path):
     """Along x, the sensor at 10 m/s and an actor towards it."""
     scene = replace(
-        Scene.seed(),
-        actors=(Actor(box("Van", (5, 2, 2)), Track([0, 1], [[20, 3, 0], [0, 3, 0]])),),
+        Scene.seed(), actors=(Actor(box("Van", (5, 2, 2)), Track([0, 1], [[20, 3, 0], [0, 3, 0]])),)
     )
     drive = Track([0, 1], [[0, 0, 1], [10, 0, 1]])
     nose = Mounted(Sensor.grid(), Pose((2, 0, 0)), "nose")

@@ -344,7 +344,7 @@ def test_materials_returns_noise_and_weather_become_those_of_the_survey():
                 {"objects": ["V*", "Bowl"], "transparent": "pass"},
             ],
             "actors": [
-                {"name": "Van", "box": [4, 2, 2], "class": 9, "trajectory": {"points": points}},
+                {"name": "Van", "box": [4, 2, 2], "class": 9, "trajectory": {"points": points}}
             ],
             "returns": {"mode": "dual", "subrays": 7},
             "noise": {"range_m": 0.02, "seed": 3},

@@ -20,13 +20,6 @@ def world(scene):
     return scene.vertices[scene.faces] + scene.origin
 
 
-def test_arrays_cannot_be_changed():
-    scene = Scene.seed()
-    for array in (scene.vertices, scene.faces, scene.face_object, scene.origin):
-        with pytest.raises(ValueError, match="read-only"):
-            array[0] = 0
-
-
 @given(
     st.tuples(*[st.floats(-6e6, 6e6)] * 3),
     st.lists(st.tuples(*[st.floats(-500, 500)] * 3), min_size=1, max_size=5),

@@ -7,10 +7,8 @@ import pytest
 from lidarpool.base.task_book import (
     MISPLACED_MOST,
     RECORDS_MOST,
-    SPANS_MOST,
     StageTotals,
     TaskBook,
-    union,
 )
 from poolpart import TaskRecord
 
@@ -58,12 +56,3 @@ def test_tasks_elsewhere_are_counted_and_the_first_are_kept():
         record(n, ("OTHER",) if n % 2 else ()) for n in range(MISPLACED_MOST)
     ]
     assert totals.resources == {"OTHER": 30, "none": 30}
-
-
-def test_busy_times_are_bounded_and_hardly_wrong():
-    totals = StageTotals("intersect", "GPU")
-    for number in range(4 * SPANS_MOST):
-        totals.add(record(number, every=0.5 + 1e-5))  # pauses of 10 microseconds
-    assert len(totals.busy) <= SPANS_MOST
-    spans = union(totals.busy)
-    assert sum(stop - start for start, stop in spans) == pytest.approx(totals.seconds, rel=1e-3)

@@ -34,9 +34,7 @@ def exact(corners, origin, direction):
 
 
 @settings(
-    max_examples=60,
-    derandomize=True,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
+    max_examples=60, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(
     corners=hnp.arrays(
