@@ -18,7 +18,7 @@ from ..plan import Planning
 from ..render.closeup import around_ways
 from ..render.colouring import colours_of
 from ..render.theme import object_colours
-from ..run.picture_file import SensorWay
+from ..run.picture_file import SensorWay, ways_of
 from ..scene.scene import Scene
 from ..sensor.trajectory import quaternions_of
 from .colouring import as_bytes, legend_of
@@ -79,7 +79,7 @@ class View:
         self._poses = places_of(sensors)
         self._actors = () if scene is None else scene.actors
         self._origin, self._ground = origin, float(bounds[0, 2])
-        near = around_ways(bounds, [way.positions for way in sensors if way.moves])
+        near = around_ways(bounds, ways_of(sensors, self._actors, duration_ns))
         near = bounds if near is None else near
         self._size_m = float(np.linalg.norm(near[1] - near[0])) or 1.0
         self._columns = {c.name: c for c in (Z, *(c for c in table if c not in AXES))}

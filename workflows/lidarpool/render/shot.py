@@ -181,7 +181,7 @@ def take_shot(
     stage = _stage(scene, everywhere)
     surface = Surface.of(scene, backend)
     # What moves is on the ground, between what stands there.
-    camera, reach = _camera(stage, size, 48.0 if len(paths) else 33.0), np.inf
+    camera, reach = _camera(stage, size, 48.0 if len(paths) or actors else 33.0), np.inf
     cutaway = plan_cutaway(surface, everywhere, camera.eye)
     if cutaway is not None:
         # From higher up more of the floor is seen between what stands on it.

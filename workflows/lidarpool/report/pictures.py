@@ -16,7 +16,7 @@ from ..export.cloud_file import CloudFile
 from ..render.closeup import around_ways, cut_out
 from ..render.pictures import MOST_POINTS, draw_cloud, draw_intensity, draw_scene
 from ..render.shot import SIZE, Shot, take_shot
-from ..run.picture_file import Pictured
+from ..run.picture_file import Pictured, ways_of
 from ..scene.scene import Scene
 from .path_picture import draw_path
 
@@ -46,13 +46,14 @@ def picture_makers(
     def part() -> tuple[Scene, NDArray[np.int64], NDArray[np.float64], str]:
         """Cut out what is drawn; of each triangle, which it was and how much, and words on it."""
         scene = shown.scene.solid(middle)
-        box = around_ways(scene.bounds, ways)
+        happening = ways_of(shown.sensors, shown.scene.actors, shown.duration_ns)
+        box = around_ways(scene.bounds, happening)
         if box is None:
             return scene, np.arange(len(scene.faces)), np.ones(len(scene.faces)), ""
         wide, deep, _ = box[1] - box[0]
         top = box[1, 2] + scene.origin[2]
         return *cut_out(scene, box), (
-            f" · drawn: {wide:,.0f} × {deep:,.0f} m around the way, below z = {top:,.0f} m"
+            f" · drawn: {wide:,.0f} × {deep:,.0f} m around what moves, below z = {top:,.0f} m"
         )
 
     @cache

@@ -263,6 +263,21 @@ def sensor_ways(survey: Survey) -> list[SensorWay]:
     return ways
 
 
+def ways_of(
+    sensors: Sequence[SensorWay], actors: Sequence[Actor], duration_ns: float
+) -> list[NDArray[np.float64]]:
+    """Where something happens in a scene: ways (k, 3) of sensors, else of actors and their sensors.
+
+    There are none where nothing moves.
+    """
+    moving = [way.positions for way in sensors if way.moves]
+    if moving or not actors:
+        return moving
+    times = np.linspace(0, duration_ns, PLACES_MOST)
+    ways = [actor.trajectory.poses(0, times)[0] for actor in actors]
+    return [*(way.positions for way in sensors), *ways]
+
+
 def _sampled(actor: Actor, duration_ns: float) -> Actor:
     """Return an actor with poses of a survey, whatever its trajectory is."""
     times = np.linspace(0, max(duration_ns, 1.0), PLACES_MOST)
