@@ -102,6 +102,9 @@ def write(tmp_path: Path) -> Callable[..., tuple[str, dict[str, Any]]]:
             book.add(task)
         result = Result(
             **{
+                "scene": scene,
+                "survey": survey,
+                "planning": plan,
                 "points": cloud_of(points, len(names), survey.scan_count, 16),
                 "plan": best(trials, plan) if plan else None,
                 "trials": trials,
@@ -127,7 +130,7 @@ def write(tmp_path: Path) -> Callable[..., tuple[str, dict[str, Any]]]:
             (tmp_path / name).write_bytes(f"picture {name}".encode())
         files = [*pictures, "report.html", "report.json"]
         cloud = counted(result.points, len(scene.names))
-        report = make_report(result, scene, survey, plan, files, cloud)
+        report = make_report(result, files, cloud)
         write_page(tmp_path / "report.html", report, result, cloud, scenario)
         return (tmp_path / "report.html").read_text(encoding="utf-8"), report
 

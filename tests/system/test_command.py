@@ -26,7 +26,7 @@ from distributed import Client
 
 import lidarpool.cli.run_command
 import lidarpool.report.output
-from lidarpool import LidarpoolError, read_cloud, simulate
+from lidarpool import LidarpoolError, Result, read_cloud, simulate
 from lidarpool.report.output import FILES, write_result
 from lidarpool.scenario.scenario import Scenario
 
@@ -302,13 +302,13 @@ def test_bars_on_a_terminal(tmp_path, cluster):
 
 
 @pytest.fixture(scope="module")
-def made(cluster) -> tuple[Any, ...]:
-    """A result with scene, survey and planning, to be written."""
+def made(cluster) -> Result:
+    """A result to be written."""
     scenario = Scenario.from_data({"sensor": {"layers": 4}, "planning": {"trials": 2}})
     scene = scenario.build_scene()
     survey, planning = scenario.survey(scene), scenario.plan(scene)
     with Client(cluster, set_as_default=False) as client:
-        return simulate(scene, survey, planning, client=client), scene, survey, planning
+        return simulate(scene, survey, planning, client=client)
 
 
 def earlier(folder: Path) -> dict[str, bytes]:
@@ -336,7 +336,7 @@ def test_a_file_that_cannot_be_written_leaves_the_earlier_result(
 
     monkeypatch.setattr(lidarpool.report.output, "flush", full)
     with pytest.raises(LidarpoolError, match=r"out \(No space left on device\): make room"):
-        write_result(tmp_path / "out", *made)
+        write_result(tmp_path / "out", made)
     assert content(tmp_path / "out") == before
     assert {path.name for path in (tmp_path / "out").iterdir()} == before.keys()
 

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from .columns.table import Column
     from .export.ply import read_cloud, save_cloud
     from .plan import Plan, Planning
+    from .report.output import save_result
     from .run.result import Result
     from .run.simulation import simulate
     from .run.store import remove_run
@@ -60,6 +61,7 @@ __all__ = [
     "read_cloud",
     "remove_run",
     "save_cloud",
+    "save_result",
     "simulate",
 ]
 
@@ -73,6 +75,7 @@ _MODULES = {
     "plan": ("Plan", "Planning"),
     "run.result": ("Result",),
     "run.simulation": ("simulate",),
+    "report.output": ("save_result",),
     "run.store": ("remove_run",),
     "scan": ("Frame",),
     "scene.scene": ("Scene",),

@@ -130,9 +130,6 @@ def _simulate(
                 report = write_result(
                     options.out,
                     result,
-                    job.scene,
-                    job.survey,
-                    job.planning,
                     scenario,
                     in_place,
                     only_cloud=only_cloud,

@@ -9,6 +9,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from raybeam.open3d_module import load_open3d
+
 from ..base.errors import LidarpoolError
 from .table import TABLE, Column
 
@@ -113,6 +115,22 @@ class Cloud:
         if not len(self):
             return np.zeros((2, 3), self.positions.dtype)
         return np.stack([self.positions.min(axis=0), self.positions.max(axis=0)])
+
+    def to_dataframe(self) -> Any:
+        """Return a pandas DataFrame of all columns, by their names in files."""
+        import pandas as pd
+
+        columns = dict(zip("xyz", self.positions.T, strict=True))
+        return pd.DataFrame(columns | {c.in_files: self[c.name] for c in self.table})
+
+    def to_open3d(self) -> Any:
+        """Return an `open3d.t.geometry.PointCloud` of all columns, by their names in files."""
+        o3d = load_open3d()
+        cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(np.ascontiguousarray(self.positions)))
+        for column in self.table:
+            values = np.ascontiguousarray(self[column.name])[:, None]
+            cloud.point[column.in_files] = o3d.core.Tensor(values)
+        return cloud
 
     def part(self, rows: slice | NDArray[np.integer]) -> Cloud:
         """Return some of the points; consecutive ones as views."""

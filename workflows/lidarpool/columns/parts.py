@@ -287,6 +287,26 @@ class StoredCloud:
             clouds.append(self.cloud_of(self.part(self.names[i]), inside))
         return Cloud.joined(clouds) if clouds else self.load()
 
+    def to_dask(self) -> Any:
+        """Return a Dask DataFrame of all columns, a partition for each part.
+
+        Whoever computes it must see the parts, and the result must be kept until then.
+        """
+        import dask.dataframe as dd
+
+        bare = StoredCloud(
+            self.storage, (), (), self._columns, None, self._precision_m, self._origin
+        )
+        filled = [name for name, rows in zip(self.names, self.rows, strict=True) if rows]
+        empty = bare.load().to_dataframe()
+        if not filled:
+            return dd.from_pandas(empty, npartitions=1)
+        return dd.from_map(bare.frame_of, filled, meta=empty)
+
+    def frame_of(self, name: str) -> Any:
+        """Return a pandas DataFrame of a part."""
+        return self.cloud_of(self.part(name)).to_dataframe()
+
     def load(self) -> Cloud:
         """Read the whole cloud into memory."""
         parts = list(self.chunks())

@@ -22,12 +22,9 @@ from ..columns.storage import flush
 from ..export.formats import Format, remove
 from ..export.ply import save_cloud
 from ..export.sweeps import SWEEPS_FILE, Sweeps
-from ..plan import Planning
 from ..run.picture_file import PICTURE_FILE, Pictured
 from ..run.result import Result
 from ..scenario.scenario import Scenario
-from ..scene.scene import Scene
-from ..sensor import Survey
 from .cloud_numbers import CountedCloud
 from .report import make_report
 
@@ -78,12 +75,37 @@ def result_folder(folder: Path) -> Iterator[None]:
         os.close(lock)
 
 
+def save_result(
+    folder: str | Path,
+    result: Result,
+    *,
+    only_cloud: bool = False,
+    formats: Sequence[str] = (),
+) -> None:
+    """Write what `lidarpool run` does: cloud, pictures and report, all of them or none.
+
+    Parameters
+    ----------
+    folder
+        Made if it is not there; an earlier result in it is replaced.
+    only_cloud
+        Leave pictures and `report.html` out.
+    formats
+        Other formats to write the cloud in as well, such as "laz"; see `lidarpool export`.
+
+    Raises
+    ------
+    LidarpoolError
+        If a file cannot be written, or a format lacks a package or column.
+    """
+    wanted = [Format(name) for name in formats]
+    with result_folder(Path(folder)):
+        write_result(Path(folder), result, only_cloud=only_cloud, formats=wanted)
+
+
 def write_result(
     folder: Path,
     result: Result,
-    scene: Scene,
-    survey: Survey,
-    planning: Planning | None,
     scenario: Scenario | None = None,
     then: Callable[[], object] = lambda: None,
     only_cloud: bool = False,
@@ -103,6 +125,7 @@ def write_result(
         If a file cannot be written.
     """
     staged = folder / f"{_WRITING}{secrets.token_hex(4)}"
+    scene, survey = result.scene, result.survey
     counted = CountedCloud(result.points, len(scene.all_names))
     makers: dict[str, Callable[[Path], object]] = {}
     # Pictures are drawn beside the writing of the cloud, which keeps one core busy.
@@ -112,7 +135,7 @@ def write_result(
         from .page.page import write_page
         from .pictures import picture_makers
 
-        shown = Pictured.of(result, scene, survey, planning)
+        shown = Pictured.of(result)
         # The cloud is drawn from its file, as by `lidarpool plot`, so that both draw the same.
         pictures = picture_makers(shown, staged / CLOUD)
         makers = {f"{name}.png": draw for name, draw in pictures.items()} | {
@@ -129,7 +152,7 @@ def write_result(
         sweeps.save(staged / SWEEPS_FILE)
         for one in formats:
             one.write(staged / one.file, result.points, sweeps)
-        report = make_report(result, scene, survey, planning, files, counted)
+        report = make_report(result, files, counted)
         if not only_cloud:
             drawn.append(beside.submit(makers[OF_CLOUD], staged / OF_CLOUD))
             for each in drawn:

@@ -14,7 +14,6 @@ import numpy as np
 
 from .._version import __version__
 from ..base.task_book import StageTotals, union
-from ..plan import Planning
 from ..run.result import Result
 from ..run.trials import TRIAL
 from ..scan import COLLECT, GENERATE, INTERSECT, SORT
@@ -50,9 +49,6 @@ def versions() -> dict[str, str]:
 
 def make_report(
     result: Result,
-    scene: Scene,
-    survey: Survey,
-    planning: Planning | None,
     files: Sequence[str],
     cloud: CountedCloud,
 ) -> dict[str, Any]:
@@ -60,6 +56,7 @@ def make_report(
 
     Lengths are in metres, times in seconds; what is infinite or unknown is None.
     """
+    scene, survey = result.scene, result.survey
     return {
         "versions": versions(),
         "machine": {"system": platform.platform(), "processor": platform.machine()},
@@ -87,7 +84,7 @@ def make_report(
         "replayed": result.replayed,
         "duplicates_dropped": result.duplicates_dropped,
         "resumed_scans": result.resumed,
-        "planning": _planning(result, planning, scene),
+        "planning": _planning(result),
         "files": list(files),
     }
 
@@ -202,12 +199,12 @@ def overlap_seconds(totals: Iterable[StageTotals]) -> float:
     return sum(max(0.0, min(a[1], b[1]) - max(a[0], b[0])) for a in casting for b in planning)
 
 
-def _planning(result: Result, planning: Planning | None, scene: Scene) -> dict[str, Any] | None:
+def _planning(result: Result) -> dict[str, Any] | None:
     """Tell what was planned and found; places are in world coordinates, as in the scenario."""
-    plan = result.plan
+    plan, planning = result.plan, result.planning
     if plan is None or planning is None:
         return None
-    origin = scene.origin[:2]
+    origin = result.scene.origin[:2]
     return {
         "start": (planning.start + origin).tolist(),
         "target": (planning.target + origin).tolist(),

@@ -98,18 +98,17 @@ class Pictured:
     own: Sequence[Column] = ()
 
     @classmethod
-    def of(
-        cls, result: Result, scene: Scene, survey: Survey, planning: Planning | None
-    ) -> Pictured:
+    def of(cls, result: Result) -> Pictured:
         """Return what the pictures of a result show."""
+        scene, survey = result.scene, result.survey
         actors = tuple(_sampled(actor, survey.duration_ns) for actor in scene.actors)
         return cls(
             replace(scene, actors=actors),
             sensor_ways(survey),
             result.hit_counts,
             result.sample_rays,
-            planning if result.plan is not None else None,
-            result.plan if planning is not None else None,
+            result.planning,
+            result.plan,
             [trial.waypoints for trial in result.trials],
             survey.duration_ns,
             [replace(c, source="") for c in survey.stored_columns if c.name not in TABLE],

@@ -261,6 +261,9 @@ def make_result(
     job = store.job
     trials = tuple(sorted(store.db.trials, key=lambda trial: trial.trial))
     return Result(
+        scene=job.scene,
+        survey=job.survey,
+        planning=job.planning,
         points=store.points(),
         plan=best(trials, job.planning) if job.planning else None,
         trials=trials,
