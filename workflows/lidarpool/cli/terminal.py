@@ -10,10 +10,9 @@ from contextlib import contextmanager, suppress
 from typing import Any, TextIO, cast
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn
-from rich.progress import Progress as Bars
 
-from ..run.progress import STAGES, Progress, Show, in_words, is_sure, time_in_words
+from ..run.bars import Pace, bars, standing_still
+from ..run.progress import STAGES, Progress, Show
 
 # Plain lines come as a tenth of the time has passed again, within these bounds: a survey of
 # hours should not fill a log.
@@ -30,7 +29,7 @@ def shown_progress(quiet: bool = False) -> Iterator[Show]:
     if quiet or sys.stderr is None:
         yield lambda progress: None
     elif (console := _terminal()) is not None:
-        with _bars(console) as show:
+        with bars(console) as show:
             yield show
     else:
         yield PlainLines(_Unheard(sys.stderr))
@@ -81,29 +80,6 @@ def _tell(stream: Any, line: str) -> None:
     stream.write(f"{time.strftime('%H:%M:%S')}  {line}\n")
 
 
-class _Pace:
-    """Rate of a count since it was first seen, and the time that the rest of it takes."""
-
-    def __init__(self) -> None:
-        self._first: tuple[float, int] | None = None
-
-    def told(self, seconds: float, count: int, whole: int) -> str:
-        """Rate and time left; empty as long as nothing has come."""
-        begin, before = self._first = self._first or (seconds, count)
-        if count == before or seconds == begin:
-            return ""
-        rate = (count - before) / (seconds - begin)
-        sure = is_sure(count, whole, seconds) and count < whole
-        left = f"  {time_in_words((whole - count) / rate)} left" if sure else ""
-        return f"{in_words(rate)}/s{left}"
-
-
-def _standing(progress: Progress) -> str:
-    """Why no more scans come; empty where they do."""
-    slots = progress.waits_for
-    return f"waits for slots of {slots}, which other runs hold" if slots else ""
-
-
 class PlainLines:
     """Progress as lines of text; call it with each `Progress`.
 
@@ -116,14 +92,14 @@ class PlainLines:
     def __init__(self, stream: Any) -> None:
         self.stream = stream
         self._next = PLAIN_EVERY_S[0]  # seconds since the start at which to tell again
-        self._paces = {"survey": _Pace(), "planning": _Pace()}
+        self._paces = {"survey": Pace(), "planning": Pace()}
         self._done: set[str] = set()
         self._standing = ""  # what was said of it
 
     def __call__(self, progress: Progress) -> None:
         """Write what is new, if it is time or something has been completed."""
         now = progress.seconds
-        if (standing := _standing(progress)) != self._standing:
+        if (standing := standing_still(progress)) != self._standing:
             self._standing = standing
             words = standing or "goes on"
             _tell(self.stream, f"run  {words}, {progress.collected:,} scans are done")
@@ -151,31 +127,3 @@ class PlainLines:
             _tell(self.stream, f"{what}  done: {whole}")
         elif due and count < total:
             _tell(self.stream, f"{what}  {count:,} of {total:,} {unit}  {pace}".rstrip())
-
-
-@contextmanager
-def _bars(console: Console) -> Iterator[Show]:
-    columns = (
-        TextColumn("{task.description:<11}"),
-        BarColumn(bar_width=None),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[unit]:<6}"),
-        TextColumn("{task.fields[pace]}", style="progress.remaining"),
-    )
-    with Bars(*columns, console=console) as bars:
-        lines: dict[str, TaskID] = {}
-        paces = {label: _Pace() for label, _, _ in STAGES}
-
-        def show(progress: Progress) -> None:
-            """Move the bars; one appears when its total is known."""
-            for label, count, unit in STAGES:
-                done, total = getattr(progress, count), getattr(progress, unit)
-                if total and label not in lines:
-                    lines[label] = bars.add_task(label, total=total, unit=unit, pace="")
-                if label in lines:
-                    pace = paces[label].told(progress.seconds, done, total)
-                    if unit == "scans" and done < total:
-                        pace = _standing(progress) or pace
-                    bars.update(lines[label], completed=done, pace=pace)
-
-        yield show

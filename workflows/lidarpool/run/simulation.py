@@ -14,6 +14,7 @@ from ..plan import Planning
 from ..scan import Frame
 from ..scene.scene import Scene
 from ..sensor import Survey
+from .bars import notebook_bars
 from .checks import check_backend_here
 from .connection import local_client
 from .job import Job
@@ -64,7 +65,8 @@ def simulate(
         then, see `Frame.points`. It is called in this thread: while it takes its time the
         pipeline waits, and nothing is lost.
     on_progress
-        Called some ten times a second with how far things are.
+        Called some ten times a second with how far things are. In a notebook there are bars
+        without it.
     queue_capacity
         Items that stage 1 may be ahead of stage 2.
     collectors
@@ -139,10 +141,11 @@ def simulate(
                 tls=tls,
             )
             if client is None
-            else nullcontext(client) as client
+            else nullcontext(client) as client,
+            notebook_bars() if on_progress is None else nullcontext(on_progress) as show,
         ):
             run = Run(client, store, logger.info)
             with nullcontext() if own else run.partitions_page():
-                result = run.drive(on_frame, on_progress)
+                result = run.drive(on_frame, show)
             store.db.unlock()
             return result

@@ -1,0 +1,27 @@
+"""The notebook among the examples, executed as a user would."""
+
+from pathlib import Path
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+
+EXAMPLE = Path(__file__).parents[2] / "examples/drive.ipynb"
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_the_notebook_shows_progress_a_result_a_table_and_a_picture(tmp_path):
+    notebook = nbformat.read(EXAMPLE, 4)
+    assert not any(cell.get("outputs") for cell in notebook.cells)  # they would grow old
+    NotebookClient(notebook, timeout=600, resources={"metadata": {"path": tmp_path}}).execute()
+    shown = [output for cell in notebook.cells for output in cell.get("outputs", ())]
+    assert not [output for output in shown if output.output_type == "error"]
+    kinds = [set(output.data) for output in shown if "data" in output]
+    assert any("application/vnd.jupyter.widget-view+json" in kind for kind in kinds)  # bars
+    assert any("image/png" in kind for kind in kinds)
+    result = next(
+        o.data["text/html"] for o in shown if "survey" in o.get("data", {}).get("text/html", "")
+    )
+    assert "180 scans, 144,688 rays" in result
+    assert "cloud.parquet" in shown[-1].data["text/plain"]

@@ -1,0 +1,76 @@
+"""Bars of a run's progress, at a terminal or in a notebook."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn
+from rich.progress import Progress as Bars
+
+from .progress import STAGES, Progress, Show, in_words, is_sure, time_in_words
+
+
+class Pace:
+    """Rate of a count since it was first seen, and the time that the rest of it takes."""
+
+    def __init__(self) -> None:
+        self._first: tuple[float, int] | None = None
+
+    def told(self, seconds: float, count: int, whole: int) -> str:
+        """Rate and time left; empty as long as nothing has come."""
+        begin, before = self._first = self._first or (seconds, count)
+        if count == before or seconds == begin:
+            return ""
+        rate = (count - before) / (seconds - begin)
+        sure = is_sure(count, whole, seconds) and count < whole
+        left = f"  {time_in_words((whole - count) / rate)} left" if sure else ""
+        return f"{in_words(rate)}/s{left}"
+
+
+def standing_still(progress: Progress) -> str:
+    """Why no more scans come; empty where they do."""
+    slots = progress.waits_for
+    return f"waits for slots of {slots}, which other runs hold" if slots else ""
+
+
+@contextmanager
+def bars(console: Console) -> Iterator[Show]:
+    """Bars by stage with rates and time left; gives the function that moves them."""
+    columns = (
+        TextColumn("{task.description:<11}"),
+        BarColumn(bar_width=None),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[unit]:<6}"),
+        TextColumn("{task.fields[pace]}", style="progress.remaining"),
+    )
+    with Bars(*columns, console=console) as shown:
+        lines: dict[str, TaskID] = {}
+        paces = {label: Pace() for label, _, _ in STAGES}
+
+        def show(progress: Progress) -> None:
+            """Move the bars; one appears when its total is known."""
+            for label, count, unit in STAGES:
+                done, total = getattr(progress, count), getattr(progress, unit)
+                if total and label not in lines:
+                    lines[label] = shown.add_task(label, total=total, unit=unit, pace="")
+                if label in lines:
+                    pace = paces[label].told(progress.seconds, done, total)
+                    if unit == "scans" and done < total:
+                        pace = standing_still(progress) or pace
+                    shown.update(lines[label], completed=done, pace=pace)
+
+        yield show
+
+
+@contextmanager
+def notebook_bars() -> Iterator[Show | None]:
+    """Bars in the output of a notebook's cell; None anywhere else."""
+    console = Console() if "ipykernel" in sys.modules else None
+    if console is None or not console.is_jupyter:
+        yield None
+        return
+    with bars(console) as show:
+        yield show
