@@ -92,7 +92,7 @@ def _begin(steward: Steward, rules: Mapping[str, Rule]) -> str:
     """Have tasks inherit the partitions, raise or lower their fences, and count their tasks."""
     scheduler = steward.scheduler
     try:
-        note = begin_inheritance(scheduler, *rules)
+        note = begin_inheritance(rules, scheduler)
         for name, rule in rules.items():
             if rule.exclusive:
                 enclose(scheduler, name)
@@ -124,18 +124,14 @@ def _seat(steward: Steward, name: str, address: str) -> Seat:
 
 
 def _check_sole(steward: Steward, name: str, chosen: Sequence[Seat], seen: Collection[str]) -> None:
-    """Refuse a partition that others have; one that was seen can be made again."""
+    """Refuse a partition that others have; one that was seen can be made again, of all of it."""
     seats = steward.seats.values()
     members = [s for s in seats if not s.away and name in _declared_by(steward, s)]
-    if members and name not in seen:
+    if others := [seat for seat in members if name not in seen or seat not in chosen]:
         raise PoolError(
-            f"Somebody else has made a partition {name!r} meanwhile, with {names_of(members)}: "
-            f"use Pool.partitions()[{name!r}] of a new pool, or give another name."
-        )
-    if others := [seat for seat in members if seat not in chosen]:
-        raise PoolError(
-            f"There is a partition {name!r} already, with {names_of(others)}, which this "
-            f"call does not choose: give another name, or use Pool.partitions()[{name!r}]."
+            f"There is a partition {name!r} already, with {names_of(others)}, which this call did "
+            f"not see, or does not choose: use Pool.partitions()[{name!r}] of a new pool, or give "
+            "another name."
         )
 
 

@@ -19,6 +19,7 @@ tasks that *those* submit, and every task is pickled with a wrapper around it).
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterable
 from typing import Any
 
 from distributed import Client
@@ -62,12 +63,12 @@ class Inheritance(SchedulerPlugin):
         self.scheduler.remove_plugin(NAME)
 
 
-def begin_inheritance(scheduler: Any, *names: str) -> str:
+def begin_inheritance(names: Iterable[str] = (), dask_scheduler: Any = None) -> str:
     """Have tasks that tasks of these partitions submit belong to them, and shuffles stay there.
 
     Returns what a user should know, where there is anything.
     """
-    rule: Inheritance = scheduler.plugins.get(NAME) or Inheritance(scheduler)
+    rule: Inheritance = dask_scheduler.plugins.get(NAME) or Inheritance(dask_scheduler)
     rule.names.update(names)
     return rule.note
 
@@ -83,8 +84,4 @@ def end_inheritance(scheduler: Any, name: str | None) -> None:
 
 def keep_shuffles_in(client: Client) -> None:
     """Have shuffles and rechunks of tasks that ask for a partition stay in it, from now on."""
-    on_scheduler(client, _keep_shuffles_in)
-
-
-async def _keep_shuffles_in(dask_scheduler: Any = None) -> None:
-    begin_inheritance(dask_scheduler)
+    on_scheduler(client, begin_inheritance)

@@ -51,7 +51,7 @@ def page_of(scheduler: Any) -> str:
     workers = list(scheduler.workers.values())
     names = {name for worker in workers for name, slots in worker.resources.items() if slots}
     names |= fences_of(scheduler) | {name for name, _ in statistics.tallies if name}
-    partitions = told(scheduler, [*sorted(names), ""])
+    partitions = told([*sorted(names), ""], scheduler)
     stages = [
         [
             stage,

@@ -15,7 +15,7 @@ from .errors import PoolError
 from .page import leave_page, partitions_page
 from .partition import Partition
 from .probe import probe_worker
-from .rules import Count, PerGpu, PerHost, Rule, check_rules, divide, named
+from .rules import Count, PerGpu, PerHost, Rule, check_name, divide, named
 from .workers import WorkerInfo, all_workers, ask_workers
 
 logger = logging.getLogger(__name__)
@@ -177,7 +177,6 @@ class Pool:
         >>> parts["GPU"].submit(pow, 2, 10).result()                   # doctest: +SKIP
         1024
         """
-        check_rules(rules)
         return self._divide(rules, rules)[0]
 
     def partition(
@@ -248,7 +247,6 @@ class Pool:
                 f"workers to partition {name!r}, not {len(given)}."
             )
         [rule] = given
-        check_rules({name: rule})
         # All that were asked for are to be there now, though it may have fewer later.
         needed = n_workers or len(workers or ()) or max(1, minimum)
         made, remainder = self._divide({name: rule}, {name: replace(rule, minimum=needed)})
@@ -310,6 +308,8 @@ class Pool:
 
         Returns also a pool of the workers that are left.
         """
+        for name in rules:
+            check_name(name)
         cluster = all_workers(self.client)
         # By name: the address of a worker that was restarted meanwhile is another one.
         gpus = {worker.name: worker.gpus for worker in self.workers}

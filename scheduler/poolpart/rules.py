@@ -230,28 +230,3 @@ def check_name(partition: object) -> None:
     """Check the name of a partition; PoolError unless it is one."""
     if not isinstance(partition, str) or not partition:
         raise PoolError(f"The name of a partition is {partition!r}; give one such as 'GPU'.")
-
-
-def check_rules(rules: Mapping[str, Rule]) -> None:
-    """Check rules as they were given; PoolError unless they make sense."""
-    if not isinstance(rules, Mapping) or not rules:
-        raise PoolError(f'The rules are {rules!r}; give a dict, such as {{"NAME": rest()}}.')
-    for name, rule in rules.items():
-        check_name(name)
-        if not isinstance(rule, Rule):
-            raise PoolError(
-                f"The rule of partition {name!r} is {rule!r}; give one, such as per_host(2)."
-            )
-        number = getattr(rule, "most", getattr(rule, "workers", 1))
-        for what, value, least in (
-            ("slots", 1 if rule.slots is None else rule.slots, 1),
-            ("minimum", rule.minimum, 0),
-            ("the number of workers", number, 1),
-        ):
-            if not isinstance(value, int) or value < least:
-                raise PoolError(
-                    f"Partition {name!r}: {what} is {value!r}; give a whole number, {least} or "
-                    "more."
-                )
-        if isinstance(rule, Count) and rule.minimum > rule.workers:
-            raise PoolError(f"Partition {name!r} has a minimum above its {rule.workers} workers.")

@@ -172,13 +172,13 @@ def partition_stats(client: Client, name: str) -> PartitionStats:
     PoolError
         If the scheduler lacks this package.
     """
-    told = on_scheduler(client, _told, name=name)
-    stages = {stage: StageStats(**counts) for stage, counts in told.pop("stages").items()}
+    [found] = on_scheduler(client, told, names=[name])
+    stages = {stage: StageStats(**counts) for stage, counts in found.pop("stages").items()}
     sums = {
         count: sum(getattr(stage, count) for stage in stages.values())
         for count in StageStats.__dataclass_fields__
     }
-    return PartitionStats(**told, **sums, stages=stages)
+    return PartitionStats(**found, **sums, stages=stages)
 
 
 def statistics_of(scheduler: Any) -> Statistics:
@@ -196,12 +196,9 @@ def forget_statistics(scheduler: Any) -> None:
         scheduler.remove_plugin(NAME)
 
 
-async def _told(name: str, dask_scheduler: Any = None) -> dict[str, Any]:
-    return told(dask_scheduler, [name])[0]
-
-
-def told(scheduler: Any, names: Sequence[str]) -> list[dict[str, Any]]:
+def told(names: Sequence[str], dask_scheduler: Any = None) -> list[dict[str, Any]]:
     """Statistics of partitions as plain values; runs on the scheduler."""
+    scheduler = dask_scheduler
     statistics = statistics_of(scheduler)
     under_way: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)
     for task in scheduler.tasks.values():

@@ -79,11 +79,9 @@ def test_a_refused_request_changes_nothing(start):
         {"n_workers": 1, "max_workers_per_host": 1},
         {"n_workers": 4},
         {"n_workers": 0},
-        {"max_workers_per_host": 1.5},
         {"workers": []},
         {"workers": ["a", "nobody"]},
         {"workers": ["other"]},
-        {"n_workers": 1, "slots": 0},
     ):
         with pytest.raises(PoolError):
             pool.partition("P", **arguments)

@@ -18,7 +18,7 @@ from poolpart import (
     rest,
     steward,
 )
-from poolpart.rules import check_rules, divide, partition_for
+from poolpart.rules import divide, partition_for
 
 
 def worker(name, *gpus, host="h", **resources):
@@ -62,24 +62,6 @@ def test_fewer_than_the_minimum():
     assert names({"P": n_workers(2), "Q": per_host(1, minimum=0)}, pool)["Q"] == []
     with pytest.raises(PoolError, match="would have 2 workers, of the 3"):
         divide({"P": rest(minimum=3)}, pool)
-
-
-@pytest.mark.parametrize(
-    ("rules", "message"),
-    [
-        ({}, r"rules are \{\}; give a dict"),
-        ({3: rest()}, "name of a partition is 3; give one such as 'GPU'"),
-        ({"P": 3}, r"rule of partition 'P' is 3; give one, such as per_host\(2\)"),
-        ({"P": rest(slots=0)}, "slots is 0; give a whole number, 1 or more"),
-        ({"P": rest(minimum=-1)}, "'P': minimum is -1"),
-        ({"P": per_gpu(0)}, "a whole number, 1 or more"),
-        ({"P": per_host(1.5)}, "a whole number, 1 or more"),
-        ({"P": n_workers(2, minimum=3)}, "a minimum above its 2 workers"),
-    ],
-)
-def test_rules_that_make_no_sense(rules, message):
-    with pytest.raises(PoolError, match=message):
-        check_rules(rules)
 
 
 # -- whom a worker that joins belongs to -----------------------------------------------

@@ -58,7 +58,7 @@ def test_one_name(two, both, others):
         lambda: mine.partition("P", workers=["a", "b"])[0],
         lambda: theirs.partition("P", **others)[0],
     )
-    assert "partition 'P' meanwhile" in (message := told(outcomes))
+    assert "a partition 'P' already" in (message := told(outcomes))
     assert "Pool.partitions()['P']" in message
     (part,) = (outcome for outcome in outcomes if isinstance(outcome, Partition))
     members = {worker.name for worker in part.workers}
