@@ -257,6 +257,8 @@ class Steward(SchedulerPlugin):
     def _place_all(self) -> None:
         self._placing = None
         waiting = [s for s in self.seats.values() if s.unplaced and not s.away]
+        # One that is still being asked for its GPUs is placed when it has answered.
+        waiting = [s for s in waiting if s.settling and s.settling.done()]
         self.settle([seat for seat in waiting if self._place(seat)])
 
     def _place(self, seat: Seat) -> bool:

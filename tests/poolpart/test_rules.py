@@ -1,5 +1,7 @@
 """Rules: whom they choose, now and when a worker joins, without a cluster and on one."""
 
+import time
+
 import pytest
 from distributed import Client
 from hypothesis import given
@@ -164,7 +166,8 @@ def test_a_worker_that_left_is_replaced_by_one_that_joins_and_waiting_tasks_run(
 
 def test_a_late_worker_is_asked_for_its_gpus(start, wait_until, monkeypatch):
     gpus = iter([("x",), ("x", "y"), ("x", "y")])
-    monkeypatch.setattr(probe, "visible_gpus", lambda: next(gpus))
+    # As long as a driver takes to answer: others are placed meanwhile.
+    monkeypatch.setattr(probe, "visible_gpus", lambda: time.sleep(0.3) or next(gpus))
     client = start({"a": {}})
     Pool.from_client(client).divide({"GPU": per_gpu(1), "OTHER": rest()})
     for name in ("second", "third"):
