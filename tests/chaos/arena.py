@@ -8,7 +8,6 @@ import time
 from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import dask
@@ -25,28 +24,23 @@ from .events import Board, ChaosPlugin
 # at such intervals, too: a worker is given up after once to twice this.
 TIME_TO_LIVE_S = 10
 CLOSING_S = 10.0
-_CONFIG = {
-    # Half of what is started here is killed; no need to be told each time.
-    "logging.distributed": "critical",
-}
 
 
 class Arena:
     """A local cluster with two casting workers, two for the LIDAR stages, one more, and a board.
 
-    Parameters
-    ----------
-    pauses
-        Seconds a scan to hold at some points of the workers.
-    time_to_live_s
-        Without a heartbeat of a worker, before the scheduler gives it up.
+    `pauses` are seconds a scan to hold at some points of the workers. A worker is given up by the
+    scheduler when it has had no heartbeat for `time_to_live_s`.
     """
 
     def __init__(
         self, pauses: Mapping[str, float] | None = None, time_to_live_s: int = TIME_TO_LIVE_S
     ) -> None:
         self._stack = ExitStack()
-        self._config = {**_CONFIG, "distributed.scheduler.worker-ttl": f"{time_to_live_s}s"}
+        self._config = {
+            "logging.distributed": "critical",  # half of what is started here is killed
+            "distributed.scheduler.worker-ttl": f"{time_to_live_s}s",
+        }
         self._pauses = dict(pauses or {})
         self._withdrawn: dict[str, Any] = {}  # {name: how to start it}
 
@@ -69,12 +63,7 @@ class Arena:
             self._stack = stack.pop_all()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stack.close()
 
     def names(self, partition: str) -> list[str]:

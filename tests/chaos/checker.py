@@ -22,26 +22,16 @@ TRIED = ("generate.put", "intersect.start", "driver.handon", "driver.replay")
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of the scans of a run; each list names scans, some possibly in two ways.
+    """What became of the scans of a run; each list names scans, some possibly in two ways."""
 
-    Parameters
-    ----------
-    expected
-        Number of scans that should have arrived.
-    lost
-        Asked for, and not delivered, or without rows in the cloud that belong there.
-    duplicated
-        Delivered twice in one way, or with rows in the cloud twice.
-    unexpected
-        Delivered and never asked for, out of order, or let go of before they had arrived.
-    recovered
-        Tried more than once, and delivered exactly once.
-    """
-
-    expected: int
+    expected: int  # number of scans that should have arrived
+    # Asked for, and not delivered, or without rows in the cloud that belong there.
     lost: tuple[str, ...] = ()
+    # Delivered twice in one way, or with rows in the cloud twice.
     duplicated: tuple[str, ...] = ()
+    # Delivered and never asked for, out of order, or let go of before they had arrived.
     unexpected: tuple[str, ...] = ()
+    # Tried more than once, and delivered exactly once.
     recovered: tuple[int, ...] = field(default=(), repr=False)
 
     @property
@@ -74,16 +64,9 @@ def judge(
 ) -> Verdict:
     """Judge one run.
 
-    Parameters
-    ----------
-    events
-        What was logged of this run: by process, in the order it happened there.
-    scans
-        Number of scans asked for, numbered from 0.
-    rows
-        Scan of each row of the delivered cloud.
-    expected_rows
-        Scan of each row of the cloud as it should be.
+    `events` are what was logged of it, by process, in the order it happened there; `scans` is the
+    number of scans asked for, numbered from 0; `rows` has the scan of each row of the delivered
+    cloud, and `expected_rows` that of each row of the cloud as it should be.
     """
     log = list(events)
     every = set(range(scans))

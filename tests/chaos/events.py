@@ -50,42 +50,19 @@ _EVENTS, _ARMED, _FIRED = "events", "armed", "fired"
 
 @dataclass(frozen=True)
 class Fault:
-    """One thing to go wrong.
+    """One thing to go wrong."""
 
-    Parameters
-    ----------
-    number
-        Tells faults apart; their order in the plan.
-    kind
-        One of `KINDS`.
-    point
-        Named point at which it happens, or `RANDOM`.
-    scan
-        At a named point: at the first pass that is about this scan or a later one.
-    worker
-        At a named point: the worker that is to come to it; "" for any.
-    partition
-        Whose worker, unless the one that passes the point is meant; "" for that one.
-    pick
-        Which of the workers, from 0 to 1.
-    after_s
-        At a random time: seconds after the one before.
-    stop_s
-        Until SIGCONT.
-    given_up
-        Whether the scheduler is to give up the stopped worker meanwhile, at once: its time to
-        live can then be so long that no other worker is given up for being slow.
-    """
-
-    number: int
-    kind: str
-    point: str
-    scan: int = 0
-    worker: str = ""
-    partition: str = ""
-    pick: float = 0.0
-    after_s: float = 0.0
-    stop_s: float = 0.5
+    number: int  # tells faults apart
+    kind: str  # of KINDS
+    point: str  # at which it happens, or RANDOM
+    scan: int = 0  # at a point: at the first pass that is about this scan or a later one
+    worker: str = ""  # at a point: who is to come to it; "" for anybody
+    partition: str = ""  # whose worker; "" for the one that passes the point
+    pick: float = 0.0  # which of the partition's workers, from 0 to 1
+    after_s: float = 0.0  # at a random time: seconds after the one before
+    stop_s: float = 0.5  # until SIGCONT
+    # Whether the scheduler is to give the stopped worker up meanwhile, at once. Its time to live
+    # can then be so long that no other worker is given up for being slow.
     given_up: bool = False
 
 
@@ -175,17 +152,9 @@ class Board:
 class Sink:
     """What `trace_to` is given: it logs a point, slows it down, strikes there.
 
-    Parameters
-    ----------
-    board
-        Where to log, and where faults are.
-    worker
-        Name of the worker, or of whoever else this process is.
-    strike
-        Carries a fault out that was taken here.
-    pauses
-        Seconds to hold the thread at some points, by name, for each scan that it is about: it
-        paces a run that would be over before anything could happen to it.
+    `strike` carries a fault out that was taken here. `pauses` are seconds for which the thread is
+    held at a point for each scan that it is about: they pace a run that would be over before
+    anything could happen to it.
     """
 
     def __init__(

@@ -38,20 +38,8 @@ def make_plan(
     """Choose faults: the same for the same arguments.
 
     First every point, every kind among them, then every kind at every point of the workers, and
-    for the rest faults at random times.
-
-    Parameters
-    ----------
-    seed
-        Where all choices come from.
-    count
-        How many.
-    worker_points
-        Points that workers pass, which strike themselves there.
-    driver_points
-        Points that the driver passes; it strikes some worker.
-    scans
-        Number of scans of a run.
+    for the rest faults at random times. Workers strike themselves at their points; at the
+    driver's, it strikes some worker.
     """
     chance = random.Random(seed)
     turned = [KINDS[turn:] + KINDS[:turn] for turn in range(len(KINDS))]
@@ -94,13 +82,8 @@ def _fault(
 class Nemesis:
     """Carries out faults during a run whose driver is in this process; a context manager around it.
 
-    Parameters
-    ----------
-    arena
-        Where.
-    faults
-        What is to happen. Faults at points are armed at once; those at random times follow
-        one another, from when anybody passes a point.
+    Faults at points are armed at once; those at random times follow one another, from when
+    anybody passes a point.
     """
 
     def __init__(self, arena: Arena, faults: Sequence[Fault]) -> None:

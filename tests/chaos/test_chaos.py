@@ -1,12 +1,14 @@
-"""The short versions of `python -m tests.chaos`."""
+"""The short versions of `python -m tests.chaos` and of its soak."""
 
 from __future__ import annotations
 
 import pytest
 from tests.chaos.__main__ import Campaign
-from tests.chaos.events import KINDS, Fault
+from tests.chaos.events import KINDS, RANDOM, Fault
+from tests.chaos.nemesis import PARTITIONS, make_plan
 from tests.chaos.points import WORKER_POINTS
-from tests.chaos.survey import disturbed
+from tests.chaos.soak import draw, soak
+from tests.chaos.survey import disturbed, reference
 
 SEED = 7
 FAULTS = 20
@@ -54,3 +56,39 @@ def test_twenty_faults_are_survived(arena, what, known):
     assert {kind for kind, _ in campaign.done} == set(KINDS)
     assert {point for _, point in campaign.done} >= set(WORKER_POINTS)
     assert campaign.summary() == f"faults {campaign.done.total()} lost 0 duplicated 0 identical yes"
+
+
+@pytest.mark.slow
+def test_a_soak_leaves_nothing_and_loses_nothing(arena, what, tmp_path):
+    # Memory is judged in a long one.
+    soaked = soak(arena, what, reference(arena, what, None), seed=1)
+    assert soaked.sound, soaked
+    assert soaked.outcome.verdict.recovered
+    assert soaked.outcome.done.total() >= 3
+    draw(soaked, tmp_path / "soak.png")
+    assert (tmp_path / "soak.png").stat().st_size > 0
+
+
+# -- what a seed decides -------------------------------------------------------------------------
+
+WORKER, DRIVER = ("cast.start", "cast.end"), ("driver.take",)
+
+
+def test_a_seed_plays_the_same_faults_again():
+    plans = [make_plan(seed, 30, WORKER, DRIVER, scans=100) for seed in (3, 3, 4)]
+    assert plans[0] == plans[1] != plans[2]
+
+
+def test_a_long_plan_has_every_kind_at_every_point_of_the_workers_and_the_rest_at_random():
+    plan = make_plan(0, 40, WORKER, DRIVER, scans=100)
+    crossed = {(kind, point) for kind in KINDS for point in WORKER}
+    assert {(f.kind, f.point) for f in plan if f.point in WORKER} == crossed
+    assert {f.partition for f in plan if f.point in DRIVER} == {"GPU", "LIDAR"}
+    assert {f.partition for f in plan if f.point == RANDOM} == set(PARTITIONS)
+    assert len(plan) == 40
+
+
+def test_a_short_plan_has_every_point():
+    plan = make_plan(0, 6, WORKER, DRIVER, scans=100)
+    assert {fault.point for fault in plan} == {*WORKER, *DRIVER, RANDOM}
+    assert len(plan) == 6

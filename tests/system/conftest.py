@@ -18,6 +18,7 @@ import pytest
 from distributed import Client, Worker, WorkerPlugin
 from tests.clusters import thread_cluster
 
+import lidarpool.base.fork_server
 import lidarpool.report.pictures
 import lidarpool.scan.driver
 from lidarpool import Cloud
@@ -226,9 +227,11 @@ class Outcome:
 
 @pytest.fixture(name="lidarpool")
 def run_lidarpool(
-    capfd: pytest.CaptureFixture[str],
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[Callable[..., Outcome]]:
     """Run the command in this process."""
+    # The workers of `local_client` are forked from the same server, and end with it.
+    monkeypatch.setattr(lidarpool.base.fork_server, "stop_fork_server", lambda: None)
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
     def run(*arguments: object) -> Outcome:

@@ -23,6 +23,7 @@ import numpy as np
 import psutil
 import pytest
 from distributed import Client
+from tests.system.default_survey import DEFAULT_CLOUD_SHA256
 
 import lidarpool.cli.run_command
 import lidarpool.report.output
@@ -31,8 +32,6 @@ from lidarpool.report.output import FILES, write_result
 from lidarpool.scenario.scenario import Scenario
 
 COMMAND = [sys.executable, "-c", "from lidarpool.cli.commands import main; main()"]
-# Of the default survey, with Embree as well as with NumPy.
-CLOUD_SHA256 = "9012bcbf7aa44d9d07c95fae78e707887c40225f1bde1fcb304c674c220c0228"
 SHORT = "sensor: {layers: 8}\nplanning: {trials: 4, iterations: 20}\n"
 
 
@@ -124,7 +123,7 @@ def test_the_report_has_all_that_is_promised(demo):
     assert report["files"] == list(FILES)
     assert report["scans"] == 108 and report["rays"] == 120_000
     assert (report["hits"], report["points"]) == (4926, 995)
-    assert sha256((out / "cloud.ply").read_bytes()).hexdigest() == CLOUD_SHA256
+    assert sha256((out / "cloud.ply").read_bytes()).hexdigest() == DEFAULT_CLOUD_SHA256
     assert sum(report["points_by_object"].values()) == report["points"]
     assert report["backend"] in ("cuda", "embree", "numpy")
     assert {"lidarpool", "python", "numpy", "dask", "distributed"} <= report["versions"].keys()

@@ -8,6 +8,7 @@ from hashlib import sha256
 from typing import Any
 
 import pytest
+from tests.system.default_survey import DEFAULT_CLOUD_SHA256
 
 from lidarpool.columns.parts import PartColumns, unpack
 from lidarpool.columns.storage import Storage
@@ -17,8 +18,6 @@ pytest.importorskip("s3fs", reason="parts in an object store need s3fs")
 server = pytest.importorskip("moto.server", reason="the object store of these tests is moto's")
 
 BUCKET = "s3://surveys"
-# Of the default survey, with Embree as well as with NumPy.
-CLOUD_SHA256 = "9012bcbf7aa44d9d07c95fae78e707887c40225f1bde1fcb304c674c220c0228"
 SCENARIO = "planning: {enabled: false}\n"
 
 
@@ -72,7 +71,7 @@ def check(tmp_path, monkeypatch) -> Callable[[str], dict[str, Any]]:
 
     def check(folder: str) -> dict[str, Any]:
         out = tmp_path / "out"
-        assert sha256((out / "cloud.ply").read_bytes()).hexdigest() == CLOUD_SHA256
+        assert sha256((out / "cloud.ply").read_bytes()).hexdigest() == DEFAULT_CLOUD_SHA256
         report = json.loads((out / "report.json").read_text())
         ((url, parts),) = found.items()
         assert url.startswith(f"{BUCKET}/{folder}/run-")

@@ -7,52 +7,37 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Callable
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from distributed import Client
+from tests.system.default_survey import DEFAULT_CLOUD_SHA256
 
 import lidarpool as package
 from lidarpool import Frame, Scene, Sensor, Survey, __version__, simulate
 from poolpart import worker_identities
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "seed.yaml"
-# Of the default survey, with Embree as well as with NumPy.
-CLOUD_SHA256 = "9012bcbf7aa44d9d07c95fae78e707887c40225f1bde1fcb304c674c220c0228"
 
 
-@pytest.fixture
-def run(lidarpool, tmp_path, no_pictures, all_records) -> Callable[..., dict[str, Any]]:
-    """Run the default survey with less planning, and check its cloud; the report."""
-    fewer = EXAMPLE.read_text().replace("trials: 100 ", "trials: 10 ")
-    assert "trials: 10 " in fewer
-    (tmp_path / "seed.yaml").write_text(fewer)
-
-    def run(cluster: Any, *options: str) -> dict[str, Any]:
-        out = tmp_path / "out"
-        arguments = ["--out", out, "--quiet", "--scheduler", cluster.address, *options]
-        outcome = lidarpool("run", tmp_path / "seed.yaml", *arguments)
-        assert (outcome.code, outcome.err) == (0, "")
-        report = json.loads((out / "report.json").read_text())
-        assert [report[name] for name in ("rays", "hits", "points")] == [120_000, 4926, 995]
-        assert sha256((out / "cloud.ply").read_bytes()).hexdigest() == CLOUD_SHA256
-        assert not (out / "run").exists()
-        return report
-
-    return run
-
-
-def test_an_outside_cluster_gives_the_same_bytes(run, lidarpool, outside):
+def test_an_outside_cluster_gives_the_same_bytes(
+    lidarpool, outside, tmp_path, no_pictures, all_records
+):
     cluster = outside()
     cluster.add(("GPU", 1))
     cluster.add(*[("LIDAR", 1)] * 4, ("OTHER", 1))
     cluster.wait()
-    report = run(cluster, "--backend", "numpy")  # the demo's is Embree
-    assert report["backend"] == "numpy"
+    fewer = EXAMPLE.read_text().replace("trials: 100 ", "trials: 10 ")
+    (tmp_path / "seed.yaml").write_text(fewer)
+    out = tmp_path / "out"
+    place = ["--out", out, "--quiet", "--scheduler", cluster.address]
+    outcome = lidarpool("run", tmp_path / "seed.yaml", *place, "--backend", "numpy")
+    assert (outcome.code, outcome.err) == (0, "")
+    assert sha256((out / "cloud.ply").read_bytes()).hexdigest() == DEFAULT_CLOUD_SHA256
+    report = json.loads((out / "report.json").read_text())
+    assert report["backend"] == "numpy"  # the demo's is Embree
     assert report["placement_violations"] == 0
     assert report["tasks"]["GPU"].keys() == {"intersect"}
     assert report["tasks"]["LIDAR"] == {"generate": 1, "sort": 1, "collect": 2}

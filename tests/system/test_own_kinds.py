@@ -13,14 +13,12 @@ from lidarpool import (
     Column,
     Scene,
     Sensor,
-    Spin,
     Survey,
     read_cloud,
     save_cloud,
     save_result,
     simulate,
 )
-from lidarpool.columns.table import TABLE
 
 
 @dataclass(frozen=True)
@@ -138,14 +136,3 @@ def test_both_are_in_the_files_of_the_result(result, tmp_path, no_pictures):
 
     save_cloud(tmp_path / "again.ply", result.cloud)
     assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "cloud.ply").read_bytes()
-
-
-def test_all_columns_of_the_table_come_through(client, cluster_client, same_cloud):
-    """And the same, whatever makes them: three processes, or one thread."""
-    optional = [name for name in TABLE if name not in ("scan", "x", "y", "z", "channel", "object")]
-    wanted = Survey(
-        Sensor(Beams.even(8, 40.0), Spin(360, 10)), [(0, 0, 1)], steps=36, columns=optional
-    )
-    cloud = simulate(Scene.seed(), wanted, client=client).cloud
-    assert set(optional) < cloud.columns.keys()
-    assert same_cloud(cloud, simulate(Scene.seed(), wanted, client=cluster_client).cloud)
