@@ -199,6 +199,23 @@ def test_what_moves_is_where_it_is_at_the_time_that_is_chosen_or_played(cloud, p
     assert "room" in view._view._cloud_legend.content
 
 
+def test_a_drive_through_a_large_scene_is_looked_at_from_near(cloud, page):
+    """The camera is near the way, towers are cut above it, and hits are shown when asked for."""
+    scene = Scene.from_meshes([box("Ground", (800, 800, 0.1)), box("Tower", (9, 9, 90))])
+    way = SensorWay(np.array([0, 2e9]), np.array([[0, 5, 2.0], [20, 5, 2]]), True, "", "VLP-16")
+    hits, rays = np.full(scene.triangles, 9, np.int64), np.zeros((0, 2, 3), np.float32)
+    view = ResultView(
+        page, CloudFile(cloud), Pictured(scene, [way], hits, rays, None, None, (), 2e9)
+    )
+    view.draw()
+    assert 20 < view._view.cut < 40
+    assert np.linalg.norm(page.initial_camera.position) < 200
+    assert not view._view._scene_legend.content
+    view._view._show_hits.value = True
+    view.draw()
+    assert "hits per square metre" in view._view._scene_legend.content
+
+
 def test_without_a_scene_the_cloud_is_shown_alone_near_zero(cloud, page):
     view = ResultView(page, CloudFile(cloud), None, "why & what")
     view.draw()

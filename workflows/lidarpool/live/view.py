@@ -80,6 +80,7 @@ class View:
         self._actors = () if scene is None else scene.actors
         self._origin, self._ground = origin, float(bounds[0, 2])
         near = around_ways(bounds, ways_of(sensors, self._actors, duration_ns))
+        self._from_near = near is not None  # points are dense there, and hits would hide them
         near = bounds if near is None else near
         self._size_m = float(np.linalg.norm(near[1] - near[0])) or 1.0
         self._columns = {c.name: c for c in (Z, *(c for c in table if c not in AXES))}
@@ -96,7 +97,7 @@ class View:
         self._ends_ns = duration_ns
         page.frame_scene(near)
         self._add_controls(bounds, duration_ns / 1e9)
-        if near is not bounds:  # towers would hide the street
+        if self._from_near:  # towers would hide the street
             self._cut.value = min(float(near[1, 2] + origin[2]), self._top)
         self._add_poses()
         self._add_actors()
@@ -126,6 +127,7 @@ class View:
         if self._scene is not None:
             with gui.add_folder("scene"):
                 self._show_scene = gui.add_checkbox("show", initial_value=True)
+                self._show_hits = gui.add_checkbox("hits", initial_value=not self._from_near)
                 self._show_rays = gui.add_checkbox("rays", initial_value=True)
                 self._scene_legend = gui.add_html("")
 
@@ -205,8 +207,10 @@ class View:
         if self._surface is None:
             self._surface = Surface(self._scene)
             self._look_around(self._surface)
-        if self._changed("scene", version, self.cut):
-            colours, self._scene_legend.content = self._surface.coloured(hit_counts())
+        hits = self._show_hits.value
+        if self._changed("scene", version if hits else 0, self.cut, hits):
+            counts = hit_counts() if hits else np.zeros(len(self._scene.faces))
+            colours, self._scene_legend.content = self._surface.coloured(counts)
             corners, kept = self._surface.below(self.cut)
             self._mesh.show(corners, colours[kept], self._show_scene.value)
         if self._changed("scene shown", self._show_scene.value):
