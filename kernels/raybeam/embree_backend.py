@@ -116,11 +116,10 @@ class EmbreeBackend(Backend):
         self._scene = open3d.t.geometry.RaycastingScene(nthreads=self._threads)
         self._scene.add_triangles(self._tensor(points), self._tensor(rows))
         self._refine = Refiner(mesh)
-        self._local = threading.local()  # threads of one worker may cast at the same time
 
     def closest(self, rays: Rays) -> Found:
         """See `Backend.closest`."""
-        desk, limits = self._desk(len(rays)), self._limits(rays.t_min, rays.t_max)
+        desk, limits = _desk(len(rays)), self._limits(rays.t_min, rays.t_max)
         unit, starts = rays.directions.T.copy(), Starts(self._mesh.to_local(rays.origins))
         desk.aim(unit)
         hits = self._within(desk, unit, starts, limits)
@@ -134,7 +133,7 @@ class EmbreeBackend(Backend):
         collector = Collector(scan, self._mesh.face_count)
         limits = self._limits(scan.t_min, scan.t_max)
         for start, stop in scan.chunks(self.chunk):
-            desk = self._desk(stop - start)
+            desk = _desk(stop - start)
             order, unit, starts = desk.make(scan, start, stop, self._mesh)
             hits = self._within(desk, unit, starts, limits)
             ray = np.flatnonzero(order.by_ray(hits.counts))
@@ -254,12 +253,16 @@ class EmbreeBackend(Backend):
         t[beyond] = rough[beyond]
         return t, place.astype(np.intp)
 
-    def _desk(self, rays: int) -> Workspace:
-        """Workspace of this thread, for that many rays at least."""
-        kept: Workspace | None = getattr(self._local, "desk", None)
-        if kept is None or kept.size < rays:
-            kept = self._local.desk = Workspace(rays)
-        return kept
+
+_desks = threading.local()  # threads of one worker may cast at the same time
+
+
+def _desk(rays: int) -> Workspace:
+    """Workspace of this thread, for that many rays at least; its casters share it."""
+    kept: Workspace | None = getattr(_desks, "desk", None)
+    if kept is None or kept.size < rays:
+        kept = _desks.desk = Workspace(rays)
+    return kept
 
 
 def _columns_of(unit: Float, ray: NDArray[np.intp]) -> Float:

@@ -292,7 +292,7 @@ class Workspace:
                 np.multiply(x, a, out=total)
                 total += np.multiply(y, b, out=product)
                 total += np.multiply(z, c, out=product)
-            if poses.motion is not None:
+            if poses.motion is not None and poses.motion.rates[some].any():
                 delays = _delays(poses.motion, poses.rays, start + at, length // count)
                 crosses = order.view(self._crosses[:, :length], count)
                 _drift(turned, poses.motion.rates[some], delays, crosses, product)
