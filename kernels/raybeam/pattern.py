@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from .poses import Motion, Poses, check_poses
 from .rays import check_origins, unit_directions
 
+_BLOCK = 1 << 14  # rays that are made at a time: what that takes stays in a core's cache
+
 
 class Pattern:
     """Rays that are cast many times, for example one revolution of a lidar.
@@ -120,11 +122,23 @@ class Pattern:
         What is in the mesh's axes is rotated, then moved: ``((x a + y b) + z c) + p``; and where
         the lidar moves on within a pose, ``v + t (w x v)`` and ``p + t u`` come after each.
         """
-        row = (first + ray) % max(len(self), 1)
-        pose = ray // poses.rays
-        directions = poses.drifted(poses.turned(self._directions.take(row, axis=1), pose), ray)
-        at = poses.positions if len(poses) == 1 else poses.positions.take(pose, axis=0)
-        if self._origins is None:
-            return poses.moved(at, ray), directions
-        turned = poses.drifted(poses.turned(self._origins.take(row, axis=1), pose), ray)
-        return poses.moved(turned + at, ray), directions
+        one = len(poses) == 1 and self._origins is None and poses.motion is None
+        places, directions = np.empty((2, 3, len(ray)))
+        room = np.empty((18, min(len(ray), _BLOCK)))
+        for start in range(0, len(ray), _BLOCK):
+            block = slice(start, start + _BLOCK)
+            some = ray[block]
+            row, these = first + some, poses.of(some, room[:, : len(some)])
+            row -= row // len(self) * len(self)  # takes half as long as the remainder
+            directions[:, block] = these.turned(_columns(self._directions, row))
+            if one:
+                continue
+            at = these.positions
+            if self._origins is not None:
+                at = these.turned(_columns(self._origins, row)) + at
+            places[:, block] = these.moved(at)
+        return (poses.positions if one else places.T), directions.T
+
+
+def _columns(table: NDArray[np.float64], row: NDArray[np.int64]) -> NDArray[np.float64]:
+    return np.stack([numbers.take(row) for numbers in table])

@@ -60,55 +60,69 @@ class Poses:
     def __len__(self) -> int:
         return len(self.positions)
 
-    def turned(
-        self, vectors: NDArray[np.float64], pose: NDArray[np.integer[Any]]
+    def of(self, ray: NDArray[np.int64], room: NDArray[np.float64]) -> RayPoses:
+        """Look up the poses of rays (m,); `room`, (18, m), is for what is found."""
+        pose = ray // self.rays
+        delay, rates, velocities = np.zeros(1), None, None
+        if self.motion is not None:
+            delay = self.motion.delays.take(ray - pose * self.rays)
+            velocities = self._each(self.motion.velocities, pose, room[12:15])
+            if self.motion.rates.any():
+                rates = self._each(self.motion.rates, pose, room[15:])
+        rotations = self.rotations
+        if rotations is not None:
+            rotations = self._each(rotations, pose, room[:9])
+        return RayPoses(
+            self._each(self.positions, pose, room[9:12]), rotations, delay, velocities, rates
+        )
+
+    def _each(
+        self, table: NDArray[np.float64], pose: NDArray[np.intp], room: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Turn vectors into the mesh's axes, with one fixed order of rounding.
+        columns = np.moveaxis(table, 0, -1).reshape(-1, len(self))
+        if len(self) == 1:
+            return columns
+        for column, out in zip(columns, room, strict=True):
+            column.take(pose, out=out, mode="clip")  # in other modes by way of a buffer
+        return room
+
+
+@dataclass(frozen=True, eq=False)
+class RayPoses:
+    """Poses of m rays, see `Poses`: (numbers, m), or (numbers, 1) where one is that of all."""
+
+    positions: NDArray[np.float64]
+    rotations: NDArray[np.float64] | None
+    delay: NDArray[np.float64]
+    velocities: NDArray[np.float64] | None
+    rates: NDArray[np.float64] | None
+
+    def turned(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Turn vectors (3, m) into the mesh's axes, with one fixed order of rounding.
 
         ``matrices @ vectors`` would do, but its last bit depends on the machine's BLAS.
-
-        Parameters
-        ----------
-        vectors
-            (3, m), in the sensor's axes, one row an axis.
-        pose
-            (m,): number of the pose of each vector.
-
-        Returns
-        -------
-        (m, 3); transposed, it is contiguous.
         """
-        if self.rotations is None:
-            return vectors.T
-        # One matrix for all, or one a vector: the products and sums are the same.
-        rows = self.rotations.reshape(-1, 9).T
-        rows = rows[:, :1] if len(self) == 1 else np.ascontiguousarray(rows).take(pose, axis=1)
-        x, y, z = vectors
-        out = np.empty((3, len(pose))).T
-        for axis in range(3):
-            a, b, c = rows[3 * axis : 3 * axis + 3]
-            out[:, axis] = (x * a + y * b) + z * c
-        return out
-
-    def drifted(self, vectors: NDArray[np.float64], ray: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Turn vectors (m, 3), in the mesh's axes, on by as much as their rays are late."""
-        if self.motion is None:
+        if self.rotations is not None:
+            x, y, z = vectors
+            vectors, product = np.empty_like(vectors), np.empty_like(x)
+            for out, (a, b, c) in zip(vectors, self.rotations.reshape(3, 3, -1), strict=True):
+                np.multiply(x, a, out=out)
+                out += np.multiply(y, b, out=product)
+                out += np.multiply(z, c, out=product)
+        if self.rates is None:
             return vectors
-        delay = self.motion.delays.take(ray % self.rays)
-        x, y, z = vectors.T
-        a, b, c = self.motion.rates.take(ray // self.rays, axis=0).T
-        out = np.empty((3, len(ray))).T
-        out[:, 0] = x + delay * (b * z - c * y)
-        out[:, 1] = y + delay * (c * x - a * z)
-        out[:, 2] = z + delay * (a * y - b * x)
-        return out
+        (x, y, z), (a, b, c) = vectors, self.rates
+        crosses = np.stack([b * z - c * y, c * x - a * z, a * y - b * x])
+        crosses *= self.delay
+        crosses += vectors
+        return crosses
 
-    def moved(self, places: NDArray[np.float64], ray: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Move places (m, 3), or (1, 3), on by as much as their rays are late."""
-        if self.motion is None:
+    def moved(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Move places (3, m), or (3, 1), on by as much as their rays are late."""
+        if self.velocities is None:
             return places
-        delay = self.motion.delays.take(ray % self.rays)[:, None]
-        return places + delay * self.motion.velocities.take(ray // self.rays, axis=0)
+        pairs = zip(places, self.velocities, strict=True)
+        return np.stack([place + self.delay * speed for place, speed in pairs])
 
 
 def check_poses(

@@ -22,7 +22,7 @@ from .surfaces import Surfaces
 from .world import World
 
 PATTERN_RAYS = 20_000_000  # of a period of the head that are kept; 24 bytes each
-CHUNK_RAYS = 1 << 20  # sub-rays that are cast at a time
+CHUNK_RAYS = 1 << 18  # sub-rays that are cast at a time
 BLOCK_RAYS = 1 << 14  # rays whose sub-rays are made at a time, within a cache
 PASSES_MOST = 16  # surfaces that light meets one after the other, before it is given up
 

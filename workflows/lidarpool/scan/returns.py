@@ -95,7 +95,7 @@ class BatchReturns:
     @cached_property
     def firing(self) -> NDArray[np.int64]:
         """Number of the firing, from the beginning of the station."""
-        return self.specs[0].firings[0] + self.found.ray // np.int64(self.sensor.channels)
+        return self.specs[0].firings[0] + self._number
 
     @property
     def sensor_number(self) -> NDArray[np.uint8]:
@@ -105,8 +105,19 @@ class BatchReturns:
     @cached_property
     def time(self) -> NDArray[np.int64]:
         """When the ray was fired, nanoseconds since the survey's start."""
-        firings, which = np.unique(self.firing, return_inverse=True)
-        return self.specs[0].start_ns + self.sensor.times_ns(firings)[which, self.channel]
+        times = self.sensor.begins_ns(self._firings).take(self._number)
+        times += self.sensor.beams.time_ns.take(self.channel)
+        return self.specs[0].start_ns + np.rint(times, out=times).astype(np.int64)
+
+    @property
+    def _firings(self) -> NDArray[np.int64]:
+        """All of the scans, whether anything came back or not."""
+        return np.arange(self.specs[0].firings[0], self.specs[-1].firings[1])
+
+    @cached_property
+    def _number(self) -> NDArray[np.int64]:
+        """Number of the firing, from that of the first scan."""
+        return self.found.ray // np.int64(self.sensor.channels)
 
     # -- where -------------------------------------------------------------------------------
 
@@ -185,10 +196,9 @@ class BatchReturns:
     def _to_sensor(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
         """Turn vectors (n, 3) in the axes of the carrier, or the head, to those of the sensor."""
         if self._by_head:
-            firings, which = np.unique(self.firing, return_inverse=True)
-            spins = self.sensor.spins(firings)
+            spins = self.sensor.spins(self._firings)
             assert spins is not None  # or the rig would not cast by head
-            (cos, sin), (x, y, z) = spins[:, which], vectors.T
+            (cos, sin), (x, y, z) = (a.take(self._number) for a in spins), vectors.T
             looks = np.stack([x * cos - y * sin, x * sin + y * cos, z], axis=1)
             return turned(looks, self.sensor.axes)
         mount = self.carried.mount.rotation
