@@ -60,7 +60,7 @@ RETURNS: dict[str, str] = {
 # -- options: arguments, what the message says -------------------------------------------------
 
 OPTIONS: dict[str, tuple[list[str], str]] = {
-    "no scenario": (["run"], "Missing argument 'SCENARIO'"),
+    "no scenario": (["run"], "Usage: lidarpool run"),
     "two scenarios": (["run", "a.yaml", "b.yaml"], "unexpected extra argument"),
     "misspelt command": (["rum"], "Did you mean 'run'?"),
     "unknown option": (["demo", "--fast"], "--fast"),
@@ -84,6 +84,8 @@ OPTIONS: dict[str, tuple[list[str], str]] = {
     ),
     "out cannot be made": (["run", "good.yaml", "--out", "/proc/o"], "Cannot write to the folder"),
     "malformed address": (["run", "good.yaml", "--scheduler", "tcp://::1:x"], "tcp://host:8786"),
+    "no port": (["info", "--scheduler", "localhost"], "has no port"),
+    "scene that is there": (["scene", "city", "good.ply"], "is there already"),
     "no scheduler": (["run", "good.yaml", "--scheduler", "tcp://127.0.0.1:1"], "No Dask scheduler"),
 }
 
@@ -94,6 +96,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "good.yaml").write_text("sensor: {layers: 2}\nsteps: 2\n")
     (tmp_path / "a.stl").write_bytes(BOX.export(file_type="stl"))
+    (tmp_path / "good.ply").touch()
     (tmp_path / "lidarpool-out").mkdir()
     for name in ("cloud.ply", "path.png", "report.json", "notes of mine.txt"):
         (tmp_path / "lidarpool-out" / name).write_text(f"an earlier {name}")

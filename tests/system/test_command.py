@@ -262,6 +262,9 @@ def test_info_tells_versions_backends_and_gpus(lidarpool):
     first_words = [line.split()[0] for line in outcome.out.splitlines()]
     assert {"lidarpool", "python", "dask", "GPUs", "backends", "cuda", "embree"} <= {*first_words}
     assert re.search(r"^  numpy +ready$", outcome.out, re.MULTILINE)
+    told = json.loads(lidarpool("info", "--json").out)
+    assert told["backends"]["numpy"] == "ready" and told["workers"] == []
+    assert lidarpool("-h").out == lidarpool().out == lidarpool("--help").out
     assert lidarpool("--version").out.startswith("lidarpool, version ")
 
 

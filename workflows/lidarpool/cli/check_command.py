@@ -35,7 +35,9 @@ def check(
     no_plan: bool,
     as_json: bool,
 ) -> None:
-    """Check a scenario, and tell what a run would do and take; nothing is started.
+    """Tell what a run would do and take.
+
+    The scenario is checked, and nothing is started.
 
     Some scans are cast here to estimate the number of points. The exit code is 0 if it can run,
     and 2, with the reasons, if it cannot.

@@ -6,7 +6,9 @@ at a terminal come at once, where everything that is imported for a run takes a 
 
 from __future__ import annotations
 
+import json
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -33,8 +35,6 @@ from .sensor_command import sensors
 from .view_command import view
 
 if TYPE_CHECKING:
-    from poolpart import Pool
-
     from ..run.connection import TlsFiles
 
 PROGRAM = "lidarpool"
@@ -82,7 +82,7 @@ def _shown(command: options.Command) -> options.Command:
     return command
 
 
-@click.group(context_settings={"max_content_width": 100})
+@click.group(context_settings={"max_content_width": 100, "help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name=PROGRAM)
 def cli() -> None:
     """Simulate lidar surveys on a partitioned Dask cluster."""
@@ -96,7 +96,7 @@ for _command in (init, check, schema, scene, sensors, view, plot, export):
 @options.out
 @_shown
 def demo(out: Path, **shown: Any) -> None:
-    """Run the default survey and path planning on a cluster on this machine.
+    """Run the default survey and plan a path, on this machine.
 
     \b
     Examples:
@@ -139,7 +139,9 @@ def demo(out: Path, **shown: Any) -> None:
 )
 @_shown
 def run(scenario: Path, **given: Any) -> None:
-    """Run a survey from a scenario file, or of a mesh file from its middle.
+    """Run the survey of a scenario or mesh file.
+
+    A mesh file alone is scanned from its middle.
 
     \b
     Examples:
@@ -173,8 +175,9 @@ def _run(path: Path | None, **given: Any) -> None:
 
 @cli.command()
 @options.scheduler
-def info(scheduler: str | None, files: TlsFiles) -> None:
-    """Show versions, ray-casting backends, GPUs and the workers by partition.
+@click.option("--json", "as_json", is_flag=True, help="Print it as one JSON document.")
+def info(scheduler: str | None, files: TlsFiles, as_json: bool) -> None:
+    """Show versions, backends, GPUs and workers.
 
     \b
     Examples:
@@ -192,23 +195,33 @@ def info(scheduler: str | None, files: TlsFiles) -> None:
     if scheduler is not None:
         with connected(scheduler, files) as client:
             pool = Pool.from_client(client)
+    workers = sorted(pool or (), key=lambda worker: (sorted(worker.resources), worker.name))
+    gpus = visible_gpus()
+    if as_json:
+        told = {
+            "versions": versions(),
+            "gpus": list(gpus),
+            "backends": {name: reason or "ready" for name, reason in available_backends().items()},
+            "workers": [asdict(worker) for worker in workers],
+        }
+        click.echo(json.dumps(told, indent=1, default=str))
+        return
     for name, number in versions().items():
         click.echo(f"{name:<14} {number}")
-    gpus = visible_gpus()
     click.echo(f"{'GPUs here':<14} {', '.join(gpus) or 'none'}")
     click.echo("backends")
     for name, reason in available_backends().items():
         click.echo(f"  {name:<12} {reason or 'ready'}")
     if pool is not None:
-        _tell_workers(pool)
+        _tell_workers(workers)
 
 
-def _tell_workers(pool: Pool) -> None:
+def _tell_workers(workers: list[Any]) -> None:
     from ..base.words import counted
 
-    hosts = {worker.host for worker in pool}
-    click.echo(f"cluster: {counted(len(pool), 'worker')} on {counted(len(hosts), 'host')}")
-    for worker in sorted(pool, key=lambda worker: (sorted(worker.resources), worker.name)):
+    hosts = {worker.host for worker in workers}
+    click.echo(f"cluster: {counted(len(workers), 'worker')} on {counted(len(hosts), 'host')}")
+    for worker in workers:
         held = ", ".join(f"{name}={slots:g}" for name, slots in sorted(worker.resources.items()))
         name = f"{worker.name}  " if worker.name != worker.address else ""
         click.echo(
@@ -226,6 +239,11 @@ def main(arguments: list[str] | None = None) -> NoReturn:
         cli.main(args=arguments, prog_name=PROGRAM, standalone_mode=False)
     except LidarpoolError as error:
         _die(" ".join([str(error), *_notes(error)]), 2)
+    except click.exceptions.NoArgsIsHelpError as error:
+        click.echo(error.format_message())
+    except click.MissingParameter as error:
+        usage = error.ctx.get_usage() if error.ctx else ""
+        _die(f"{error.format_message()}\n{usage}", 2)
     except click.UsageError as error:
         _die(error.format_message(), 2)
     except (KeyboardInterrupt, click.Abort) as error:

@@ -59,7 +59,7 @@ def _size(ctx: click.Context, param: click.Parameter, value: Any) -> tuple[int, 
 def plot(
     result: Path, only: tuple[str, ...], size: tuple[int, int], out: Path | None, colour: str
 ) -> None:
-    """Draw the pictures of a finished result again: scene, intensity, cloud and path.
+    """Draw the pictures of a result again.
 
     \b
     Examples:

@@ -35,7 +35,7 @@ from ..base.vocabulary import UNITS_M
     help="Axis of these files that points up; by default what they state, else z.",
 )
 def init(folder: Path, meshes: tuple[Path, ...], unit: str | None, up_axis: str | None) -> None:
-    """Write a commented scenario file with all defaults into a folder.
+    """Write a commented scenario file with all defaults.
 
     Beside it goes its JSON Schema, with which editors complete and check it. A scenario that is
     there is not overwritten.
@@ -86,7 +86,9 @@ def _entry(path: Path, folder: Path, unit: str | None, up_axis: str | None) -> d
 
 @click.command()
 def schema() -> None:
-    """Print the JSON Schema of scenario files, for editors that complete them.
+    """Print the JSON Schema of scenario files.
+
+    Editors complete scenarios by it.
 
     Visual Studio Code does with the extension redhat.vscode-yaml, Vim, Emacs and others with
     yaml-language-server, once the first line of a scenario names the schema's file:

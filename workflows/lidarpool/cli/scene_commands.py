@@ -26,6 +26,7 @@ def _made(triangles: int) -> Callable[[Command], Command]:
         for option in (
             click.option("--seed", default=0, help="The same seed gives the same scene."),
             click.option("--triangles", default=triangles, help="About how many."),
+            click.option("--overwrite", is_flag=True, help="Replace a file that is there."),
             click.argument("out", type=click.Path(path_type=Path), metavar="OUT.ply|.glb|.obj"),
         ):
             command = option(command)
@@ -36,7 +37,7 @@ def _made(triangles: int) -> Callable[[Command], Command]:
 
 @scene.command(context_settings={"show_default": True})
 @_made(triangles=100_000)
-def city(out: Path, triangles: int, seed: int) -> None:
+def city(out: Path, triangles: int, seed: int, overwrite: bool) -> None:
     """Make a city: streets, houses, towers, trees, cars; more triangles make it larger.
 
     \b
@@ -46,13 +47,13 @@ def city(out: Path, triangles: int, seed: int) -> None:
     """  # noqa: D301 - click wants the character, not its name
     from ..scene.city import city as make
 
-    _write(out, lambda: make(triangles, seed))
+    _write(out, lambda: make(triangles, seed), overwrite)
 
 
 @scene.command(context_settings={"show_default": True})
 @_made(triangles=2_000_000)
 @click.option("--side", default=1000.0, help="Length of a side in metres.")
-def terrain(out: Path, triangles: int, seed: int, side: float) -> None:
+def terrain(out: Path, triangles: int, seed: int, side: float, overwrite: bool) -> None:
     """Make a square of hills and mountains; more triangles make it finer.
 
     \b
@@ -62,14 +63,17 @@ def terrain(out: Path, triangles: int, seed: int, side: float) -> None:
     """  # noqa: D301 - click wants the character, not its name
     from ..scene.terrain import terrain as make
 
-    _write(out, lambda: make(triangles, seed, side))
+    _write(out, lambda: make(triangles, seed, side), overwrite)
 
 
-def _write(out: Path, make: Callable[[], Scene]) -> None:
+def _write(out: Path, make: Callable[[], Scene], overwrite: bool) -> None:
+    from ..base.errors import LidarpoolError
     from ..base.words import counted
     from ..scene.scene_file import check_target, write_scene
 
     check_target(out)
+    if out.exists() and not overwrite:
+        raise LidarpoolError(f"{out} is there already: give another name, or --overwrite.")
     made = make()
     write_scene(out, made)
     low, high = made.bounds

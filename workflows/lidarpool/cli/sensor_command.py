@@ -16,7 +16,7 @@ import click
     help="Where the picture goes.  [default: named after the model]",
 )
 def sensors(model: str | None, out: Path | None) -> None:
-    """List the sensor models there are, or draw the beam pattern of one.
+    """List sensor models, or draw one's beams.
 
     \b
     Examples:

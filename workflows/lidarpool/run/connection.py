@@ -105,6 +105,11 @@ def connected(scheduler: str, files: TlsFiles | None = None) -> Iterator[Client]
     LidarpoolError
         If no scheduler answers at this address, or the certificates do not do.
     """
+    if ":" not in scheduler.rpartition("//")[2] and not scheduler.startswith("inproc"):
+        raise LidarpoolError(
+            f"The address {scheduler!r} has no port: give that of the scheduler, such as "
+            f"{scheduler}:8786."
+        )
     try:
         security = Security()
         if files and any(files):
