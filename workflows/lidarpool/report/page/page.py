@@ -200,7 +200,7 @@ def _facts(report: Report) -> Iterator[Fact]:
         if report["planning"] is not None:
             yield Fact(duration(seconds["planning"]), "for the planning")
             beside = seconds["survey_and_planning_overlap"]
-            yield Fact(duration(beside), "both at work at the same time")
+            yield Fact(duration(beside), "survey and planning overlap")
     yield Fact(f"{wrong:,}", "tasks outside their partition", bad=wrong > 0)
 
 
