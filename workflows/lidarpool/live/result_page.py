@@ -54,7 +54,12 @@ class ResultView:
         self._facts = page.gui.add_html("")
         self._scans: Any = None
         if file.scans[0] < file.scans[1]:
-            self._scans = page.gui.add_multi_slider("scans", *file.scans, 1, file.scans)
+            first, last = map(str, file.scans)
+            # Marks are centred: spaces keep the last within the panel.
+            marks = ((file.scans[0], first), (file.scans[1], last + len(last) * "\u2007"))
+            self._scans = page.gui.add_multi_slider(
+                "scans", *file.scans, 1, file.scans, marks=marks
+            )
         sensors: Sequence[SensorWay] = ()
         if pictured is None:
             origin, bounds = _around(file)

@@ -84,10 +84,8 @@ def draw_intensity(
     most = min(len(sample_rays), MOST_OF_MOVING if shot.paths else MOST_RAYS)
     some = np.linspace(0, len(sample_rays) - 1, most).astype(int)
     page.lines(axes, shot, sample_rays[some].astype(np.float64), 0.45, 0.5)
-    page.colour_bar(TURBO, LogNorm(low, high), "hits per square metre")
-    page.title(
-        "Ray intensity", f"{counted(count, 'hit')} · {shot.when} · grey: hit by no ray", shot.models
-    )
+    page.colour_bar(TURBO, LogNorm(low, high), "hits per square metre; grey: none")
+    page.title("Ray intensity", f"{counted(count, 'hit')} · {shot.when}", shot.models)
     page.save(path)
 
 
