@@ -216,6 +216,19 @@ def test_a_drive_through_a_large_scene_is_looked_at_from_near(cloud, page):
     assert "hits per square metre" in view._view._scene_legend.content
 
 
+def test_a_drive_under_a_wide_roof_is_cut_below_the_roof(cloud, page):
+    roof = box("Roof", (800, 800, 1))
+    roof = replace(roof, vertices=roof.vertices + np.array([0, 0, 10]))
+    scene = Scene.from_meshes([box("Ground", (800, 800, 0.1)), roof, box("Mast", (1, 1, 90))])
+    way = SensorWay(np.array([0, 2e9]), np.array([[3, 5, 2.0], [20, 5, 2]]), True, "", "VLP-16")
+    hits, rays = np.zeros(scene.triangles, np.int64), np.zeros((0, 2, 3), np.float32)
+    view = ResultView(
+        page, CloudFile(cloud), Pictured(scene, [way], hits, rays, None, None, (), 2e9)
+    )
+    view.draw()
+    assert view._view.cut == pytest.approx(6, abs=0.5)
+
+
 def test_without_a_scene_the_cloud_is_shown_alone_near_zero(cloud, page):
     view = ResultView(page, CloudFile(cloud), None, "why & what")
     view.draw()

@@ -10,9 +10,9 @@ import trimesh
 from numpy.typing import NDArray
 from trimesh.exchange.gltf import export_glb
 
-from raybeam import RayCaster
 from raybeam.open3d_module import load_open3d
 
+from ..render.closeup import floor_and_roof
 from ..render.colouring import TURBO
 from ..render.intensity import density_colours, density_range, hit_density
 from ..scene.scene import Scene
@@ -22,10 +22,6 @@ from .page import LivePage
 MOST_TRIANGLES = 100_000  # 60 bytes each, whenever their colours have changed
 TITLE = "hits per square metre; grey: none"
 SWAP_S = 1.5  # a browser needs a moment to load a mesh
-
-ROOFED = 0.7  # of the steep rays from a sensor end in the scene: there is a roof over it
-STEEP_DEG = 60.0
-TOUCHES = 1e-3  # of the scene's diagonal: a sensor on a surface does not stand under it
 
 # glTF's colours are linear in light, those on a screen are not (IEC 61966-2-1).
 _SCREEN = np.arange(256) / 255
@@ -88,24 +84,7 @@ class Surface:
 
         None where there is none: where they see the sky, or stand over an abyss.
         """
-        if not len(self.corners):
-            return None, None
-        some = sensors[np.linspace(0, len(sensors) - 1, min(len(sensors), 8)).astype(int)]
-        caster = RayCaster(self.coarse.vertices, self.coarse.faces)
-        floor = some[:, 2] - caster.cast(some, np.tile([0.0, 0.0, -1.0], (len(some), 1))).distance
-        count = 64
-        up = np.sin(np.radians(np.linspace(STEEP_DEG, 90, count)))
-        turn = np.pi * (3 - 5**0.5) * np.arange(count)  # the golden angle
-        level = np.sqrt(1 - up * up)
-        rays = np.stack([level * np.cos(turn), level * np.sin(turn), up], axis=1)
-        near = TOUCHES * float(np.linalg.norm(np.ptp(self.coarse.bounds, axis=0)))
-        found = caster.cast(
-            np.repeat(some, count, axis=0), np.tile(rays, (len(some), 1)), t_min=near
-        )
-        heights = (some[:, 2, None] + found.distance.reshape(-1, count) * up).ravel()
-        met = np.isfinite(heights)
-        roof = float(np.median(heights[met])) if met.mean() >= ROOFED else None
-        return (float(floor.min()) if np.isfinite(floor).all() else None), roof
+        return floor_and_roof(self.coarse, sensors) if len(self.corners) else (None, None)
 
 
 def _simplified(scene: Scene, most: int) -> tuple[Scene, NDArray[np.integer]]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..columns.cloud import Cloud
 from ..columns.table import AXES, Column, Z
 from ..plan import Planning
-from ..render.closeup import around_ways
+from ..render.closeup import CUT, around_ways
 from ..render.colouring import colours_of
 from ..render.theme import object_colours
 from ..run.picture_file import SensorWay, ways_of
@@ -36,8 +36,6 @@ _PATH, _DISC = (20, 150, 90), (120, 130, 150)
 _BALL, _POSE, _END = 0.009, 0.0054, 0.008
 _MOVES = 0.4  # of that: what moves through a large scene is looked at from near
 _POINT, _POINT_OF_MANY = 0.0035, 0.6
-# Where a scene is cut that has a roof: so far up from the sensors, as a share of the way to it.
-_CUT = 0.5
 _PLAY_S = (6.0, 60.0)  # that a survey takes which is played, however short or long it is
 
 
@@ -221,9 +219,9 @@ class View:
         """Let one look into a building, where the sensors stand in one, and find the floor."""
         floor, roof = surface.around(self._poses)
         self._ground = self._ground if floor is None else floor
-        if self.cut is None and roof is not None:
+        if roof is not None and (self.cut is None or roof < self.cut):
             top = float(self._poses[:, 2].max())
-            height = top + _CUT * (roof - top) + float(self._origin[2])
+            height = top + CUT * (roof - top) + float(self._origin[2])
             self._cut.value = min(max(height, self._cut.min), self._top)
 
     def draw_rays(self, rays: NDArray[np.float32], version: Hashable) -> None:

@@ -8,6 +8,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from raybeam import RayCaster
+
 from ..scene.scene import Scene
 
 Floats = NDArray[np.float64]
@@ -17,6 +19,12 @@ Ints = NDArray[np.int64]
 # point, and metres at least.
 _SHARE, _HEIGHTS, _LEAST_M = 0.35, 2.0, 25.0
 _MOST = 0.5  # of the scene's ground: then all of it is shown
+
+CUT = 0.5  # where what stands under a roof is cut, as a share of the way up to it
+_ROOFED = 0.7  # of the steep rays from a sensor end in the scene: there is a roof over it
+_STEEP_DEG, _RAYS = 60.0, 64
+_TOUCHES = 1e-3  # of the scene's diagonal: a sensor on a surface does not stand under it
+_PLACES = 8  # that are asked
 
 
 def around_ways(bounds: Floats, ways: Sequence[Floats]) -> Floats | None:
@@ -39,6 +47,26 @@ def around_ways(bounds: Floats, ways: Sequence[Floats]) -> Floats | None:
     box[0, 2] = bounds[0, 2]
     ground, whole = (float(np.prod((b[1] - b[0])[:2])) for b in (box, bounds))
     return box if ground < _MOST * whole else None
+
+
+def floor_and_roof(scene: Scene, places: Floats) -> tuple[float | None, float | None]:
+    """Heights of the floor under places (p, 3) and of the roof over them, metres.
+
+    None where there is none: where they see the sky, or are over an abyss.
+    """
+    some = places[np.linspace(0, len(places) - 1, min(len(places), _PLACES)).astype(int)]
+    caster = RayCaster(scene.vertices, scene.faces)
+    floor = some[:, 2] - caster.cast(some, np.tile([0.0, 0.0, -1.0], (len(some), 1))).distance
+    up = np.sin(np.radians(np.linspace(_STEEP_DEG, 90, _RAYS)))
+    turn = np.pi * (3 - 5**0.5) * np.arange(_RAYS)  # the golden angle
+    level = np.sqrt(1 - up * up)
+    rays = np.stack([level * np.cos(turn), level * np.sin(turn), up], axis=1)
+    near = _TOUCHES * float(np.linalg.norm(np.ptp(scene.bounds, axis=0)))
+    found = caster.cast(np.repeat(some, _RAYS, axis=0), np.tile(rays, (len(some), 1)), t_min=near)
+    heights = (some[:, 2, None] + found.distance.reshape(-1, _RAYS) * up).ravel()
+    met = np.isfinite(heights)
+    roof = float(np.median(heights[met])) if met.mean() >= _ROOFED else None
+    return (float(floor.min()) if np.isfinite(floor).all() else None), roof
 
 
 def cut_out(scene: Scene, box: Floats) -> tuple[Scene, Ints, Floats]:

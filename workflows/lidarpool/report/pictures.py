@@ -13,7 +13,7 @@ from ..base.errors import LidarpoolError
 from ..base.words import did_you_mean
 from ..columns.table import Z
 from ..export.cloud_file import CloudFile
-from ..render.closeup import around_ways, cut_out
+from ..render.closeup import CUT, around_ways, cut_out, floor_and_roof
 from ..render.pictures import MOST_POINTS, draw_cloud, draw_intensity, draw_scene
 from ..render.shot import SIZE, Shot, take_shot
 from ..run.picture_file import Pictured, ways_of
@@ -50,6 +50,11 @@ def picture_makers(
         box = around_ways(scene.bounds, happening)
         if box is None:
             return scene, np.arange(len(scene.faces)), np.ones(len(scene.faces)), ""
+        places = np.concatenate(happening)
+        _, roof = floor_and_roof(scene, places)
+        if roof is not None:
+            top = float(places[:, 2].max())
+            box[1, 2] = min(box[1, 2], top + CUT * (roof - top))
         wide, deep, _ = box[1] - box[0]
         top = box[1, 2] + scene.origin[2]
         return *cut_out(scene, box), (
