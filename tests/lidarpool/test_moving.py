@@ -8,9 +8,20 @@ import numpy as np
 import pytest
 from tests.lidarpool.casting import cast_between
 
-from lidarpool import LidarpoolError, Material, Mounted, Pose, Scene, Survey, Track, load_sensor
+from lidarpool import (
+    LidarpoolError,
+    Material,
+    Mounted,
+    Noise,
+    Pose,
+    Scene,
+    Survey,
+    Track,
+    load_sensor,
+)
 from lidarpool.run.identity import identity_of
 from lidarpool.run.job import Job
+from lidarpool.scan import world
 from lidarpool.scan.motion import into_axes
 from lidarpool.scan.rig import Rig, RigPlan
 from lidarpool.scene.actors import Actor, box
@@ -165,6 +176,37 @@ def test_an_actor_behind_glass_is_where_it_is_without(street, backend):
     assert np.array_equal(plain["time"], seen["time"])
     assert np.allclose(plain["range"], seen["range"], atol=1e-4)
     assert (seen["intensity"] < 0.93 * plain["intensity"]).all()
+
+
+TURNED = {"poses": [Pose((0, 0, 1.5), 40, 8, -5), Pose((1, 0, 1.5), -17, 2, 9)], "steps": 54}
+CORNERS = np.array([[-9, -3, 0], [9, -3, 0], [9, -3, 9], [-9, -3, 9.0]])
+MIRROR = Mesh("Mirror", CORNERS, np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+@pytest.mark.parametrize("model", ["velodyne/vlp16", "livox/mid40"])
+@pytest.mark.parametrize("name", [*SURVEYS, "turned", "noise", "mirror"])
+def test_no_ray_meets_an_actor_that_is_not_asked_about_it(street, monkeypatch, name, model):
+    options = SURVEYS | {
+        "turned": TURNED,
+        "noise": {"trajectory": DRIVE, "noise": Noise(angle_deg=1)},
+        "mirror": {
+            **TURNED,
+            "materials": [Material("*", 0.5), Material("Mirror", transparent="mirror")],
+        },
+    }
+    scene = replace(Scene.from_meshes([*street.meshes(), MIRROR]), actors=(CAR,))
+    sensors = [Mounted(load_sensor(model), Pose((0, 0.1, 0.2), 90 if "livox" in model else 20))]
+    survey = Survey(sensors=sensors, keep_every=1, columns=COLUMNS, **options[name])
+    found = made(survey, scene)
+    asked = []
+    monkeypatch.setattr(
+        world._Cells, "near", lambda cells, *_: asked.append(1) or np.arange(cells._rays)
+    )
+    every = made(survey, scene)
+    assert asked
+    assert (every["object"] == len(scene.names)).sum() > (0 if name == "turned" else 100)
+    for column, values in every.items():
+        assert np.array_equal(found[column], values), column
 
 
 def test_however_scans_are_batched_actors_have_the_same_bits(street):

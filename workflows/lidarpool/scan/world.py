@@ -1,7 +1,8 @@
 """The ray caster of a whole world: of the scene, which stands, and of actors, which move.
 
-Each ray is taken into an actor's axes at its own time, so that no tree is ever built again; and an
-actor is asked only about rays that come near the sphere that holds it meanwhile.
+Each ray is taken into an actor's axes at its own time, so that no tree is ever built again. An
+actor is asked only about rays that come near a sphere that holds it meanwhile, and only those are
+made: which they are is told by where the sphere lies in the axes of each pose.
 """
 
 from __future__ import annotations
@@ -18,8 +19,12 @@ from ..scene.scene import Scene
 from ..sensor import Sensor
 from .motion import Poses, into_axes
 
-CHUNK_RAYS = 1 << 16  # that are made at a time to be taken to actors
-SAMPLES = 32  # of an actor's way while the rays of a chunk are fired
+CELL_RAYS = 1 << 10  # of a sensor that stands, which are fired at nearly one time
+CELLS = 64  # cells for which an actor's way is looked at once
+NEAR_M = 1.0  # rays of a cell start no farther than this from its place
+TURN = (
+    2e-3  # radians: rays of a cell point no farther than this off the pattern, turned by its pose
+)
 
 Float = NDArray[np.float64]
 
@@ -73,14 +78,15 @@ class World:
         distance = np.full(stop - start, np.inf)
         triangle = np.full(stop - start, -1, np.int32)
         distance[found.ray], triangle[found.ray] = found.distance, found.triangle
-        for first in range(0, stop - start, CHUNK_RAYS):
-            ray = np.arange(first, min(first + CHUNK_RAYS, stop - start))
-            origins, directions = map(_by_axis, poses.rays(pattern, ray, start))
-            times = poses.times(ray)
-            for actor in self._actors:
-                rows, t, face = actor.hits(origins, directions, times, **limits)
-                nearer = t < distance[ray[rows]]
-                distance[ray[rows[nearer]]], triangle[ray[rows[nearer]]] = t[nearer], face[nearer]
+        cells = _Cells(pattern, poses, start, stop)
+        for actor in self._actors:
+            ray = cells.near(actor, t_max)
+            if not len(ray):
+                continue
+            origins, directions = poses.rays(pattern, ray, start)
+            rows, t, face = actor.hits(origins, directions, poses.times(ray), **limits)
+            nearer = t < distance[ray[rows]]
+            distance[ray[rows[nearer]]], triangle[ray[rows[nearer]]] = t[nearer], face[nearer]
         ray = np.flatnonzero(triangle >= 0)
         begins = np.zeros(1, np.int64) if groups is None else groups
         cuts = np.append(np.searchsorted(ray, begins), len(ray))
@@ -112,9 +118,77 @@ class World:
         )
 
 
-def _by_axis(vectors: Float) -> Float:
-    """Return vectors (m, 3) in memory axis by axis."""
-    return np.ascontiguousarray(vectors.T).T
+class _Cells:
+    """Rays of a scan, so many to a cell that they start and are fired nearly together.
+
+    Parameters
+    ----------
+    pattern, poses
+        Of the scan.
+    start, stop
+        Its window.
+    """
+
+    def __init__(self, pattern: Pattern, poses: Poses, start: int, stop: int) -> None:
+        self._rays, each, places = stop - start, poses.rays_per_pose, poses.positions
+        rotations = None if poses.rotations is None else poses.rotations.reshape(-1, 3, 3)
+        self._rotations = rotations
+        reach = 0.0 if pattern.origins is None else 2 * float(np.abs(pattern.origins).max())
+        apart = each is None and reach > NEAR_M
+        self._each = each = 1 if apart else each or CELL_RAYS
+        cells = -(-self._rays // each)
+        rows = (start + np.arange(cells * each)) % len(pattern)
+        if apart and pattern.origins is not None:
+            origins = pattern.origins.take(rows, axis=0)
+            back = None if rotations is None else rotations.transpose(0, 2, 1)
+            places, reach = places + into_axes(origins, back), 0.0
+        self._reach = reach
+        self._places = np.broadcast_to(places, (cells, 3))
+        alike = len(pattern) == each and start % each == 0
+        directions = pattern.directions if alike else pattern.directions.take(rows, axis=0)
+        self._directions = directions.reshape(-1, each, 3).transpose(2, 0, 1)
+        # A cone that holds the rays of a cell.
+        middle = self._directions.mean(axis=2)
+        self._axes = middle / np.maximum(np.linalg.norm(middle, axis=0), 1e-9)
+        cosines = _along(self._axes[:, :, None], self._directions)
+        self._opening = np.arccos(np.clip(cosines.min(axis=1, initial=1), -1, 1))
+        first = np.arange(0, self._rays, each)
+        last = np.minimum(first + each, self._rays) - 1
+        self._begins = poses.times(first)
+        ends = poses.times(last)
+        self._lasts, self._end = (ends - self._begins).max(initial=0), ends.max(initial=0)
+
+    def near(self, actor: _Cast, t_max: float) -> NDArray[np.intp]:
+        """Numbers of the rays that come near an actor; no other ray meets it."""
+        if not self._rays:
+            return np.zeros(0, np.intp)
+        low, high = self._begins.min(), self._begins.max()
+        step = max((high - low) * CELLS / len(self._begins), self._lasts, 1.0)
+        times = low + step * np.arange((high - low) // step + 1)
+        way = actor.centre(np.append(times, self._end))
+        between = np.linalg.norm(np.diff(way, axis=0), axis=1).max()
+        radius = actor.radius + 2 * between + self._reach + 1e-3
+        number = ((self._begins - low) // step).astype(np.intp)
+        centre = into_axes(way[number] - self._places, self._rotations).T
+        far = np.sqrt(_along(centre, centre))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            seen = np.where(far > radius, np.arcsin(radius / far), np.pi) + TURN
+            off = np.arccos(np.clip(_along(self._axes, centre) / far, -1, 1))
+        cell = np.flatnonzero((far <= t_max + radius) & ~(off > self._opening + seen))
+        directions = self._directions
+        if directions.shape[1] > 1:
+            directions = directions[:, cell]
+        along = _along(centre[:, cell, None], directions)
+        least = far[cell] * np.cos(np.minimum(seen[cell], np.pi))
+        found = np.flatnonzero(along >= least[:, None])
+        ray = cell[found // self._each] * self._each + found % self._each
+        return ray[ray < self._rays]
+
+
+def _along(one: Float, other: Float) -> Float:
+    """Scalar products of vectors (3, ...)."""
+    (x, y, z), (a, b, c) = one, other
+    return np.asarray(x * a + y * b + z * c)
 
 
 class _Cast:
@@ -125,7 +199,13 @@ class _Cast:
         self._first = first  # number of its first triangle
         self._caster = RayCaster(vertices, actor.mesh.faces, **options)
         self._centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
-        self._radius = float(np.linalg.norm(vertices - self._centre, axis=1).max())
+        self.radius = float(np.linalg.norm(vertices - self._centre, axis=1).max())
+
+    def centre(self, times: Float) -> Float:
+        """Middle of a sphere that holds it, of `radius`, at times (m,): (m, 3)."""
+        positions, rotations = self._way.poses(0, times)
+        turned = self._centre if rotations is None else rotations @ self._centre
+        return np.asarray(positions + turned)
 
     def hits(
         self, origins: Float, directions: Float, times: Float, *, t_min: float, t_max: float
@@ -136,35 +216,10 @@ class _Cast:
         -------
         Numbers of the rays that do (h,), distances in lengths of their directions, and triangles.
         """
-        rows = np.flatnonzero(self._near(origins, directions, times, t_max))
-        if not len(rows):
-            return rows, np.zeros(0), np.zeros(0, np.int32)
-        starts = np.broadcast_to(origins, directions.shape)[rows]
-        ahead = directions[rows]
-        positions, rotations = self._way.poses(0, times[rows])
-        starts = into_axes(starts - positions, rotations)
-        hits = self._caster.cast(starts, into_axes(ahead, rotations), t_min, t_max)
+        positions, rotations = self._way.poses(0, times)
+        starts = into_axes(origins - positions, rotations)
+        hits = self._caster.cast(starts, into_axes(directions, rotations), t_min, t_max)
         on = np.flatnonzero(hits.hit)
         # Directions of a sensor that turns meanwhile are not quite of unit length.
-        lengths = np.linalg.norm(ahead[on], axis=1)
-        return rows[on], hits.distance[on] / lengths, hits.triangle[on] + np.int32(self._first)
-
-    def _near(
-        self, origins: Float, directions: Float, times: Float, t_max: float
-    ) -> NDArray[np.bool_]:
-        """Which rays meet the sphere that holds the actor at all of these times: (m,)."""
-        positions, rotations = self._way.poses(0, np.linspace(times.min(), times.max(), SAMPLES))
-        centre = self._centre if rotations is None else rotations @ self._centre
-        way = centre + positions
-        middle = (way.min(axis=0) + way.max(axis=0)) / 2
-        between = np.linalg.norm(np.diff(way, axis=0), axis=1).max()
-        radius = self._radius + np.linalg.norm(way - middle, axis=1).max() + between + 1e-3
-        # By axis: sums over rows of three take several times as long.
-        x, y, z = np.subtract(middle[:, None], origins.T)
-        squared = x * x + y * y + z * z
-        if squared.min() > (t_max + radius) ** 2:
-            return np.zeros(len(directions), np.bool_)
-        a, b, c = directions.T
-        along = x * a + y * b + z * c
-        past = squared - along * along / (a * a + b * b + c * c)
-        return np.asarray((past <= radius * radius) & (along >= -radius))
+        lengths = np.linalg.norm(directions[on], axis=1)
+        return on, hits.distance[on] / lengths, hits.triangle[on] + np.int32(self._first)
