@@ -22,14 +22,12 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
-from distributed import Client
 from tests.system.default_survey import DEFAULT_CLOUD_SHA256
 
 import lidarpool.cli.run_command
 import lidarpool.report.output
-from lidarpool import LidarpoolError, Result, read_cloud, simulate
-from lidarpool.report.output import FILES, write_result
-from lidarpool.scenario.scenario import Scenario
+from lidarpool import read_cloud
+from lidarpool.report.output import FILES
 
 COMMAND = [sys.executable, "-c", "from lidarpool.cli.commands import main; main()"]
 SHORT = "sensor: {layers: 8}\nplanning: {trials: 4, iterations: 20}\n"
@@ -298,49 +296,6 @@ def test_bars_on_a_terminal(tmp_path, cluster):
     assert process.wait(300) == 0, drawn
     for label in ("1 generate", "2 intersect", "3 sort", "4 collect", "planning", "108/108", "4/4"):
         assert label in drawn.decode()
-
-
-# -- the output folder ---------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def made(cluster) -> Result:
-    """A result to be written."""
-    scenario = Scenario.from_data({"sensor": {"layers": 4}, "planning": {"trials": 2}})
-    scene = scenario.build_scene()
-    survey, planning = scenario.survey(scene), scenario.plan(scene)
-    with Client(cluster, set_as_default=False) as client:
-        return simulate(scene, survey, planning, client=client)
-
-
-def earlier(folder: Path) -> dict[str, bytes]:
-    folder.mkdir(exist_ok=True)
-    for name in FILES:
-        (folder / name).write_text(f"an earlier {name}")
-    return content(folder)
-
-
-def content(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
-
-
-@pytest.mark.parametrize("failing", FILES)
-def test_a_file_that_cannot_be_written_leaves_the_earlier_result(
-    failing, made, tmp_path, monkeypatch, no_pictures
-):
-    before = earlier(tmp_path / "out")
-    flush = lidarpool.report.output.flush
-
-    def full(path: Path) -> None:
-        if path.name == failing:
-            raise OSError(28, "No space left on device")
-        flush(path)
-
-    monkeypatch.setattr(lidarpool.report.output, "flush", full)
-    with pytest.raises(LidarpoolError, match=r"out \(No space left on device\): make room"):
-        write_result(tmp_path / "out", made)
-    assert content(tmp_path / "out") == before
-    assert {path.name for path in (tmp_path / "out").iterdir()} == before.keys()
 
 
 # -- drawn again ---------------------------------------------------------------------------------

@@ -1,15 +1,259 @@
-"""What the documents say is so: the files, links and tests that they name exist."""
+"""Code in README and docs: Python runs, commands are parsed, scenarios are validated.
+
+What cannot run says so in a comment before it, `<!-- not run: the reason -->`; of that, what
+can be looked at without running it is. Files, links and tests that documents name exist.
+"""
 
 from __future__ import annotations
 
 import ast
+import importlib.util
 import re
+import runpy
+import shlex
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from contextlib import nullcontext
+from dataclasses import dataclass
+from functools import partial
+from itertools import dropwhile
 from pathlib import Path
+from typing import Any
 
+import click
+import dask
+import distributed
+import numpy as np
 import pytest
+import yaml
+from distributed.cli import dask_scheduler, dask_worker
+
+import lidarpool.run.simulation
+from lidarpool import Cloud, save_cloud
+from lidarpool.cli.commands import cli
+from lidarpool.scenario.scenario import Scenario
+from lidarpool.sensor.models import SensorModel
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = [ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md"))]
+_BLOCK = re.compile(
+    r"^(?:<!-- not run: (?P<reason>[^\n]*) -->\n)?"
+    r'^```(?P<language>\w*)(?: title="(?P<title>[^"]*)")?\n(?P<code>.*?)^```$',
+    re.MULTILINE | re.DOTALL,
+)
+_SHELL = ("sh", "console", "")
+DASK = {"scheduler": dask_scheduler.main, "worker": dask_worker.main}
+
+
+@dataclass(frozen=True)
+class Block:
+    """Code in a document; `reason` says why it does not run, where it does not."""
+
+    where: str
+    language: str
+    title: str | None
+    code: str
+    reason: str | None = None
+
+
+def blocks_of(path: Path) -> list[Block]:
+    text = path.read_text(encoding="utf-8")
+    return [
+        Block(
+            f"{path.relative_to(ROOT)}:{text[: match.start('code')].count(chr(10)) + 1}",
+            match["language"],
+            match["title"],
+            match["code"],
+            match["reason"],
+        )
+        for match in _BLOCK.finditer(text)
+    ]
+
+
+def programs() -> Iterator[Block]:
+    """Python of all documents; that of a page which says so is one program."""
+    for path in DOCUMENTS:
+        python = [block for block in blocks_of(path) if block.language == "python"]
+        if "<!-- one program -->" in path.read_text(encoding="utf-8"):
+            code = "\n".join(block.code for block in python)
+            python = [Block(str(path.relative_to(ROOT)), "python", None, code)]
+        yield from python
+
+
+ALL = [block for path in DOCUMENTS for block in blocks_of(path)]
+PROGRAMS = list(programs())
+
+
+def of(*languages: str) -> Any:
+    chosen = [block for block in ALL if block.language in languages]
+    return pytest.mark.parametrize("block", chosen, ids=lambda block: block.where)
+
+
+def test_no_code_is_overlooked():
+    fences = sum(path.read_text("utf-8").count("\n```") for path in DOCUMENTS)
+    assert fences == 2 * len(ALL)  # none has another form
+    assert {block.language for block in ALL} <= {"python", "yaml", "text", "matlab", *_SHELL}
+
+
+@pytest.fixture
+def in_threads(monkeypatch, cluster_client):
+    """Give programs clusters of threads: the tests' own, or one that they describe."""
+    theirs = partial(distributed.LocalCluster, processes=False, protocol="tcp")
+    monkeypatch.setattr(distributed, "LocalCluster", theirs)
+    ours = nullcontext(cluster_client)
+    monkeypatch.setattr(lidarpool.run.simulation, "local_client", lambda **_: ours)
+
+
+@pytest.mark.parametrize("block", PROGRAMS, ids=lambda block: block.where)
+def test_python_runs(tmp_path, block, in_threads, monkeypatch, capsys):
+    compile(block.code, block.where, "exec")
+    if block.reason:
+        return
+    folder = tmp_path / "lidarpool-out"
+    folder.mkdir()
+    one = np.ones(1, np.int32)
+    columns = {"scan": one, "channel": one, "object": one}
+    save_cloud(folder / "cloud.ply", Cloud(np.ones((1, 3), np.float32), columns))
+    script = tmp_path / "example.py"
+    fewer = block.code.replace("trials=100", "trials=4")  # all are in `make sample`
+    script.write_text(fewer, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    runpy.run_path(str(script), run_name="__main__")
+    printed = capsys.readouterr().out.splitlines()
+    # What a comment beside a print promises is what is printed.
+    for promised in re.findall(r"print\(.*\)  # (.*)", block.code):
+        assert promised in printed
+    if block is PROGRAMS[0]:
+        assert re.fullmatch(r"\d+ points, a path of 71\.\d\d m", *printed)
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_the_first_program_of_the_readme_runs_as_a_script(tmp_path):
+    """It starts processes, each of which imports it."""
+    script = tmp_path / "example.py"
+    script.write_text(PROGRAMS[0].code, encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, script], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert re.fullmatch(r"\d+ points, a path of 71\.\d\d m\n", done.stdout)
+    assert (tmp_path / "cloud.ply").exists()
+
+
+@of(*_SHELL)
+def test_commands_are_there(block, tmp_path, monkeypatch):
+    # Dask asks whether files of certificates are there while it parses.
+    for name in ("ca.pem", "me.pem", "me.key"):
+        (tmp_path / name).touch()
+    monkeypatch.chdir(tmp_path)
+    lines = commands(block)
+    assert lines
+    known = [look(words) for words in lines]
+    assert block.reason or all(known), lines
+
+
+def commands(block: Block) -> list[list[str]]:
+    """Words of each command, without what the prompt or the environment is."""
+    lines = block.code.replace("\\\n", " ").splitlines()
+    if block.language == "console":
+        lines = [line.removeprefix("$ ") for line in lines if line.startswith("$ ")]
+    found = (shlex.split(line, comments=True) for line in lines)
+    bare = (dropwhile(re.compile(r"[A-Z]+=").match, words) for words in found)
+    return [words for words in map(list, bare) if words]
+
+
+def look(words: list[str]) -> bool:
+    """Whether this is a command of ours or of Dask; its arguments must be right then."""
+    match words:
+        case ["lidarpool", *arguments]:
+            parse(cli, "lidarpool", arguments)
+        case ["dask", kind, *arguments]:
+            parse(DASK[kind], kind, arguments)
+        case ["make", target, *_]:
+            assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text("utf-8"), re.M)
+        case ["python", "-m", module, *_]:
+            assert importlib.util.find_spec(module), module
+        case ["pip", "install", *arguments]:  # pip takes an extra that there is not
+            project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+            extras = re.findall(r"\[(\w+)\]", " ".join(arguments))
+            assert set(extras) <= set(project["optional-dependencies"])
+        case ["pytest", *_]:
+            pass
+        case _:
+            return False
+    for word in words:
+        assert not word.startswith("examples/") or (ROOT / word).exists(), word
+    return True
+
+
+def parse(command: click.Command, name: str, arguments: list[str]) -> None:
+    """Parse arguments as the command does, and do nothing; click.UsageError if they are wrong."""
+    parent = None
+    while isinstance(command, click.Group):
+        parent = click.Context(command, parent, name)
+        name, command, arguments = command.resolve_command(parent, arguments)
+    with command.make_context(name, list(arguments), parent) as context:
+        # dask worker hands what it does not know to preloads.
+        assert not context.params.get("preload_argv")
+
+
+@of("yaml")
+def test_yaml_is_what_it_is_for(block):
+    data = yaml.safe_load(block.code)
+    assert data
+    if block.reason:
+        return
+    if block.title == "distributed.yaml":
+        for key in leaves(data):
+            # KeyError where Dask has no such setting; variables of the environment have any name.
+            dask.config.get(re.sub(r"(?<=\.pre-spawn-environ)\..*", "", key))
+    elif "beams" in data:
+        SensorModel.model_validate(data)
+    else:
+        Scenario.from_data(data, source=block.where)
+
+
+def leaves(data: dict[str, Any], above: str = "") -> Iterator[str]:
+    """Keys of settings, with dots."""
+    for key, value in data.items():
+        if isinstance(value, dict):
+            yield from leaves(value, f"{above}{key}.")
+        else:
+            yield f"{above}{key}"
+
+
+@pytest.mark.slow
+def test_the_tutorial_from_beginning_to_end(tmp_path, lidarpool, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    told, ran = "", 0
+    for block in blocks_of(ROOT / "docs/tutorial.md"):
+        if block.reason or block.language == "python":
+            continue
+        if block.language == "yaml":
+            Path(block.title).write_text(block.code, encoding="utf-8")
+        elif block.language == "text":
+            for line in block.code.splitlines():
+                assert plain(line) in map(plain, told.splitlines()), told
+        else:
+            for words in commands(block):
+                assert words[0] == "lidarpool"
+                outcome = lidarpool(*words[1:])
+                assert outcome.code == 0, outcome.err
+                told, ran = outcome.out + outcome.err, ran + 1
+    assert ran == 4
+    for name in ("cloud.ply", "report.html"):
+        assert (tmp_path / "hall/result" / name).stat().st_size > 1000
+
+
+def plain(line: str) -> str:
+    """A line without its numbers, units of memory and spaces, which differ between machines."""
+    return " ".join(re.sub(r"[\d,.]+(?: [kMG]?B\b)?", "N", line).split())
+
+
+# -- what documents name --------------------------------------------------------------------------
 
 
 def test_the_readme_shows_the_example_as_it_is():

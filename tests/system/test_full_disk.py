@@ -107,10 +107,12 @@ def test_a_disk_without_room_for_anything(disk, run):
 def test_the_disk_of_the_result_is_full(
     disk, run, expected, cluster, lidarpool, tmp_path, monkeypatch, no_pictures
 ):
-    """The run is complete, and there is no room for the files, or for a part of them."""
+    """The run is complete, and there is no room for its files beside an earlier result."""
     monkeypatch.setattr(lidarpool_output, "ROOM_BYTES", 0)  # else it would be refused at once
     out = disk(4000) / "out"
     out.mkdir()
+    for name in FILES:
+        (out / name).write_text(f"an earlier {name}")
     run(folder=out / "run")
     used = sum(path.stat().st_blocks * 512 for path in out.rglob("*"))
     disk(used // 1024 + 30)
@@ -120,7 +122,8 @@ def test_the_disk_of_the_result_is_full(
     assert failed.code == 2
     assert re.search(r"(?i)make room|no space", failed.err.splitlines()[-1])
     assert f"108 of 108 scans are kept in {out}/run: continue with --resume (" in failed.err
-    assert {path.name for path in out.iterdir()} == {"run"}
+    assert {path.name for path in out.iterdir()} == {"run", *FILES}
+    assert all((out / name).read_text() == f"an earlier {name}" for name in FILES)
     disk(40_000)
     done = lidarpool(*command)
     assert (done.code, done.err) == (0, "")

@@ -15,7 +15,6 @@ from typing import Any
 
 import pytest
 
-import lidarpool.cli.run_command
 from lidarpool.report.output import FILES
 
 pytestmark = pytest.mark.skipif(
@@ -237,31 +236,18 @@ def test_nohup_is_obeyed(when):
     assert (ended.returncode, ended.stdout, ended.stderr) == (0, b"still here\n", b"")
 
 
-MOMENTS = {
-    "moved in": (Path, "replace", lambda _, to: to == Path("out/cloud.ply")),
-    "dropped": (Path, "rmdir", lambda path: path.name == "run" and Path("out/cloud.ply").exists()),
-    "told": (lidarpool.cli.run_command, "_tell", lambda *_: True),
-}
-
-
-@pytest.mark.parametrize(
-    "moment", ["moved in", *(pytest.param(m, marks=pytest.mark.slow) for m in ("dropped", "told"))]
-)
-def test_ctrl_c_when_the_result_is_whole(
-    moment, lidarpool, cluster, tmp_path, monkeypatch, no_pictures
-):
+def test_ctrl_c_when_the_result_is_whole(lidarpool, cluster, tmp_path, monkeypatch, no_pictures):
     """It is not said that nothing has happened, and there is nothing to resume."""
-    owner, name, when = MOMENTS[moment]
-    function = getattr(owner, name)
+    replace = Path.replace
 
-    def interrupted(*arguments: Any) -> Any:
-        if when(*arguments):
+    def interrupted(path: Path, to: Path) -> Path:
+        if to == Path("out/cloud.ply"):
             os.kill(os.getpid(), signal.SIGINT)
-        return function(*arguments)
+        return replace(path, to)
 
     (tmp_path / "s.yaml").write_text(SHORT)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(owner, name, interrupted)
+    monkeypatch.setattr(Path, "replace", interrupted)
     run = lidarpool("run", "s.yaml", "--out", "out", "--scheduler", cluster, "-q", "--no-plan")
     assert run.code == 130
     assert run.err.strip() == (

@@ -9,11 +9,12 @@ from collections.abc import Callable
 
 import dask
 import pytest
-from distributed import Client
+from distributed import Client, Future
 
 import lidarpool.run.checks
-from lidarpool import LidarpoolError, Scene, Sensor, Survey, simulate
+from lidarpool import Frame, LidarpoolError, Scene, Sensor, Survey, simulate
 from lidarpool.run.checks import common_backend
+from lidarpool.scan.workers import CastingWorkers
 from poolpart import Pool, worker_identities
 
 SURVEY = Survey(Sensor.grid(rays_per_revolution=180, layers=16, step_deg=10), [(0, 0, 1)], steps=36)
@@ -81,6 +82,28 @@ def test_workers_that_die_when_a_run_starts_are_waited_for(client, lose_gpu):
     lose_gpu(kill_all)
     result = simulate(Scene.seed(), SURVEY, client=client, backend="numpy")
     assert result.hits > 0
+
+
+@pytest.mark.slow
+def test_a_worker_that_stops_when_it_has_prepared_itself_is_done_without(client, monkeypatch):
+    """Its answer cannot be had for longer than Dask's own calls wait for one."""
+    stopped: list[int] = []
+    take = CastingWorkers._take
+
+    def stop_and_take(workers: CastingWorkers, address: str, future: Future) -> None:
+        if not stopped:
+            stopped.append(client.run(os.getpid, workers=[address])[address])
+            os.kill(stopped[0], signal.SIGSTOP)
+        take(workers, address, future)
+
+    def go_on(frame: Frame) -> None:
+        os.kill(stopped[0], signal.SIGCONT)
+
+    monkeypatch.setattr(CastingWorkers, "_take", stop_and_take)
+    try:
+        assert simulate(Scene.seed(), SURVEY, client=client, on_frame=go_on).hits > 0
+    finally:
+        os.kill(stopped[0], signal.SIGCONT)
 
 
 @pytest.mark.slow

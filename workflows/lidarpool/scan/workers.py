@@ -10,7 +10,7 @@ from typing import Any
 
 from distributed import Client, Future
 
-from poolpart import Partition, Whereabouts, look_for_tasks
+from poolpart import Partition, Whereabouts, fetch_available, look_for_tasks
 
 from .._version import __version__
 from ..base.errors import LidarpoolError
@@ -19,6 +19,7 @@ from .rig import RigPlan, drop_rig
 
 LOOK_EVERY_S = 1.0
 SETUP_DEATHS = 4  # workers in a row that may die while they prepare themselves
+ANSWER_S = 1.0  # that a prepared worker's answer is waited for without a sign of life
 RELEASE_S = 3.0  # for workers to forget their rigs
 PREPARING = "preparing the scene on the GPU workers"
 
@@ -141,8 +142,11 @@ class CastingWorkers:
         )
 
     def _take(self, address: str, future: Future) -> None:
-        """Enter a worker that has answered."""
-        answer: dict[str, Any] = future.result(timeout=10)
+        """Enter a worker that has answered; one that has stopped since is asked again."""
+        found = fetch_available(self._client, [future.key], ANSWER_S, at=address)
+        if future.key not in found:
+            return
+        answer: dict[str, Any] = found[future.key]
         if answer["version"] != __version__:
             self._refused[address] = answer["version"]
             del self._setups[address]
