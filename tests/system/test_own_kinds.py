@@ -15,7 +15,6 @@ from lidarpool import (
     Sensor,
     Survey,
     read_cloud,
-    save_cloud,
     save_result,
     simulate,
 )
@@ -133,6 +132,3 @@ def test_both_are_in_the_files_of_the_result(result, tmp_path, no_pictures):
     assert np.array_equal(cloud["brightness"], values)
     header = (tmp_path / "cloud.ply").read_bytes().partition(b"end_header")[0]
     assert b"property float brightness" in header
-
-    save_cloud(tmp_path / "again.ply", result.cloud)
-    assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "cloud.ply").read_bytes()

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import time
-
 from lidarpool import Scene, Sensor, Survey, simulate
-
-REST_S = 3.0  # Dask's Active Memory Manager looks every two seconds
 
 
 def _count_builds(dask_worker=None) -> None:
@@ -28,12 +24,12 @@ def test_a_tree_for_each_casting_worker(client):
     casting = [a for a, w in client.scheduler_info(n_workers=-1)["workers"].items()
                if w["resources"].get("GPU")]  # fmt: skip
 
-    def rest(frame) -> None:
+    def look(frame) -> None:
         if frame.scan == 10:
-            time.sleep(REST_S)
+            client.amm.run_once()
 
     client.run(_count_builds, workers=casting)
     survey = Survey(Sensor.grid(), [(0, 0, 1), (0, 0, 2)])
-    result = simulate(Scene.seed(), survey, client=client, on_frame=rest)
+    result = simulate(Scene.seed(), survey, client=client, on_frame=look)
     assert client.run(_builds, workers=casting) == dict.fromkeys(casting, 1)
     assert len(casting) == 2 and result.hits > 0
