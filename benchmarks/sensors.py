@@ -5,6 +5,7 @@ One turn of a VLP-16, an OS1-128 and an HDL-64E in a city, with one thread, in t
 - grid: so many rays, evenly spaced over the same field of view, from one still pose;
 - still: the sensor itself, from that pose;
 - moving: on a carrier at 20 m/s, each beam at its own time from its own place;
+- turning: so, while the carrier turns by 30 degrees a second;
 - noise, actors, sub-rays: moving, and one thing more.
 
 Times are of casting alone, and of all of stage 2: casting and making the columns of a cloud. What
@@ -41,7 +42,7 @@ MODELS = ("velodyne/vlp16", "ouster/os1-128", "velodyne/hdl64e-s3")
 PEERS = ("mujoco", "pyhelios3d")
 BAR = 1.15  # of a moving sensor's time to a still grid's, without noise
 WAY = ((-10.0, -1.8, 2.0), (10.0, -1.8, 2.0))  # along the street, in a second
-CASES = ("grid", "still", "moving", "noise", "ten actors", "19 sub-rays")
+CASES = ("grid", "still", "moving", "turning", "noise", "ten actors", "19 sub-rays")
 
 
 def track(shift: tuple[float, float] = (0.0, 0.0), speed: float = 1.0) -> Track:
@@ -49,6 +50,13 @@ def track(shift: tuple[float, float] = (0.0, 0.0), speed: float = 1.0) -> Track:
     start, end = np.array(WAY)
     way = np.array([start, end]) * (speed, 1, 1) + (*shift, 0)
     return Track([-0.5, 0.5], way, start_s=0, duration_s=0.2)
+
+
+def bend(rate_deg: float = 30.0) -> Track:
+    """Make the way along the street with a carrier that turns, to the left."""
+    straight, half = track(), np.radians(rate_deg) * np.array([-0.5, 0.5]) / 2
+    turns = np.stack([0 * half, 0 * half, np.sin(half), np.cos(half)], axis=1)
+    return replace(straight, quaternions=turns)
 
 
 def surveys(name: str, share: float) -> dict[str, Survey]:
@@ -77,6 +85,7 @@ def surveys(name: str, share: float) -> dict[str, Survey]:
         "grid": Survey(grid, poses=middle, **common),
         "still": Survey(sensor, poses=middle, **common),
         "moving": moving,
+        "turning": Survey(sensor, trajectory=bend(), **common),
         "noise": replace(moving, noise=Noise(range_m=0.01, angle_deg=0.01)),
         "ten actors": moving,
         "19 sub-rays": replace(moving, returns=Returns(subrays=19, divergence_mrad=3)),
@@ -244,7 +253,7 @@ def show(row: dict[str, Any]) -> None:
     )
     for case in row["seconds"]:
         times = np.median(np.array(row["seconds"][case]), axis=0) * 1e3
-        base = "grid" if case in CASES[:3] else "moving"
+        base = "grid" if case in CASES[:4] else "moving"
         line = f"  {case:<12} {times[0]:9.2f} ms  {ratio(row, case, base):6.3f} x {base}"
         if case in CASES:
             line += f"; with columns {times[1]:9.2f} ms  {ratio(row, case, base, 1):6.3f} x"

@@ -58,19 +58,20 @@ class Order:
         self._skip, self._rays, self._each, self._plain = skip, rays, each, plain
         self.blocks = list(_blocks(skip, skip + rays, each))
 
-    def _by_beam(self, length: int, poses: int) -> bool:
+    def by_beam(self, length: int, poses: int) -> bool:
+        """Whether a block of so many rays and poses lies so."""
         return not self._plain and 1 < poses >= length // poses
 
     def view(self, slots: NDArray[Any], poses: int) -> NDArray[Any]:
         """View the slots of a block (..., length) as (..., poses, rays of a pose)."""
-        if self._by_beam(slots.shape[-1], poses):
+        if self.by_beam(slots.shape[-1], poses):
             return slots.reshape(*slots.shape[:-1], -1, poses).swapaxes(-1, -2)
         return slots.reshape(*slots.shape[:-1], poses, -1)
 
     @cached_property
     def slots(self) -> NDArray[np.intp] | None:
         """Where each ray lies, (rays,); None if as they are numbered."""
-        if not any(self._by_beam(length, poses) for _, length, _, poses in self.blocks):
+        if not any(self.by_beam(length, poses) for _, length, _, poses in self.blocks):
             return None
         table = np.arange(self._rays)
         parts = [self.view(table[a : a + n], k).reshape(-1) for a, n, _, k in self.blocks]
@@ -280,6 +281,10 @@ class Workspace:
             )
             if given.shape[1] == n:
                 vectors = given[:, block].reshape(3, count, -1)
+                if order.by_beam(length, count):
+                    room = order.view(self._crosses[:, :length], count)
+                    room[:] = vectors
+                    vectors = room
             else:  # those of one pose
                 skip = (start + at) % poses.rays
                 vectors = given[:, None, skip : skip + length // count]

@@ -341,18 +341,23 @@ def separated(hits: Hits, gap_m: float) -> Hits:
     Hits
         In the order of rays and distances.
     """
-    hits = hits.take(hits.energy > 0)
+    some = hits.energy > 0
+    if not some.all():
+        hits = hits.take(some)
     if not len(hits.ray):
         return hits
     begins, counts = _runs(hits.ray)
     width = np.maximum.reduceat(hits.distance, begins) - np.minimum.reduceat(hits.distance, begins)
+    new = np.zeros(len(hits.ray), np.bool_)
+    new[begins] = True
     # Few beams meet an edge, and only those are sorted.
     wide = np.flatnonzero(np.repeat(width > gap_m, counts))
-    order = np.arange(len(hits.ray))
-    order[wide] = wide[np.lexsort((hits.distance[wide], hits.ray[wide]))]
-    hits = hits.take(order)
-    new = np.diff(hits.ray, prepend=-1) != 0
-    new |= np.diff(hits.distance, prepend=np.inf) > gap_m
+    if len(wide):
+        order = wide[np.lexsort((hits.distance[wide], hits.ray[wide]))]
+        rows = np.arange(len(hits.ray))
+        rows[wide] = order
+        hits = hits.take(rows)
+        new[1:] |= np.diff(hits.distance) > gap_m
     begins = np.flatnonzero(new)
     which = np.cumsum(new) - 1
     energy = np.bincount(which, hits.energy).astype(np.float64)
