@@ -78,6 +78,7 @@ def test_what_check_says_of_a_drive(town, lidarpool):
     assert re.search(
         r"roof        Velodyne VLP-16, 3,61\d firings, 2.00 turns; in one .* moves 1\.\d+ m", told
     )
+    assert "returns     strongest of each pulse\n" in told
     done = lidarpool("check", town / "drive.yaml", "--out", town / "out", "--json")
     assert [s["name"] for s in json.loads(done.out)["drive"]["sensors"]] == ["roof", "nose"]
 

@@ -106,7 +106,7 @@ def told(job: Job, found: dict[str, Any]) -> Iterator[str]:
                 )
             yield told
     returns = job.survey.returns
-    if returns != type(returns)():
+    if drive or returns != type(returns)():
         rays = f", {returns.subrays} sub-rays a beam" if returns.subrays > 1 else ""
         yield f"returns     {returns.mode} of each pulse{rays}"
     if estimate:
