@@ -113,7 +113,7 @@ def poses_of_firings(
     The beams of a firing that are fired later leave from where the carrier is then: it moves
     evenly from each firing to the next. A pose for each beam would cost as much as casting it.
 
-    There is no motion where all beams of a firing are fired at one time.
+    There is no motion where the carrier stands, or all beams of a firing are fired at one time.
     """
     sensor = carried.sensor
     firings = np.arange(first, stop + 1, dtype=np.int64)
@@ -136,7 +136,7 @@ def poses_of_firings(
         centre = np.broadcast_to(sensor.centre, places.shape)
         places = places + into_axes(centre, rotations.transpose(0, 2, 1))
     delays = (sensor.beams.time_ns - sensor.lead_ns) / 1e9
-    if not delays.any():
+    if not path.moves or not delays.any():
         return Poses(places, rotations, sensor.channels)
     seconds = np.diff(times)[:, None] / 1e9
     seconds[seconds == 0] = np.inf  # a last firing at the very end: it stands

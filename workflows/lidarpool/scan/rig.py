@@ -82,10 +82,12 @@ class Rig:
         self._whole: list[Pattern | None] = []  # one period of each sensor's head
         self.by_head: list[bool] = []  # whether poses of each sensor are those of its head
         for number, sensor in enumerate(carried.sensor for carried in plan.survey.carried):
-            heads = sensor.spins(np.zeros(1, np.int64)) is not None
-            self.by_head.append(plan.survey.path.moves and heads)
-            period = 1 if self.by_head[-1] else sensor.period or 0
+            period = sensor.period or 0
             fits = 0 < period * sensor.channels <= PATTERN_RAYS
+            heads = sensor.spins(np.zeros(1, np.int64)) is not None
+            self.by_head.append(heads and (plan.survey.path.moves or not fits))
+            if self.by_head[-1]:
+                period, fits = 1, True
             self._whole.append(self._pattern(number, 0, period) if fits else None)
             if self._echoes is not None and self._whole[-1] is not None:
                 self._echoes.divide(sensor, self._whole[-1])
@@ -123,7 +125,7 @@ class Rig:
         sensor, whole = self.survey.carried[number].sensor, self._whole[number]
         first, stop = specs[0].firings[0], specs[-1].firings[1]
         channels = sensor.channels
-        if path.moves:
+        if path.moves or self.by_head[number]:
             carried = self.survey.carried[number]
             poses = poses_of_firings(carried, path, specs[0].station, first, stop)
         else:
