@@ -136,7 +136,8 @@ class Workspace:
         self._product = np.empty(min(size, _BLOCK))
         self._crosses = np.empty((3, min(size, _BLOCK)))  # of a lidar that moves within a pose
         self._started: Starts | None = None  # where rows start, if each by itself
-        self._origin: Float | None = None  # where all rows start, if at one point
+        self._origin: Float | None = None  # where the first rows start, if at one point
+        self._alike = 0  # how many
         self._orders: dict[tuple[int, ...], Order] = {}  # of the last few shapes of chunks
 
     def start(self, n: int, starts: Starts) -> NDArray[np.float32]:
@@ -154,9 +155,10 @@ class Workspace:
             if starts is not self._started:
                 for axis in range(3):
                     self._rows[:n, axis] = points[:, axis]
-        elif self._origin is None or not np.array_equal(points, self._origin):
-            self._origin = points.copy()
-            self._rows[:, :3] = points
+        elif self._origin is None or self._alike < n or not np.array_equal(points, self._origin):
+            self._origin, self._alike = points.copy(), n
+            for axis in range(3):
+                self._rows[:n, axis] = points[0, axis]
         self._started = starts
         return self._rows[:n]
 
@@ -210,7 +212,11 @@ class Workspace:
             given = self._rays(scan, pattern.origins.T, start, room)
             given = np.multiply(given, mesh.scale, out=room[:, : given.shape[1]])
             turned = self._turn(given, poses, start, order, moved, written=False)
-        reach = 0.0
+        reach = np.abs(poses.positions[first : -(-stop // poses.rays)] * mesh.scale - centre).max()
+        if pattern.origins is not None:
+            reach += 2 * np.abs(given).max()
+        if motion is not None:
+            reach += np.abs(motion.delays).max() * np.abs(motion.velocities).max() * mesh.scale
         for at, length, pose, count in order.blocks:
             block, some = slice(at, at + length), slice(first + pose, first + pose + count)
             out, product = (order.view(a, count) for a in (moved[:, block], self._product[:length]))
@@ -235,7 +241,6 @@ class Workspace:
                 if vectors is not None or motion is not None:
                     points -= centre[axis]
                 rows[axis] = points
-            reach = max(reach, moved[:, block].max(), -moved[:, block].min())
         self._started, self._origin = Starts(moved.T, float(reach)), None
         return order, unit, self._started
 

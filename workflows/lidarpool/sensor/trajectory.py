@@ -266,16 +266,17 @@ class Track:
             )
         segment = np.clip(np.searchsorted(times, at, "right") - 1, 0, len(times) - 2)
         since = at - times.take(segment)
+        if len(segment) and segment.max() == segment.min():
+            segment = segment[:1]  # all are in one
         way, turn, rates = self._segments
         # By Horner; a straight way has no more than two coefficients.
         positions = way[-1].take(segment, axis=1)
         for coefficient in way[-2::-1]:
-            positions *= since
-            positions += coefficient.take(segment, axis=1)
+            positions = positions * since + coefficient.take(segment, axis=1)
         angle = since * rates.take(segment)
         rotations = turn[0].take(segment, axis=1)
         for factor, table in ((np.sin(angle), turn[1]), (np.cos(angle), turn[2])):
-            rotations += factor * table.take(segment, axis=1)
+            rotations = rotations + factor * table.take(segment, axis=1)
         return positions.T, rotations.reshape(3, 3, -1).transpose(2, 0, 1)
 
     @cached_property
