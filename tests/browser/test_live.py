@@ -71,7 +71,6 @@ class Driven:
 
     def ended(self):
         """Wait for its end."""
-        self.most = ALL
         self.thread.join(300)
         assert not self.thread.is_alive()
 
@@ -100,6 +99,7 @@ def test_points_grow_until_all_are_there(client, live, new_tab, tmp_path):
         tab.wait_for(lambda text: points_in(text) > first)
         assert not store.complete
     finally:
+        run.most = ALL
         run.ended()
     assert run.error is None
     assert store.complete
@@ -121,6 +121,7 @@ def test_stop_ends_the_run_as_an_interrupt_does(client, live, new_tab):
         tab.click("Stop")
         tab.wait_for(lambda _: live.stopped.is_set())
     finally:
+        live.stopped.set()
         run.ended()
     assert isinstance(run.error, KeyboardInterrupt)
     assert not store.complete
