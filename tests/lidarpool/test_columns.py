@@ -179,3 +179,8 @@ def test_chunks_are_the_cloud(count, points):
         assert np.array_equal(joined.positions, cloud.positions)
         for name, values in cloud.columns.items():
             assert np.array_equal(joined[name], values) and joined[name].dtype == values.dtype
+
+
+def test_a_cloud_shows_itself_in_a_line():
+    cloud = Cloud(np.zeros((3, 3)), {"scan": np.zeros(3), "channel": np.zeros(3)})
+    assert repr(cloud) == "<Cloud of 3 points: x, y, z, scan, channel>"

@@ -1,5 +1,7 @@
 """Clouds in other formats, read back by the libraries of those formats."""
 
+import signal
+import sys
 from dataclasses import replace
 
 import laspy
@@ -274,9 +276,12 @@ def test_what_cannot_be_written_is_one_line_and_leaves_nothing(
 ):
     bare = Cloud(cloud.positions, {name: cloud[name] for name in ("scan", "channel", "object")})
     with pytest.raises(
-        LidarpoolError, match=r"kitti needs intensity, class, which the cloud lacks"
+        LidarpoolError,
+        match=r"kitti needs intensity, class, which the cloud lacks: .* kitti in output.write, or",
     ):
         Format("kitti").write(tmp_path / "kitti", bare, sweeps)
+    with pytest.raises(LidarpoolError, match="mcap with the layout ouster needs intensity, time"):
+        Format("mcap", "ouster").write(tmp_path / "cloud.mcap", bare, sweeps)
     (tmp_path / "cloud.laz").write_text("mine")
     with pytest.raises(LidarpoolError, match=r"is there already: .* --overwrite"):
         Format("laz").write(tmp_path / "cloud.laz", cloud, sweeps)
@@ -291,3 +296,52 @@ def test_what_cannot_be_written_is_one_line_and_leaves_nothing(
     with pytest.raises(LidarpoolError, match=r'laspy and lazrs: pip install "lidarpool\[las\]"'):
         Format("las").check_installed()
     assert {path.name for path in tmp_path.iterdir()} == {"cloud.laz"}
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="has no limits of files")
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_file_that_cannot_grow_is_one_line_and_leaves_nothing(cloud, sweeps, tmp_path, name):
+    import resource
+
+    one, before = Format(name), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, before[1]))  # as a full disk does
+    try:
+        with pytest.raises(LidarpoolError, match="cannot be written") as told:
+            one.write(tmp_path / one.file, cloud, sweeps)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert "\n" not in str(told.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_interrupt_waits_for_the_points_that_lazrs_writes(cloud, sweeps, tmp_path, monkeypatch):
+    """An exception within a write of lazrs would become one of lazrs."""
+    wrote, write = [], laspy.LasWriter.write_points
+
+    def interrupted(writer, points):
+        signal.raise_signal(signal.SIGINT)
+        write(writer, points)
+        wrote.append(len(points))
+
+    monkeypatch.setattr(laspy.LasWriter, "write_points", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        Format("laz").write(tmp_path / "cloud.laz", cloud, sweeps)
+    assert wrote == [len(cloud)]
+    assert not list(tmp_path.iterdir())
+
+
+def test_any_name_makes_a_topic_a_frame_and_a_folder(cloud, sweeps, tmp_path):
+    """Also one that would lead out of the folder, and an actor called as the world's frame."""
+    odd = replace(sweeps, sensors=("../front", ".. front"), actors=("map",))
+    Format("nuscenes").write(tmp_path / "nuscenes", cloud, odd)
+    assert {path.name for path in (tmp_path / "nuscenes").iterdir()} == {"___front", "___front_2"}
+    Format("mcap").write(tmp_path / "cloud.mcap", cloud, odd)
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    frames = set()
+    with AnyReader([tmp_path / "cloud.mcap"], default_typestore=store) as bag:
+        assert {"/___front/points", "/___front_2/points"} < {*bag.topics}
+        for connection, _, data in bag.messages():
+            if connection.topic == "/tf":
+                transforms = bag.deserialize(data, connection.msgtype).transforms
+                frames |= {transform.child_frame_id for transform in transforms}
+    assert frames == {"___front", "___front_2", "map_2"}

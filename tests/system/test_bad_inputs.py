@@ -170,7 +170,7 @@ def test_out_is_in_use_by_another_run(place, refused):
 
     handle = os.open(place / "lidarpool-out", os.O_RDONLY)
     fcntl.flock(handle, fcntl.LOCK_EX)
-    refused(["run", "good.yaml"], "Another run is using the folder")
+    refused(["run", "good.yaml"], "Another run or export is using the folder")
     os.close(handle)
 
 

@@ -5,7 +5,10 @@ import json
 import laspy
 import numpy as np
 
-from lidarpool import read_cloud
+from lidarpool import Cloud, Scene, Survey, read_cloud, save_cloud
+from lidarpool.export.folder import result_folder
+from lidarpool.export.formats import Format
+from lidarpool.export.sweeps import Sweeps
 
 SCENARIO = """
 trajectory: {points: [{time_s: 0, position: [0, 0, 1]}, {time_s: 0.3, position: [3, 0, 1]}]}
@@ -35,6 +38,12 @@ def test_a_run_writes_what_its_scenario_asks_for_and_a_result_is_exported(
     assert len(list((out / "kitti/sequences/01/velodyne").iterdir())) == 3  # turns of 0.1 s
 
     before = laspy.read(out / "cloud.laz")
+    refused = lidarpool(
+        "export", out, "-f", "mcap", "--layout", "autoware", "--out", tmp_path / "no"
+    )
+    assert refused.code == 2 and "layout autoware needs azimuth, elevation" in refused.err
+    assert not (tmp_path / "no").exists()
+    (out / ".writing-0123").mkdir()  # of an export that was killed
     refused = lidarpool("export", out, "-f", "pcd", "-f", "laz")
     assert refused.code == 2 and "cloud.laz is there already" in refused.err
     assert not (out / "pcd").exists()
@@ -43,6 +52,10 @@ def test_a_run_writes_what_its_scenario_asks_for_and_a_result_is_exported(
     again = laspy.read(out / "cloud.laz")
     for name in before.point_format.dimension_names:
         np.testing.assert_array_equal(again[name], before[name])
+    assert not (out / ".writing-0123").exists()
+    with result_folder(out):
+        refused = lidarpool("export", out, "-f", "las")
+    assert refused.code == 2 and "Another run or export is using the folder" in refused.err
     elsewhere = lidarpool("export", out, "-f", "nuscenes", "--out", tmp_path / "other")
     assert elsewhere.code == 0 and "nuscenes does not hold" in elsewhere.err
     assert len(list((tmp_path / "other/nuscenes/rear").iterdir())) == 3
@@ -55,10 +68,33 @@ def test_a_run_writes_what_its_scenario_asks_for_and_a_result_is_exported(
 
 def test_what_is_no_result_or_has_been_cut_is_one_line(lidarpool, tmp_path):
     told = lidarpool("export", tmp_path, "-f", "laz")
-    assert told.code == 2 and "holds no sweeps.npz: give the folder of a finished run" in told.err
+    assert told.code == 2 and "holds no cloud.ply: give the folder of a finished run" in told.err
+    for name in ("cloud.ply", "report.json"):
+        (tmp_path / name).touch()
     (tmp_path / "sweeps.npz").write_bytes(b"PK")
     told = lidarpool("export", tmp_path, "-f", "laz")
     assert told.code == 2 and "sweeps.npz is damaged" in told.err
     (tmp_path / "s.yaml").write_text("output: {write: [xyz]}")
     told = lidarpool("check", tmp_path / "s.yaml")
     assert told.code == 2 and "output.write" in told.err
+    told = lidarpool("export", tmp_path)
+    assert told.code == 2 and "Choose from: las, laz, parquet," in told.err.split("\n")[0]
+
+
+def test_an_interrupt_says_which_formats_are_written(lidarpool, tmp_path, monkeypatch):
+    scene, survey = Scene.seed(), Survey(poses=[(0, 0, 1)], columns=["intensity"])
+    Sweeps.of(survey, scene).save(tmp_path / "sweeps.npz")
+    columns = {name: np.zeros(3) for name in ("scan", "channel", "object", "intensity")}
+    save_cloud(tmp_path / "cloud.ply", Cloud(np.zeros((3, 3)), columns))
+    (tmp_path / "report.json").write_text("{}")
+    write = Format.write
+
+    def interrupted(one, *given, **more):
+        if one.name == "nuscenes":
+            raise KeyboardInterrupt
+        write(one, *given, **more)
+
+    monkeypatch.setattr(Format, "write", interrupted)
+    told = lidarpool("export", tmp_path, "-f", "las", "-f", "nuscenes")
+    assert told.code == 130
+    assert f"everything was stopped. Written before: {tmp_path}/cloud.las." in told.err

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from lidarpool.report.output import FILES, result_folder
+from lidarpool.export.folder import result_folder
+from lidarpool.report.output import FILES
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="forks")
 

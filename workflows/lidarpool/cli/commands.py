@@ -243,7 +243,8 @@ def main(arguments: list[str] | None = None) -> NoReturn:
         click.echo(error.format_message())
     except click.MissingParameter as error:
         usage = error.ctx.get_usage() if error.ctx else ""
-        _die(f"{error.format_message()}\n{usage}", 2)
+        told = " ".join(error.format_message().split())  # click gives each choice a line
+        _die(f"{told}\n{usage}", 2)
     except click.UsageError as error:
         _die(error.format_message(), 2)
     except (KeyboardInterrupt, click.Abort) as error:

@@ -29,7 +29,9 @@ from ..base.vocabulary import FORMATS, LAYOUTS
     help="Of the points of mcap and rosbag2.",
 )
 @click.option(
-    "--out", type=click.Path(path_type=Path, file_okay=False), help="Folder.  [default: FOLDER]"
+    "--out",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Folder for the files.  [default: FOLDER]",
 )
 @click.option("--overwrite", is_flag=True, help="Replace what is there.")
 def export(
@@ -43,27 +45,32 @@ def export(
       lidarpool export lidarpool-out --format mcap --layout autoware --out bags
     """  # noqa: D301 - click wants the character, not its name
     from ..export.cloud_file import CloudFile
+    from ..export.folder import result_folder
     from ..export.formats import Format
     from ..export.sweeps import SWEEPS_FILE, Sweeps
 
-    if not (result / SWEEPS_FILE).exists():
-        raise LidarpoolError(
-            f"{result} holds no {SWEEPS_FILE}: give the folder of a finished run (its --out)."
-        )
+    # A result is whole where it has its report, which is moved into place last.
+    for name in ("cloud.ply", SWEEPS_FILE, "report.json"):
+        if not (result / name).exists():
+            raise LidarpoolError(
+                f"{result} holds no {name}: give the folder of a finished run (its --out); "
+                "lidarpool run --resume goes on with one that was cut short."
+            )
     sweeps = Sweeps.load(result / SWEEPS_FILE)
     cloud = CloudFile(result / "cloud.ply")
-    out = result if out is None else out
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise LidarpoolError(
-            f"The folder {out} cannot be made ({error.strerror}): give another with --out."
-        ) from error
-    wanted = [Format(name, layout) for name in formats]
-    for one in wanted:  # before the first of them takes its time
-        one.check(out / one.file, cloud, overwrite=overwrite)
-    for one in wanted:
-        one.write(out / one.file, cloud, sweeps, overwrite=overwrite)
-        if left := one.left_out(cloud):
-            click.echo(f"note: {one.name} does not hold {', '.join(left)}", err=True)
-        click.echo(click.format_filename(out / one.file))
+    wanted = [Format(name, layout) for name in dict.fromkeys(formats)]
+    written: list[str] = []
+    with result_folder(result if out is None else out) as folder:
+        for one in wanted:  # before the first of them takes its time
+            one.check(folder / one.file, cloud, overwrite=overwrite)
+        try:
+            for one in wanted:
+                one.write(folder / one.file, cloud, sweeps, overwrite=overwrite)
+                written.append(click.format_filename(folder / one.file))
+                if left := one.left_out(cloud):
+                    click.echo(f"note: {one.name} does not hold {', '.join(left)}", err=True)
+                click.echo(written[-1])
+        except (LidarpoolError, KeyboardInterrupt) as error:
+            if written:
+                error.add_note(f"Written before: {', '.join(written)}.")
+            raise

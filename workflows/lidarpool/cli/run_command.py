@@ -15,8 +15,9 @@ from distributed import Client
 
 from ..base.vocabulary import PATIENCE_S, WAIT_S
 from ..base.words import counted
+from ..export.folder import result_folder
 from ..export.formats import Format
-from ..report.output import result_folder, write_result
+from ..report.output import write_result
 from ..report.report import summary
 from ..run.checks import check_backend_here
 from ..run.connection import TlsFiles, connected, local_client

@@ -34,7 +34,7 @@ class CloudLike(Protocol):
         """Give the points in order, at most so many at a time."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Cloud:
     """Points of a survey, ordered by scan and ray.
 
@@ -82,6 +82,9 @@ class Cloud:
 
     def __len__(self) -> int:
         return len(self.positions)
+
+    def __repr__(self) -> str:
+        return described(self)
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         try:
@@ -154,11 +157,17 @@ class Cloud:
         return cls(np.concatenate([part.positions for part in parts]), columns, first.own)
 
 
+def described(cloud: CloudLike) -> str:
+    """Say how many points a cloud has, and what its columns are called."""
+    names = ", ".join(("x", "y", "z", *(column.name for column in cloud.table)))
+    return f"<{type(cloud).__name__} of {len(cloud):,} points: {names}>"
+
+
 def _fitting(column: Column, values: ArrayLike) -> NDArray[Any]:
     """`values` in the column's type; LidarpoolError where a plain cast would wrap around."""
     given, wanted = np.asarray(values), np.dtype(column.dtype)
     cast = given.astype(wanted, copy=False)
-    if wanted.kind in "iu" and not np.array_equal(cast, given):
+    if cast is not given and wanted.kind in "iu" and not np.array_equal(cast, given):
         limits = np.iinfo(wanted)
         raise LidarpoolError(
             f"{column.name} holds {given.min()} to {given.max()}; it must be whole numbers of "

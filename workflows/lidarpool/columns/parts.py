@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ..base.choice import one_of_each_part
 from ..base.errors import LidarpoolError
-from .cloud import CHUNK_POINTS, Cloud
+from .cloud import CHUNK_POINTS, Cloud, described
 from .storage import Storage
 from .table import AXES, SCAN, Column
 
@@ -218,6 +218,9 @@ class StoredCloud:
         self._columns = tuple(columns)
         self._cells, self._precision_m, self._origin = cells, precision_m, origin
         self._keeper = keeper
+
+    def __repr__(self) -> str:
+        return described(self)
 
     def __len__(self) -> int:
         return sum(self.rows)

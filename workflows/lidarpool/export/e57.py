@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pye57
+from pye57 import libe57
 
 from ..columns.cloud import CloudLike
 from .sweeps import Sweeps
@@ -14,20 +16,28 @@ from .sweeps import Sweeps
 def write_e57(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
     """Write each sweep that has points, in the sensor's axes, with its pose and intensity."""
     with pye57.E57(str(path), mode="w") as file:
-        for sweep, points in enumerate(sweeps.points(cloud)):
-            if not len(points):
-                continue
-            inside = sweeps.in_sensor(sweep, points.positions)
-            data = {
-                f"cartesian{axis}": column
-                for axis, column in zip("XYZ", inside.T.copy(), strict=True)
-            }
-            if "intensity" in points.columns:
-                data["intensity"] = points["intensity"]
-            x, y, z, w = sweeps.pose.quaternions[sweep]
-            file.write_scan_raw(
-                data,
-                name=f"sweep {sweep}",
-                rotation=np.array([w, x, y, z]),
-                translation=sweeps.pose.positions[sweep],
-            )
+        try:
+            _write(file, cloud, sweeps)
+            file.close()
+        except libe57.E57Exception as error:
+            del file.image_file  # to close it would fail again
+            raise OSError(f"{str(error).splitlines()[0]}; the disk may be full") from error
+
+
+def _write(file: Any, cloud: CloudLike, sweeps: Sweeps) -> None:
+    for sweep, points in enumerate(sweeps.points(cloud)):
+        if not len(points):
+            continue
+        inside = sweeps.in_sensor(sweep, points.positions)
+        data = {
+            f"cartesian{axis}": column for axis, column in zip("XYZ", inside.T.copy(), strict=True)
+        }
+        if "intensity" in points.columns:
+            data["intensity"] = points["intensity"]
+        x, y, z, w = sweeps.pose.quaternions[sweep]
+        file.write_scan_raw(
+            data,
+            name=f"sweep {sweep}",
+            rotation=np.array([w, x, y, z]),
+            translation=sweeps.pose.positions[sweep],
+        )

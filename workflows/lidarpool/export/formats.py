@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import secrets
 import shutil
 from dataclasses import dataclass
 from importlib import import_module
@@ -14,6 +13,7 @@ from ..base.errors import LidarpoolError
 from ..base.vocabulary import FORMATS, LAYOUTS
 from ..columns.cloud import CloudLike
 from ..columns.storage import flush
+from .folder import staging
 from .sweeps import Sweeps
 
 # The module of each that writes it, and what has to be installed for it.
@@ -114,9 +114,11 @@ class Format:
             )
         there = {column.name for column in cloud.table}
         if missing := [name for name in self.needs if name not in there]:
+            whole = f"{self.name} with the layout {self.layout}" if self._laid_out else self.name
+            lacks = ", ".join(missing)
             raise LidarpoolError(
-                f"The format {self.name} needs {', '.join(missing)}, which the cloud lacks: "
-                f"run the survey again with cloud: {{columns: [{', '.join(missing)}]}}."
+                f"The format {whole} needs {lacks}, which the cloud lacks: run the survey again "
+                f"with {self.name} in output.write, or with {lacks} among cloud.columns."
             )
 
     def write(
@@ -143,7 +145,7 @@ class Format:
         self.check(path, cloud, overwrite=overwrite)
         writers = import_module(f".{_MODULES[self.name][0]}", __package__)
         more: dict[str, Any] = {"layout": self.layout} if self._laid_out else {}
-        beside = path.parent / f".export-{secrets.token_hex(4)}"
+        beside = staging(path.parent)
         staged = beside / path.name  # bags hold the name of their file
         try:
             try:

@@ -9,7 +9,7 @@ import numpy as np
 from ..base.errors import LidarpoolError
 from ..columns.cloud import CloudLike
 from ..sensor.trajectory import matrices
-from .sweeps import Sweeps
+from .sweeps import Sweeps, plain_names
 
 INSTANCES_MOST = 65_535
 
@@ -38,9 +38,9 @@ def write_kitti(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
         numbers[sensor] += 1
         inside = sweeps.in_sensor(sweep, points.positions)
         rows = np.column_stack([inside, points["intensity"]]).astype("<f4")
-        rows.tofile(folder / "velodyne" / f"{number:06}.bin")
+        (folder / "velodyne" / f"{number:06}.bin").write_bytes(rows.tobytes())
         labels = (points["object"].astype("<u4") + 1) << 16 | points["class"]
-        labels.tofile(folder / "labels" / f"{number:06}.label")
+        (folder / "labels" / f"{number:06}.label").write_bytes(labels.tobytes())
     for sensor in range(len(sweeps.sensors)):
         folder, own = path / "sequences" / f"{sensor:02}", sweeps.sensor == sensor
         turns, places = matrices(sweeps.pose.quaternions[own]), sweeps.pose.positions[own]
@@ -61,13 +61,14 @@ def write_nuscenes(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
 
     NAME is that of the sensor, LIDAR_TOP where it has none. Caesar et al., nuScenes, 2020.
     """
+    folders = plain_names(name or "LIDAR_TOP" for name in sweeps.sensors)
     numbers = [0] * len(sweeps.sensors)
     for sweep, points in enumerate(sweeps.points(cloud)):
         sensor = int(sweeps.sensor[sweep])
-        folder = path / (sweeps.sensors[sensor] or "LIDAR_TOP")
+        folder = path / folders[sensor]
         folder.mkdir(parents=True, exist_ok=True)
         inside = sweeps.in_sensor(sweep, points.positions)
         light = np.clip(points["intensity"], 0, 1) * 255
         rows = np.column_stack([inside, light, points["channel"]]).astype("<f4")
-        rows.tofile(folder / f"{numbers[sensor]:06}.pcd.bin")
+        (folder / f"{numbers[sensor]:06}.pcd.bin").write_bytes(rows.tobytes())
         numbers[sensor] += 1

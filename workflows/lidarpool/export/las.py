@@ -6,10 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import laspy
+import lazrs
 import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import LidarpoolError
+from ..base.interrupts import deferred_interrupts
 from ..columns.cloud import Cloud, CloudLike
 from ..columns.table import TABLE
 from .sweeps import Sweeps
@@ -57,9 +59,17 @@ def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> N
         ]
     )
     names = [column.name for column in extra]
-    with laspy.open(path, "w", header=header, do_compress=compress) as writer:
-        for chunk in cloud.chunks():
-            writer.write_points(_points(chunk, header, names))
+    try:
+        with (
+            path.open("wb+") as file,  # laspy leaves one open that cannot be written to its end
+            laspy.open(file, "w", header=header, do_compress=compress, closefd=False) as writer,
+        ):
+            for chunk in cloud.chunks():
+                points = _points(chunk, header, names)
+                with deferred_interrupts():  # lazrs makes errors of its own of those within
+                    writer.write_points(points)
+    except lazrs.LazrsError as error:
+        raise OSError(f"{error}; the disk may be full") from error
 
 
 def _points(chunk: Cloud, header: laspy.LasHeader, extra: list[str]) -> Any:

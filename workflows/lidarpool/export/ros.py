@@ -13,7 +13,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from ..columns.cloud import Cloud, CloudLike
-from .sweeps import Placed, Sweeps
+from .sweeps import Placed, Sweeps, plain_names
 
 WORLD = "map"  # the frame of the world
 _KINDS = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
@@ -85,19 +85,21 @@ def _messages(
     field = types["sensor_msgs/msg/PointField"]
     fields = [field(name, offset, _KINDS[kind], 1) for name, kind, offset in described]
     make = _Messages(types)
+    named = (*(name or "lidar" for name in sweeps.sensors), *sweeps.actors)
+    _, *frames = plain_names((WORLD, *named))
+    placed = list(zip(frames[len(sweeps.sensors) :], sweeps.actor_poses, strict=True))
     for sweep, points in enumerate(sweeps.points(cloud)):
         time_ns = round(sweeps.begins_ns[sweep])
-        name = sweeps.sensors[sweeps.sensor[sweep]]
+        frame = frames[sweeps.sensor[sweep]]
+        topic = f"/{frame}/points" if sweeps.sensors[sweeps.sensor[sweep]] else "/points"
         rows = _rows(row, points, sweeps, sweep)
-        frames = [(name or "lidar", sweeps.pose)]
-        frames += list(zip(sweeps.actors, sweeps.actor_poses, strict=True))
         yield "/clock", types["rosgraph_msgs/msg/Clock"](make.stamp(time_ns)), time_ns
-        yield "/tf", make.transforms(frames, sweep, time_ns), time_ns
+        yield "/tf", make.transforms([(frame, sweeps.pose), *placed], sweep, time_ns), time_ns
         message = types["sensor_msgs/msg/PointCloud2"](
-            make.header(name or "lidar", time_ns), 1, len(rows), fields, False, step,
+            make.header(frame, time_ns), 1, len(rows), fields, False, step,
             step * len(rows), rows.view(np.uint8).ravel(), True,
         )  # fmt: skip
-        yield f"/{name}/points" if name else "/points", message, time_ns
+        yield topic, message, time_ns
 
 
 def _rows(row: np.dtype[np.void], points: Cloud, sweeps: Sweeps, sweep: int) -> NDArray[np.void]:

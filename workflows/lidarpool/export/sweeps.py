@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterator
+import re
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -214,6 +215,25 @@ class Sweeps:
                 f"{path} is damaged or not of this version of lidarpool "
                 f"({' '.join(str(error).split())}): run the survey again."
             ) from error
+
+
+def plain_names(names: Iterable[str]) -> list[str]:
+    """Names as ROS and folders take them, each once.
+
+    Examples
+    --------
+    >>> plain_names(["roof", "left/rear", "left rear", "2nd"])
+    ['roof', 'left_rear', 'left_rear_2', '_2nd']
+    """
+    out: list[str] = []
+    for name in names:
+        plain = allowed = re.sub(r"^(?=\d)|\W", "_", name, flags=re.ASCII)
+        number = 1
+        while plain in out:
+            number += 1
+            plain = f"{allowed}_{number}"
+        out.append(plain)
+    return out
 
 
 def _of_head(sensor: Sensor, steps: int) -> tuple[NDArray[np.int64], Floats]:

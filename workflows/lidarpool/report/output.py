@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import errno
-import fcntl
 import json
-import os
-import secrets
 import shutil
-import tempfile
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +13,7 @@ from ..base.errors import LidarpoolError
 from ..base.interrupts import deferred_interrupts
 from ..base.vocabulary import FORMATS, PICTURES
 from ..columns.storage import flush
+from ..export.folder import result_folder, staging
 from ..export.formats import Format, remove
 from ..export.ply import save_cloud
 from ..export.sweeps import SWEEPS_FILE, Sweeps
@@ -35,44 +30,6 @@ OF_CLOUD = "cloud.png"  # the picture that is drawn from the cloud's file
 _IMAGES = tuple(f"{name}.png" for name in PICTURES)
 FILES = (CLOUD, *_IMAGES, PICTURE_FILE, SWEEPS_FILE, PAGE, REPORT)
 EXPORTS = tuple(file for file, _ in FORMATS.values())
-_WRITING = ".writing-"  # folder of a result being made; one of a killed run goes at the next
-
-
-@contextmanager
-def result_folder(folder: Path) -> Iterator[None]:
-    """Claim a folder for a result: made if it is not there, writable, ours alone.
-
-    If the body ends without a result, folders that were made for it are removed again.
-
-    Raises
-    ------
-    LidarpoolError
-        If it is a file, cannot be made or written to, or another run uses it.
-    """
-    if folder.exists() and not folder.is_dir():
-        raise LidarpoolError(f"{folder} is a file: give a folder for the results with --out.")
-    made = [path for path in (folder, *folder.parents) if not path.exists()]  # innermost first
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            lock = _lock(folder)
-        for left in folder.glob(f"{_WRITING}*"):
-            shutil.rmtree(left)
-    except BlockingIOError as error:
-        raise LidarpoolError(
-            f"Another run is using the folder {folder}: wait for it, or give another with --out."
-        ) from error
-    except OSError as error:
-        raise LidarpoolError(
-            f"Cannot write to the folder {folder} ({error.strerror}): give another with --out."
-        ) from error
-    try:
-        yield
-    finally:
-        for path in made:
-            if path.exists() and not any(path.iterdir()):
-                path.rmdir()
-        os.close(lock)
 
 
 def save_result(
@@ -124,7 +81,7 @@ def write_result(
     LidarpoolError
         If a file cannot be written.
     """
-    staged = folder / f"{_WRITING}{secrets.token_hex(4)}"
+    staged = staging(folder)
     scene, survey = result.scene, result.survey
     counted = CountedCloud(result.points, len(scene.all_names))
     makers: dict[str, Callable[[Path], object]] = {}
@@ -194,15 +151,3 @@ def _publish(staged: Path, folder: Path, files: Collection[str]) -> None:
         if name in files:
             (staged / name).replace(folder / name)
     flush(folder)
-
-
-def _lock(folder: Path) -> int:
-    """Lock a folder until the handle that is returned is closed, or this process ends."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP):  # a network disk without locks
-            os.close(handle)
-            raise
-    return handle
