@@ -121,24 +121,6 @@ def test_no_fence_stays(start):
     assert known(client) == before
 
 
-def test_nothing_stays_but_of_workers_that_do_not_answer(start, wait_until, monkeypatch):
-    client = start({"a": {}, "b": {}})
-    before = known(client)
-    pool = Pool.from_client(client)
-    pool.divide({"A": n_workers(1, exclusive=True), "B": rest()})
-    arrive = steward.Steward.arrive
-
-    async def impatient(self, seats, timeout_s):
-        return await arrive(self, seats, 0.0)
-
-    monkeypatch.setattr(steward.Steward, "arrive", impatient)
-    with pytest.raises(PoolError, match="a, b did not answer while A and B were dissolved"):
-        pool.dissolve()
-    wait_until(lambda: steward.NAME not in client.cluster.scheduler.plugins)
-    assert pool.dissolve() == []
-    assert known(client) == before
-
-
 def test_one_partition(start):
     client = start({name: {} for name in "abc"})
     parts = Pool.from_client(client).divide({"A": named("a"), "B": rest()})

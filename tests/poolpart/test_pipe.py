@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from tests.poolpart.helpers import LONG_S
 
 from poolpart import (
-    Partition,
     Pipe,
     PipeClosed,
     PipeFailed,
@@ -170,16 +169,6 @@ def test_advice_can_return_to_what_it_was(client, make_pipe):
 
 
 # -- items -----------------------------------------------------------------------------
-
-
-def test_tasks_use_the_client_of_their_worker(client, make_pipe):
-    pipe = make_pipe(client, capacity=2)
-    consumer = Partition("B", client).submit(consume, pipe)
-    producers = [Partition("A", client).submit(produce, pipe, [n] * 10) for n in range(3)]
-    for producer in producers:
-        producer.result(LONG_S)
-    pipe.close()
-    assert sorted(consumer.result(LONG_S)) == sorted([0, 1, 2] * 10)
 
 
 # -- what is left ----------------------------------------------------------------------

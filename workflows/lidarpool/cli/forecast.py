@@ -14,7 +14,6 @@ from distributed import Client
 from distributed.system import MEMORY_LIMIT
 
 from poolpart import Pool, PoolError
-from poolpart.local import usable_cores
 from poolpart.probe import visible_gpus
 from raybeam import available_backends
 
@@ -24,7 +23,7 @@ from ..columns.cloud import CHUNK_POINTS
 from ..report.output import ROOM_BYTES
 from ..run.checks import check_backend_here, find_workers, slots_needed
 from ..run.job import Job
-from ..run.local import default_workers
+from ..run.local import default_workers, usable_cores
 from ..run.store import RUN_FOLDER
 from ..scan import GPU, LIDAR, OTHER
 from ..scan.database import FILE

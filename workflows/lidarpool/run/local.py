@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 from distributed import SpecCluster
 
 import poolpart
-from poolpart.local import check_count, usable_cores
+from poolpart.local import check_count
 from poolpart.probe import visible_gpus
 
 from ..scan import GPU, LIDAR, OTHER
+
+
+def usable_cores() -> int:
+    """Processor cores that this process may run on."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def default_workers(cores: int, gpus: int) -> dict[str, int]:
