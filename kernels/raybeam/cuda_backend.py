@@ -145,7 +145,7 @@ class CudaBackend(Backend):
         if motion is None:
             return cp.asarray(np.zeros(1)), cp.asarray(np.zeros(1)), np.int32(0)
         rates = np.concatenate([motion.velocities[span], motion.rates[span]], axis=1)
-        return cp.asarray(motion.delays), cp.asarray(rates), np.int32(1)
+        return cp.asarray(motion.delays), cp.asarray(np.ascontiguousarray(rates)), np.int32(1)
 
     def _resident(self, pattern: Pattern) -> tuple[Any, ...]:
         """Directions and origins of a pattern on the device, (3, n) each, one row an axis."""

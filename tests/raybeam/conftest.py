@@ -107,7 +107,7 @@ def poisoned(shape, dtype=np.float64):
 # As much of CuPy as the backend uses, on the CPU.
 HOST = Module(
     RawModule=Kernels,
-    asarray=lambda a: np.array(a, order="C").view(Array),
+    asarray=lambda a: np.array(a, order="K").view(Array),
     empty=poisoned,
     cumsum=np.cumsum,
     get_default_memory_pool=lambda: SimpleNamespace(free_all_blocks=lambda: None),
