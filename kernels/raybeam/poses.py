@@ -159,7 +159,7 @@ def check_poses(
             "give more poses, more rays_per_pose, or a smaller window."
         )
     return Poses(
-        np.broadcast_to(_by_number(places), (count, 3)),
+        np.broadcast_to(by_number(places), (count, 3)),
         None if turns is None else np.broadcast_to(turns, (count, 3, 3)),
         each,
         None if motion is None else _check_motion(motion, count, each),
@@ -169,7 +169,7 @@ def check_poses(
 def _check_motion(motion: Motion, poses: int, rays: int) -> Motion:
     arrays = []
     for name, shape in (("delays", (rays,)), ("velocities", (poses, 3)), ("rates", (poses, 3))):
-        array = _by_number(np.asarray(getattr(motion, name), dtype=np.float64))
+        array = by_number(np.asarray(getattr(motion, name), dtype=np.float64))
         if array.shape != shape or not np.isfinite(array).all():
             raise ValueError(
                 f"Motion.{name} must be {shape} finite numbers for {poses:,} poses of {rays:,} "
@@ -181,7 +181,7 @@ def _check_motion(motion: Motion, poses: int, rays: int) -> Motion:
 
 def _check_rotations(rotations: ArrayLike) -> NDArray[np.float64]:
     """Rotation matrices (k, 3, 3) in float64; raises ValueError for one that is not orthonormal."""
-    matrices = _by_number(real_rows("rotations", rotations, (3, 3)))
+    matrices = by_number(real_rows("rotations", rotations, (3, 3)))
     # Written out for all matrices at once: a product of matrices one by one takes longer than
     # casting their rays. NaN compares as false.
     rows = matrices.transpose(1, 2, 0)
@@ -201,7 +201,7 @@ def _check_rotations(rotations: ArrayLike) -> NDArray[np.float64]:
     return matrices
 
 
-def _by_number(table: NDArray[Any]) -> NDArray[np.float64]:
+def by_number(table: NDArray[Any]) -> NDArray[np.float64]:
     """Table (k, ...) in float64, whose entries for each number lie together in memory."""
     last = np.moveaxis(table, 0, -1)
     return np.moveaxis(np.ascontiguousarray(last, dtype=np.float64), -1, 0)

@@ -119,7 +119,9 @@ def poses_of_firings(
     firings = np.arange(first, stop + 1, dtype=np.int64)
     times = np.minimum(sensor.begins_ns(firings) + sensor.lead_ns, path.duration_ns)
     positions, turns = path.poses(station, times)
+    positions = raybeam.poses.by_number(positions)
     turns = np.broadcast_to(np.eye(3), (len(times), 3, 3)) if turns is None else turns
+    turns = raybeam.poses.by_number(turns)
     spins, rotations = sensor.spins(firings[:-1]), turns[:-1]
     if spins is not None:
         mount = carried.mount
