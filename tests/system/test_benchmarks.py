@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
-from benchmarks import live, pipeline, scale
+from benchmarks import formats, live, pipeline, scale
 from tests.clusters import thread_cluster
 
 pytestmark = pytest.mark.slow
@@ -48,3 +48,8 @@ def test_live(tmp_path, capsys):
     assert figures["ratio"] > 0
     assert figures["megabytes_sent"] > 0  # or nobody looked
     assert "times as long" in capsys.readouterr().out
+
+
+def test_formats(capsys):
+    formats.main(2000)
+    assert len(capsys.readouterr().out.splitlines()) == 1 + len(formats.SCRIPTS)

@@ -97,6 +97,19 @@ def test_a_disk_without_room(check, monkeypatch):
     assert "it can run" not in outcome.out
 
 
+def test_what_the_cloud_is_exported_to_counts(check, monkeypatch):
+    kept = {"cloud": {"columns": ["intensity", "time"]}}  # as the layout would
+    plain = json.loads(check("--json", text=json.dumps(SHORT | kept)).out)
+    exported = json.dumps(SHORT | kept | {"output": {"write": ["ply", "las", "mcap"]}})
+    said = json.loads(check("--json", text=exported).out)
+    least = 2 * 20 * said["estimate"]["points"]
+    assert said["disk"]["result"] > plain["disk"]["result"] + least
+    monkeypatch.setattr("lidarpool.export.formats.find_spec", lambda name: None)
+    outcome = check(text=exported)
+    assert outcome.code == 2
+    assert 'it cannot run. The format las needs laspy and lazrs: pip install "' in outcome.err
+
+
 def test_too_little_memory(check, monkeypatch):
     monkeypatch.setattr(lidarpool.cli.forecast, "MEMORY_LIMIT", 300_000_000)
     outcome = check()

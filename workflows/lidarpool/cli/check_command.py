@@ -51,13 +51,14 @@ def check(
     from ..run.job import make_job
     from ..scenario.scenario import Scenario
     from .forecast import forecast
+    from .run_command import formats_of
     from .terminal import shown_status
 
     read = Scenario.load(scenario)
     job = make_job(read, backend, no_plan)
     cluster = nullcontext() if scheduler is None else connected(scheduler, files)
     with cluster as client, shown_status("casting some rays", as_json):
-        found = forecast(job, read.pool, out, client)
+        found = forecast(job, read.pool, out, client, formats_of(read))
     found["notes"] += read.advice(job.scene)
     if as_json:
         click.echo(json.dumps(found, indent=1, allow_nan=False))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from raybeam import available_backends
 from ..base.choice import one_of_each_part
 from ..base.errors import LidarpoolError
 from ..columns.cloud import CHUNK_POINTS
+from ..export.formats import Format
 from ..report.output import ROOM_BYTES
 from ..run.checks import check_backend_here, find_workers, slots_needed
 from ..run.job import Job
@@ -46,6 +48,7 @@ PART_BYTES = 2500  # its head, and its row in the database
 SCAN_BYTES = 64  # in the driver
 WAY_POSES = 1000  # that the length of a way is measured by
 SUMMARY_BYTES = 28  # of a scan, in the database
+FORMAT_BYTES = 30  # of a point in an exported file, beside its columns, at most: LAS
 
 # Rays that are cast at most, whole scans of them, and the least and most scans.
 SAMPLE_RAYS, SAMPLE_SCANS = 500_000, (16, 500)
@@ -69,7 +72,11 @@ class Sample:
 
 
 def forecast(
-    job: Job, pool: PoolSection, out: Path, client: Client | None = None
+    job: Job,
+    pool: PoolSection,
+    out: Path,
+    client: Client | None = None,
+    formats: Sequence[Format] = (),
 ) -> dict[str, Any]:
     """Find out what a run would do and take, and whether it can.
 
@@ -81,6 +88,8 @@ def forecast(
         Sizes of a cluster on this machine, which is not started.
     client
         Client of the cluster to run on instead.
+    formats
+        That the cloud is exported to.
 
     Returns
     -------
@@ -89,6 +98,11 @@ def forecast(
         do. `memory` is of all processes on this machine, or, on another cluster, of a GPU worker.
     """
     reasons, notes = _look_at_folder(out)
+    for one in formats:
+        try:
+            one.check_installed()
+        except LidarpoolError as error:
+            reasons.append(str(error))
     slots = _slots(job, pool, client)
     backend, memory = None, MEMORY_LIMIT
     try:
@@ -111,7 +125,7 @@ def forecast(
     # Without a sample every ray may hit.
     points = sample.points if sample else job.survey.ray_count // job.survey.keep_every
     needed = _worker_bytes(job) if client else _machine_bytes(job, points, slots)
-    parts, result = _disk_bytes(job, points)
+    parts, result = _disk_bytes(job, points, len(formats))
     free = shutil.disk_usage(_existing(out)).free
     if free < parts + result:
         reasons.append(
@@ -245,7 +259,7 @@ def _machine_bytes(job: Job, points: int, slots: dict[str, dict[str, int]]) -> i
     return workers + driver + 2 * PROCESS_BYTES  # of LIDAR and the driver
 
 
-def _disk_bytes(job: Job, points: int) -> tuple[int, int]:
+def _disk_bytes(job: Job, points: int, exports: int) -> tuple[int, int]:
     """Disk that parts and database take meanwhile, and that the result takes."""
     survey, faces, point = job.survey, len(job.scene.faces), _point_bytes(job)
     parts = min(survey.scan_count, max(16, survey.ray_count // BATCH_RAYS + 1))
@@ -253,7 +267,8 @@ def _disk_bytes(job: Job, points: int) -> tuple[int, int]:
     run = point * points + (PART_BYTES + tally) * parts + SUMMARY_BYTES * survey.scan_count
     # A row of the PLY has doubles for the coordinates at most; a piece of it is there twice.
     cloud = (point + 16) * (points + min(points, CHUNK_POINTS))
-    return run, cloud + ROOM_BYTES + 36 * faces
+    exported = (point + FORMAT_BYTES) * points * exports
+    return run, cloud + exported + ROOM_BYTES + 36 * faces
 
 
 def _point_bytes(job: Job) -> int:

@@ -107,7 +107,7 @@ def _simulate(
 
     As soon as the result is in its place, an error or interrupt that ends `whole` says so.
     """
-    formats = [Format(w.format, w.layout) for w in scenario.output.write if w.format != "ply"]
+    formats = formats_of(scenario)
     for one in formats:
         one.check_installed()
     with result_folder(options.out):
@@ -137,6 +137,11 @@ def _simulate(
                     formats=formats,
                 )
     return result, report
+
+
+def formats_of(scenario: Scenario) -> list[Format]:
+    """List what a scenario has the cloud exported to."""
+    return [Format(one.format, one.layout) for one in scenario.output.write if one.format != "ply"]
 
 
 @contextmanager
