@@ -129,6 +129,9 @@ def test_sweeps_come_back(sweeps, tmp_path):
 def test_las_has_fields_of_its_own_and_the_rest_in_extra_bytes(written, cloud, name):
     las = laspy.read(written(name))
     assert (las.header.point_format.id, str(las.header.version)) == (6, "1.4")
+    assert las.header.global_encoding.wkt  # without which PDAL refuses it
+    told = {column.name: column.description for column in las.point_format.extra_dimensions}
+    assert told["range"] == "m distance from the beam's"  # 32 bytes at most, whole words
     np.testing.assert_allclose(las.xyz, cloud.positions, atol=1e-6)
     np.testing.assert_allclose(las.gps_time, cloud.time / 1e9, atol=1e-12)
     np.testing.assert_allclose(las.intensity / 65_535, cloud.intensity, atol=1e-5)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from textwrap import shorten
 from typing import Any
 
 import laspy
@@ -42,7 +43,9 @@ def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> N
     """
     header = laspy.LasHeader(version="1.4", point_format=6)
     header.generating_software = "lidarpool"
-    header.creation_date = None  # the same points give the same bytes
+    # LAS 1.4 wants it of formats 6 and above, with a coordinate system or without; PDAL before
+    # 2.7.2, and what reads through it, opens no others (PDAL's issue 4412).
+    header.global_encoding.wkt = True
     low, high = np.asarray(cloud.bounds, np.float64)
     header.scales = np.full(3, sweeps.precision_m)
     header.offsets = np.floor((low + high) / 2)
@@ -54,7 +57,9 @@ def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> N
     extra = [column for column in cloud.table if column.name not in _OF_FORMAT]
     header.add_extra_dims(
         [
-            laspy.ExtraBytesParams(_name(c.in_files), c.dtype, f"{c.unit} {c.meaning}".strip()[:32])
+            laspy.ExtraBytesParams(
+                _name(c.in_files), c.dtype, shorten(f"{c.unit} {c.meaning}", 32, placeholder="")
+            )
             for c in extra
         ]
     )
