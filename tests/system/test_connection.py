@@ -52,6 +52,7 @@ def test_simulate_leaves_nothing_when_it_is_interrupted_twice(tmp_path):
 
 
 def test_workers_are_forked_from_one_process_also_in_place_of_others():
+    others = set(psutil.Process().children(recursive=True))  # of the tests' own cluster
     with local_client(gpu_workers=1, collectors=2, other_workers=0) as client:
         first = client.run(os.getpid)
         for pid in first.values():
@@ -64,4 +65,4 @@ def test_workers_are_forked_from_one_process_also_in_place_of_others():
         assert psutil.Process(server).ppid() == os.getpid()
         modules = client.run(lambda: {"lidarpool.scan.stages", "open3d"} & sys.modules.keys())
         assert list(modules.values()) == [{"lidarpool.scan.stages"}] * 2
-    assert psutil.Process(server).children() == []
+    assert set(psutil.Process(server).children()) <= others
