@@ -317,19 +317,21 @@ def test_a_file_that_cannot_grow_is_one_line_and_leaves_nothing(cloud, sweeps, t
     assert not list(tmp_path.iterdir())
 
 
-def test_an_interrupt_waits_for_the_points_that_lazrs_writes(cloud, sweeps, tmp_path, monkeypatch):
+@pytest.mark.parametrize("method", ["write_points", "close"])
+def test_an_interrupt_waits_for_what_lazrs_writes(cloud, sweeps, tmp_path, monkeypatch, method):
     """An exception within a write of lazrs would become one of lazrs."""
-    wrote, write = [], laspy.LasWriter.write_points
+    done, write = [], getattr(laspy.LasWriter, method)
 
-    def interrupted(writer, points):
-        signal.raise_signal(signal.SIGINT)
-        write(writer, points)
-        wrote.append(len(points))
+    def interrupted(writer, *points):
+        if not done:
+            signal.raise_signal(signal.SIGINT)
+        write(writer, *points)
+        done.append(method)
 
-    monkeypatch.setattr(laspy.LasWriter, "write_points", interrupted)
+    monkeypatch.setattr(laspy.LasWriter, method, interrupted)
     with pytest.raises(KeyboardInterrupt):
         Format("laz").write(tmp_path / "cloud.laz", cloud, sweeps)
-    assert wrote == [len(cloud)]
+    assert done
     assert not list(tmp_path.iterdir())
 
 

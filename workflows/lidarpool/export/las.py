@@ -73,6 +73,8 @@ def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> N
                 points = _points(chunk, header, names)
                 with deferred_interrupts():  # lazrs makes errors of its own of those within
                     writer.write_points(points)
+            with deferred_interrupts():
+                writer.close()
     except lazrs.LazrsError as error:
         raise OSError(f"{error}; the disk may be full") from error
 
