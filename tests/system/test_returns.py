@@ -1,10 +1,13 @@
-"""Runs with all that comes back of a pulse, in all columns: the same bytes on any cluster."""
+"""Runs with all columns and all that comes back of a pulse: the same bytes, whatever dies."""
 
 from __future__ import annotations
 
+import os
+import signal
+
 import numpy as np
 
-from lidarpool import Material, Noise, Returns, Scene, Sensor, Survey, load_sensor, simulate
+from lidarpool import Frame, Material, Noise, Returns, Scene, Sensor, Survey, load_sensor, simulate
 from lidarpool.columns.table import TABLE
 
 OPTIONAL = [name for name in TABLE if name not in ("scan", "x", "y", "z", "channel", "object")]
@@ -25,15 +28,25 @@ SURVEY = Survey(
 )
 
 
-def test_another_cluster_and_other_batches_give_the_same_bytes(
+def test_another_cluster_other_batches_and_a_killed_worker_give_the_same_bytes(
     client, cluster_client, small_batches, same_cloud
 ):
-    """Threads and one caster; processes and two."""
+    """Threads and one caster; processes and two, of which one is killed."""
+    killed: list[int] = []
+
+    def kill(frame: Frame) -> None:
+        if frame.scan == 50:
+            workers = client.scheduler_info(n_workers=-1)["workers"].items()
+            gpu = [address for address, worker in workers if "GPU" in worker["resources"]]
+            killed.append(client.run(os.getpid, workers=gpu[:1])[gpu[0]])
+            os.kill(killed[0], signal.SIGKILL)
+
     cloud = simulate(Scene.seed(), SURVEY, client=cluster_client).cloud
     assert cloud.columns.keys() >= {*OPTIONAL}
     assert set(cloud["returns"].tolist()) == {1, 2}
     assert set(cloud["class"].tolist()) == {0, 300}
-    assert same_cloud(simulate(Scene.seed(), SURVEY, client=client).cloud, cloud)
+    other = simulate(Scene.seed(), SURVEY, client=client, on_frame=kill)
+    assert killed and same_cloud(other.cloud, cloud)
 
 
 def test_a_sensor_says_how_finely_points_are_rounded(cluster_client):
