@@ -27,7 +27,7 @@ from ..run.run import Run, make_result
 from ..run.store import RUN_FOLDER, RunStore, remove_run
 from ..scenario.scenario import Scenario
 from .logs import set_logs
-from .terminal import shown_progress, shown_status
+from .terminal import shown_progress, shown_status, tell
 from .worker_logs import WorkerLogs
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ def run_scenario(scenario: Scenario, options: RunOptions) -> None:
     )
     if not options.quiet:
         for note in scenario.advice(job.scene):
-            click.echo(f"note: {note}", err=True)
+            _note(note)
     with ExitStack() as whole, _shown_live(job, options) as live:
         result, report = _simulate(scenario, job, options, live, whole)
         if options.as_json:
@@ -199,7 +199,7 @@ def _drive(
 
 
 def _note(words: str) -> None:
-    click.echo(f"note: {words}", err=True)
+    tell(f"note: {words}")
 
 
 @contextmanager

@@ -48,6 +48,12 @@ def shown_status(text: str, quiet: bool = False) -> Iterator[None]:
         yield
 
 
+def tell(words: str) -> None:
+    """Tell something on stderr, if anybody reads it."""
+    if sys.stderr is not None:
+        _Unheard(sys.stderr).write(f"{words}\n")
+
+
 def _terminal() -> Console | None:
     """Console of a terminal that can move its cursor; None where lines are all there is."""
     console = Console(file=cast(TextIO, _Unheard(sys.stderr)))
