@@ -39,7 +39,8 @@ def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> N
     `time` is the GPS time in seconds, `return_number` and `returns` are as they are, `azimuth`
     (-180 to 180 degrees) is the scan angle, `sensor` + 1 the point source. Intensity is the
     column `intensity` times 65,535, at most that, and classification `class` where it is below
-    256; as those lose something, both columns are in the extra bytes as well.
+    256; as those lose something, both columns are in the extra bytes as well. Return numbers are
+    15 at most, and angles in steps of 0.006 degrees.
     """
     header = laspy.LasHeader(version="1.4", point_format=6)
     header.generating_software = "lidarpool"
@@ -105,7 +106,7 @@ def _points(chunk: Cloud, header: laspy.LasHeader, extra: list[str]) -> Any:
 
 def _name(name: str) -> str:
     """Name of a column in the extra bytes, where one of a field of the format is taken."""
-    return {"intensity": "energy", "returns": "of_returns"}.get(name, name)[:32]
+    return "energy" if name == "intensity" else name[:32]
 
 
 def _at_most(values: NDArray[Any], most: int) -> NDArray[np.uint8]:

@@ -26,7 +26,7 @@ from .report import make_report
 ROOM_BYTES = 32 << 20  # what pictures and report may take
 
 CLOUD, PAGE, REPORT = "cloud.ply", "report.html", "report.json"
-OF_CLOUD = "cloud.png"  # the picture that is drawn from the cloud's file
+_OF_CLOUD = "cloud.png"  # the picture that is drawn from the cloud's file
 _IMAGES = tuple(f"{name}.png" for name in PICTURES)
 FILES = (CLOUD, *_IMAGES, PICTURE_FILE, SWEEPS_FILE, PAGE, REPORT)
 EXPORTS = tuple(file for file, _ in FORMATS.values())
@@ -103,7 +103,7 @@ def write_result(
     files = [CLOUD, *exported, *makers, SWEEPS_FILE, *shown_on, REPORT]
     try:
         staged.mkdir()
-        drawn = [beside.submit(make, staged / n) for n, make in makers.items() if n != OF_CLOUD]
+        drawn = [beside.submit(make, staged / n) for n, make in makers.items() if n != _OF_CLOUD]
         save_cloud(staged / CLOUD, counted, precision_m=survey.precision_m)
         sweeps = Sweeps.of(survey, scene)
         sweeps.save(staged / SWEEPS_FILE)
@@ -111,7 +111,7 @@ def write_result(
             one.write(staged / one.file, result.points, sweeps)
         report = make_report(result, files, counted)
         if not only_cloud:
-            drawn.append(beside.submit(makers[OF_CLOUD], staged / OF_CLOUD))
+            drawn.append(beside.submit(makers[_OF_CLOUD], staged / _OF_CLOUD))
             for each in drawn:
                 each.result()
             write_page(staged / PAGE, report, result, counted, scenario)
