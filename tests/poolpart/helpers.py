@@ -2,8 +2,10 @@
 
 import os
 import signal
+import time
 
 from distributed import Event, get_worker
+from distributed.core import Status
 
 from poolpart import worker_identities
 
@@ -48,8 +50,24 @@ def addresses(client):
 def kill(client, name):
     """Kill a worker's process; returns the address that it had."""
     address = addresses(client)[name]
-    os.kill(client.run(os.getpid, workers=[address])[address], signal.SIGKILL)
+    kill_nannied(client, address)
     return address
+
+
+def kill_nannied(client, address):
+    """Kill the process of a worker that has a nanny, as soon as that would start it again.
+
+    A nanny ends when its first worker dies before it has heard that this one is up. It looks 20
+    times a second, on a busy machine less often.
+    """
+    pid = client.run(os.getpid, workers=[address])[address]
+    while client.run(_hears_of_worker, workers=[address], nanny=True) != {address: True}:
+        time.sleep(0.01)
+    os.kill(pid, signal.SIGKILL)
+
+
+def _hears_of_worker(dask_worker):
+    return dask_worker.process.status == Status.running
 
 
 def join(client, name, **options):

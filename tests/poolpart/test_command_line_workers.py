@@ -8,7 +8,7 @@ import time
 
 import pytest
 from distributed import Client
-from tests.poolpart.helpers import LONG_S, here
+from tests.poolpart.helpers import LONG_S, here, kill_nannied
 
 from poolpart import Pool, n_workers, named, rest, worker_identities
 
@@ -67,10 +67,9 @@ def test_live_late_killed_and_undone(command_line, wait_until):
         before = sorted(map(str, declared(client).values()))
         assert before == ["{'A': 1}", "{'B': 3}", "{'C': 1}"]
         # Whoever is killed comes back where it was, with a nanny, and tasks that wait run.
-        pids = client.run(os.getpid)
-        for pid in pids.values():
+        for address, pid in client.run(os.getpid).items():
             if pid != plain.pid:
-                os.kill(pid, signal.SIGKILL)
+                kill_nannied(client, address)
         waiting = [parts[name].submit(here) for name in "AB" for _ in range(3)]
         ran = {future.result(LONG_S) for future in waiting}
         assert ran <= {w.name for name in "AB" for w in parts[name].workers}
@@ -84,7 +83,7 @@ def test_live_late_killed_and_undone(command_line, wait_until):
         # Moved while it runs, and killed after: its nanny knows.
         assert len(parts["B"].grow(2)) == 2
         address = next(w.address for w in parts["B"].workers if w.name == "late")
-        os.kill(client.run(os.getpid, workers=[address])[address], signal.SIGKILL)
+        kill_nannied(client, address)
         waiting = [parts["B"].submit(here) for _ in range(9)]
         wait_until(lambda: address not in worker_identities(client), LONG_S)
         wait_until(lambda: len(parts["B"]) == 3)
