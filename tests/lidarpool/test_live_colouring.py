@@ -54,8 +54,9 @@ def test_objects_have_names_and_colours_of_their_own():
     assert "Ball" in legend
     assert "&lt;b&gt;Box" in legend
     assert "object 2" in legend
-    many = tuple(f"thing {number}" for number in range(100))
-    assert "and 88 more" in colours_of(np.arange(100), OBJECT, many)[1]
+    many = tuple(f"thing {number}" for number in range(1100))
+    assert "thing 99<" in colours_of(np.arange(100), OBJECT, many)[1]
+    assert "and 100 more" in colours_of(np.arange(1100), OBJECT, many)[1]
     often = np.append(np.arange(100), np.full(9, 73))
     assert "thing 73" in colours_of(often, OBJECT, many)[1]
 

@@ -11,14 +11,18 @@ from lidarpool import LidarpoolError, Planning, Scene, Track
 from lidarpool.columns.table import CHANNEL, OBJECT, SCAN
 from lidarpool.export.cloud_file import CloudFile
 from lidarpool.export.ply_format import header, row_type
+from lidarpool.live.hits import hit_grid
 from lidarpool.live.page import live_page
 from lidarpool.live.result_page import ResultView, view_result
-from lidarpool.live.surface import Surface, coloured_mesh
+from lidarpool.live.surface import Surface, coloured_mesh, colours_for
+from lidarpool.live.view import HIDDEN
 from lidarpool.plan import Plan
 from lidarpool.run.picture_file import PICTURE_FILE, Pictured, SensorWay
 from lidarpool.scene.actors import Actor, box
+from lidarpool.scene.mesh import Mesh
 
 POSES = 25
+NOWHERE = np.zeros((0, 3), np.float32)
 ORIGIN = np.array([500_000.0, 100.0, 0.0])
 
 
@@ -135,7 +139,13 @@ def test_the_page_shows_scene_sensors_rays_and_planning(cloud, pictured, page):
     for name in ("/poses", "/rays", "/path", "/discs/0"):
         assert page.scene.get_handle_by_name(name) is not None, name
     assert len(scenes(page)) == 1
+    assert not view._view._scene_legend.content  # grey
+    view._view._scene_colour.value = "hits"
+    view.draw()
     assert "hits per square metre" in view._view._scene_legend.content
+    view._view._scene_colour.value = "object"
+    view.draw()
+    assert "room" in view._view._scene_legend.content
     assert len(page.scene.get_handle_by_name("/poses").batched_positions) == POSES
     assert "10,000 of 10,000 points" in view._facts.content
     view._scans.value = (10, 19)
@@ -167,7 +177,7 @@ def test_a_colour_that_is_chosen_is_drawn_and_what_is_hidden_is_not(cloud, pictu
     view.draw()
     assert "room" in view._view._cloud_legend.content
     view._view._show_cloud.value = view._view._show_rays.value = False
-    view._view._show_scene.value = False
+    view._view._scene_colour.value = HIDDEN
     view.draw()
     assert len(points(page)) == 0
     assert not page.scene.get_handle_by_name("/rays").visible
@@ -200,7 +210,7 @@ def test_what_moves_is_where_it_is_at_the_time_that_is_chosen_or_played(cloud, p
 
 
 def test_a_drive_through_a_large_scene_is_looked_at_from_near(cloud, page):
-    """The camera is near the way, towers are cut above it, and hits are shown when asked for."""
+    """The camera is near the way, and towers are cut above it."""
     scene = Scene.from_meshes([box("Ground", (800, 800, 0.1)), box("Tower", (9, 9, 90))])
     way = SensorWay(np.array([0, 2e9]), np.array([[0, 5, 2.0], [20, 5, 2]]), True, "", "VLP-16")
     hits, rays = np.full(scene.triangles, 9, np.int64), np.zeros((0, 2, 3), np.float32)
@@ -210,10 +220,6 @@ def test_a_drive_through_a_large_scene_is_looked_at_from_near(cloud, page):
     view.draw()
     assert 20 < view._view.cut < 40
     assert np.linalg.norm(page.initial_camera.position) < 200
-    assert not view._view._scene_legend.content
-    view._view._show_hits.value = True
-    view.draw()
-    assert "hits per square metre" in view._view._scene_legend.content
 
 
 def test_a_drive_under_a_wide_roof_is_cut_below_the_roof(cloud, page):
@@ -268,8 +274,8 @@ def test_many_triangles_become_few_that_keep_shape_and_hits():
     assert np.allclose(corners.min(axis=0), scene.vertices.min(axis=0), atol=0.5)
     assert np.allclose(corners.max(axis=0), scene.vertices.max(axis=0), atol=0.5)
     first = scene.face_object == 0  # of six objects, far from each other
-    colours, legend = surface.coloured(np.where(first, 3, 0))
-    middles = surface.corners.mean(axis=1)
+    corners, colours, legend = surface.coloured("hits", np.where(first, 3, 0), NOWHERE)
+    middles = corners.mean(axis=1)
     low, high = scene.object_bounds[0]
     there = ((middles > low - 1) & (middles < high + 1)).all(axis=1)
     vivid = np.ptp(colours.astype(int), axis=1) > 40
@@ -277,3 +283,44 @@ def test_many_triangles_become_few_that_keep_shape_and_hits():
     assert not vivid[~there].any()
     assert "hits per square metre" in legend
     assert len(Surface(scene).corners) == len(scene.faces)  # few enough
+
+
+def test_hits_of_a_wall_of_two_triangles_are_told_apart_on_a_grid():
+    """A wall of 8 by 4 metres: 100 hits per square metre on its left half, none on the other."""
+    wall = trimesh.Trimesh([[0, 0, 0], [8, 0, 0], [8, 0, 4], [0, 0, 4]], [[0, 1, 2], [0, 2, 3]])
+    scene = Scene.from_meshes([Mesh("wall", wall.vertices, wall.faces)])
+    random = np.random.default_rng(0)
+    points = random.uniform((0, 0, 0), (4, 0, 4), (800, 3)).astype(np.float32)  # every other hit
+    corners = scene.vertices[scene.faces].astype(np.float32)
+    pieces, hit, density = hit_grid(scene, corners, np.array([800.0, 800.0]), points, 5000)
+    middle = pieces.mean(axis=1)
+    sides = pieces[:, 1:] - pieces[:, :1]
+    areas = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) / 2
+    assert areas.sum() == pytest.approx(32, rel=1e-4)
+    assert np.median(density[middle[:, 0] < 3.5]) == pytest.approx(100, rel=0.2)
+    assert not hit[middle[:, 0] > 5.5].any()
+    assert len(hit_grid(scene, corners, np.array([800.0, 0.0]), points, 3)[0]) <= 3
+    untouched, hit, density = hit_grid(scene, corners, np.zeros(2), points, 5000)
+    assert (len(untouched), hit.any(), density.any()) == (2, False, False)
+
+
+def test_what_touches_does_not_show_through():
+    """Each side of a box is moved inwards, so that those of two that touch are apart."""
+    scene = Scene.from_meshes([box("Wall", (8, 1, 3)), box("Ceiling", (8, 8, 1))])
+    surface = Surface(scene)
+    moved = surface.corners - scene.vertices[scene.faces]
+    sides = surface.corners[:, 1:] - surface.corners[:, :1]
+    normals = np.cross(sides[:, 0], sides[:, 1])
+    assert ((moved.mean(axis=1) * normals).sum(axis=1) < 0).all()
+    assert np.abs(moved).max() < 0.01
+
+
+def test_a_scene_is_coloured_by_the_reflectance_of_its_objects():
+    scene = Scene.from_meshes([box("White", (1, 1, 1)), box("Black", (2, 2, 2))])
+    share = np.array([1.0, 0.0])
+    assert colours_for(scene, share) == ("grey", "hits", "object", "reflectance")
+    assert colours_for(scene, np.array([0.5, 0.5])) == ("grey", "hits", "object")
+    _, colours, legend = Surface(scene, share).coloured("reflectance", share, NOWHERE)
+    assert np.unique(colours[scene.face_object == 0]).tolist() == [255]
+    assert colours[scene.face_object == 1].max() < 40
+    assert "reflectance" in legend

@@ -8,13 +8,15 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from ..render.colouring import MOST_ENTRIES, TURBO, Colouring
+from ..render.colouring import TURBO, Colouring
+
+MOST_LABELS = 1000  # 200 bytes each
 
 _LEGEND = '<div style="font-size:0.75em;padding:0.25em 0.8em">'
 
 
 def legend_of(colouring: Colouring) -> str:
-    """Legend of colours: a bar, or a line for each label, up to a number."""
+    """Legend of colours: a bar, or all labels in a box that can be scrolled."""
     if colouring.limits is None:
         return _key(colouring)
     low, high = colouring.limits
@@ -28,9 +30,10 @@ def legend_of(colouring: Colouring) -> str:
     return colour_bar(title, marks)
 
 
-def colour_bar(title: str, marks: Sequence[str]) -> str:
-    """Bar of `TURBO` with its title above and evenly spread marks below."""
-    stops = ", ".join("rgb({},{},{})".format(*colour) for colour in as_bytes(TURBO[::15]).tolist())
+def colour_bar(title: str, marks: Sequence[str], colours: NDArray[np.float64] = TURBO) -> str:
+    """Bar of colours (256, 3) with its title above and evenly spread marks below."""
+    some = as_bytes(colours[::15]).tolist()
+    stops = ", ".join("rgb({},{},{})".format(*colour) for colour in some)
     numbers = "".join(f"<span>{text}</span>" for text in marks)
     return (
         f"{_LEGEND}{escape(title)}"
@@ -43,14 +46,18 @@ def colour_bar(title: str, marks: Sequence[str]) -> str:
 def _key(colouring: Colouring) -> str:
     labels = colouring.labels
     lines = [
-        '<div style="display:flex;align-items:center;gap:0.5em"><span style="width:0.8em;'
-        f'height:0.8em;border-radius:2px;background:rgb({r},{g},{b})"></span>'
-        f"<span>{escape(name)}</span></div>"
-        for name, (r, g, b) in ((n, as_bytes(c).tolist()) for n, c in labels[:MOST_ENTRIES])
+        '<div style="display:flex;align-items:center;gap:0.5em;min-width:0"><span style="width:'
+        f'0.8em;height:0.8em;flex:none;border-radius:2px;background:rgb({r},{g},{b})"></span>'
+        f'<span title="{escape(name)}" style="overflow:hidden;text-overflow:ellipsis;'
+        f'white-space:nowrap">{escape(name)}</span></div>'
+        for name, (r, g, b) in ((n, as_bytes(c).tolist()) for n, c in labels[:MOST_LABELS])
     ]
-    if len(labels) > MOST_ENTRIES:
-        lines.append(f"<div>and {len(labels) - MOST_ENTRIES:,} more</div>")
-    return f"{_LEGEND}{''.join(lines)}</div>"
+    if len(labels) > MOST_LABELS:
+        lines.append(f"<div>and {len(labels) - MOST_LABELS:,} more</div>")
+    return (
+        f'{_LEGEND}<div style="display:grid;grid-template-columns:1fr 1fr;gap:0 0.8em;'
+        f'max-height:7.2em;overflow-y:auto">{"".join(lines)}</div></div>'
+    )
 
 
 def as_bytes(colours: NDArray[np.float64]) -> NDArray[np.uint8]:

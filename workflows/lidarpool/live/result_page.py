@@ -70,8 +70,10 @@ class ResultView:
             bounds = bounds_of(scene, places_of(sensors), pictured.planning)
         self._origin, self._sensors = origin, sensors
         self._choose(file.scans)
+        self._even = self._cloud  # of all scans
         lasts = 0.0 if pictured is None else pictured.duration_ns
-        self._view = View(page, scene, sensors, file.table, origin, bounds, lasts)
+        reflectance = None if pictured is None else pictured.reflectance
+        self._view = View(page, scene, sensors, file.table, origin, bounds, lasts, reflectance)
 
     def draw(self) -> float:
         """Draw what has changed; returns the share of a core that this may take."""
@@ -81,7 +83,7 @@ class ResultView:
         pictured = self._pictured
         if pictured is not None:
             faces = len(pictured.scene.faces)
-            self._view.draw_scene(lambda: pictured.hit_counts[:faces], 0)
+            self._view.draw_scene(lambda: (pictured.hit_counts[:faces], self._even), 0)
             self._view.draw_rays(pictured.sample_rays, 0)
             if pictured.plan is not None:
                 self._view.draw_path(pictured.plan.path, pictured.planning)

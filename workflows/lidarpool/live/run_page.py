@@ -28,6 +28,7 @@ from ..run.progress import STAGES, Progress, Show, in_words, is_sure, time_in_wo
 from ..run.result import Result
 from ..run.store import RunStore
 from ..scan import Frame
+from ..sensor.materials import MaterialTable
 from .live_points import LivePoints
 from .page import PORT, LivePage, live_page, open_browser, redrawn
 from .view import View, bounds_of, described, places_of
@@ -61,7 +62,10 @@ class LiveRun:
         bounds = bounds_of(job.scene, places_of(sensors), job.planning)
         columns = (SCAN, *job.survey.stored_columns)
         origin, lasts = job.scene.origin, job.survey.duration_ns
-        self._view = View(page, job.scene, sensors, columns, origin, bounds, lasts)
+        table = MaterialTable.of(job.survey.materials, job.scene.all_names)
+        self._view = View(
+            page, job.scene, sensors, columns, origin, bounds, lasts, table.reflectance
+        )
         self._described = described(sensors)
         self._newest = ""  # sensor and time of the newest frame
         self._shown = -1  # the last scan of which the page was told when it was
@@ -148,14 +152,14 @@ class LiveRun:
         self._text.content = self._panel()
         view.draw_time()
         if points is None:
-            view.draw_scene(lambda: np.zeros(len(self._job.scene.faces)), 0)
+            view.draw_scene(lambda: (np.zeros(len(self._job.scene.faces)), None), 0)
             return share
         points.gather()
         if points.cloud is not None:
             view.draw_cloud(points.cloud, points.version)
         # It is large, and looks another only when there are a tenth more hits.
         grown = round(math.log1p(points.hits) / math.log(1.1))
-        view.draw_scene(points.hit_counts, (grown, self._over))
+        view.draw_scene(lambda: (points.hit_counts(), points.cloud), (grown, self._over))
         self._draw_frames()
         self._draw_path()
         return share

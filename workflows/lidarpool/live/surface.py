@@ -12,15 +12,22 @@ from trimesh.exchange.gltf import export_glb
 
 from raybeam.open3d_module import load_open3d
 
+from ..columns.table import OBJECT
 from ..render.closeup import floor_and_roof
-from ..render.colouring import TURBO
-from ..render.intensity import density_colours, density_range, hit_density
+from ..render.colouring import TURBO, colours_of
+from ..render.intensity import density_colours, density_range
+from ..render.theme import UNSEEN, mapped, rgb
 from ..scene.scene import Scene
-from .colouring import as_bytes, colour_bar
+from .colouring import as_bytes, colour_bar, legend_of
+from .hits import hit_grid
 from .page import LivePage
 
 MOST_TRIANGLES = 100_000  # 60 bytes each, whenever their colours have changed
+MOST_PIECES = 60_000  # that large ones are divided into, where hits are shown
 TITLE = "hits per square metre; grey: none"
+_INWARDS = 1e-4  # of the scene's diagonal
+_MOST_INWARDS_OF = 200.0  # metres: two centimetres are enough for any scene
+_GREYS = np.linspace(0.1, 1.0, 256)
 SWAP_S = 1.5  # a browser needs a moment to load a mesh
 
 # glTF's colours are linear in light, those on a screen are not (IEC 61966-2-1).
@@ -35,49 +42,81 @@ _MATERIAL = {
 
 
 class Surface:
-    """A scene's triangles, or fewer of nearly its shape, and the hits on them.
+    """A scene's triangles, or fewer of nearly its shape, in the colours that one asks for.
 
     Vertices in the same cell of a grid become one (Rossignac and Borrel, 1993), and hits go to
-    the nearest triangle that is left.
+    the nearest triangle that is left. Each triangle is moved inwards by a little, so that those
+    of two objects that touch, as the top of a wall and a ceiling, do not show through each other.
 
     Parameters
     ----------
     scene
         The scene.
+    reflectance
+        (objects,): share of the light that each object reflects, 0 to 1; None if not known.
     most
         Triangles that there may be.
     """
 
-    def __init__(self, scene: Scene, most: int = MOST_TRIANGLES) -> None:
-        self._scene = self.coarse = scene
-        self._nearest: NDArray[np.integer] | None = None  # of each triangle of the scene
+    def __init__(
+        self,
+        scene: Scene,
+        reflectance: NDArray[np.float64] | None = None,
+        most: int = MOST_TRIANGLES,
+    ) -> None:
+        self._scene, self._reflectance = scene, reflectance
+        self.coarse, self._objects = scene, scene.face_object
+        self._nearest: NDArray[np.int64] | None = None  # of each triangle of the scene
         if len(scene.faces) > most:
             self.coarse, self._nearest = _simplified(scene, most)
-        self.corners = self.coarse.vertices[self.coarse.faces].astype(np.float32)  # (f, 3, 3)
+            self._objects = scene.face_object[_nearest(scene, self.coarse)]
+        corners = self.coarse.vertices[self.coarse.faces].astype(np.float32)  # (f, 3, 3)
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+        normals = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0)
+        size = float(np.linalg.norm(np.ptp(scene.bounds, axis=0)))
+        self.corners = corners - (_INWARDS * min(size, _MOST_INWARDS_OF)) * normals[:, None]
 
-    def below(self, height: float | None) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Corners (k, 3, 3) of what lies below a height, and which triangles (f,) these are.
+    def coloured(
+        self, by: str, hit_counts: NDArray[Any], points: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.uint8], str]:
+        """Triangles (k, 3, 3), their colours (k, 3) and a legend as HTML.
 
-        What rises above it is pressed down to it: an upright wall looks as if it were cut.
+        Parameters
+        ----------
+        by
+            One of `colours_for` the scene.
+        hit_counts, points
+            Hits (f,) of each triangle of the scene and some of the places (n, 3) that were hit,
+            which are looked at only for "hits".
         """
-        if height is None:
-            return self.corners, np.ones(len(self.corners), np.bool_)
-        kept = np.asarray((self.corners[:, :, 2] <= height).any(axis=1))
-        corners = self.corners[kept]
-        np.minimum(corners[:, :, 2], height, out=corners[:, :, 2])
-        return corners, kept
+        legend = ""
+        if by == "hits":
+            return self._by_hits(hit_counts, points)
+        if by == "object":
+            colouring = colours_of(self._objects, OBJECT, self._scene.names)
+            colours, legend = colouring.colours, legend_of(colouring)
+        elif by == "reflectance" and self._reflectance is not None:
+            share = self._reflectance[self._objects]
+            colours = mapped("gray", 0.1 + 0.9 * share)
+            legend = colour_bar("reflectance", ("0", "0.5", "1"), mapped("gray", _GREYS))
+        else:
+            colours = np.tile(rgb(UNSEEN), (len(self.corners), 1))
+        return self.corners, as_bytes(colours), legend
 
-    def coloured(self, hit_counts: NDArray[Any]) -> tuple[NDArray[np.uint8], str]:
-        """Colours (f, 3) by the hits of each triangle of the scene, and a legend."""
+    def _by_hits(
+        self, hit_counts: NDArray[Any], points: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.uint8], str]:
         hits = hit_counts.astype(np.float64)
         if self._nearest is not None:
             hits = np.bincount(self._nearest, hits, len(self.corners)).astype(np.float64)
-        density = hit_density(self.coarse, hits)
+        most = len(self.corners) + MOST_PIECES
+        corners, hit, density = hit_grid(self.coarse, self.corners, hits, points, most)
         low, high = density_range(density)
-        colours = density_colours(density, hits > 0, (low, high), TURBO)
+        colours = density_colours(density, hit, (low, high), TURBO)
         middle = (low * high) ** 0.5
         marks = [f"{n:.2g}" if n < 10 else f"{n:,.0f}" for n in (low, middle, high)]
-        return as_bytes(colours), colour_bar(TITLE, marks) if density.any() else ""
+        return corners, as_bytes(colours), colour_bar(TITLE, marks) if density.any() else ""
 
     def around(self, sensors: NDArray[np.float64]) -> tuple[float | None, float | None]:
         """Heights of the floor under sensors at (p, 3) and of the roof over them, metres.
@@ -87,7 +126,28 @@ class Surface:
         return floor_and_roof(self.coarse, sensors) if len(self.corners) else (None, None)
 
 
-def _simplified(scene: Scene, most: int) -> tuple[Scene, NDArray[np.integer]]:
+def colours_for(scene: Scene, reflectance: NDArray[np.float64] | None) -> tuple[str, ...]:
+    """Name what a scene can be coloured by, the reflectance of its objects being known or not."""
+    more = ("reflectance",) if reflectance is not None and len(np.unique(reflectance)) > 1 else ()
+    return ("grey", "hits", "object", *more)
+
+
+def below(
+    corners: NDArray[np.float32], height: float | None
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Corners (k, 3, 3) of those triangles that lie below a height, and which (f,) these are.
+
+    What rises above it is pressed down to it: an upright wall looks as if it were cut.
+    """
+    if height is None:
+        return corners, np.ones(len(corners), np.bool_)
+    kept = np.asarray((corners[:, :, 2] <= height).any(axis=1))
+    corners = corners[kept]
+    np.minimum(corners[:, :, 2], height, out=corners[:, :, 2])
+    return corners, kept
+
+
+def _simplified(scene: Scene, most: int) -> tuple[Scene, NDArray[np.int64]]:
     """Give a scene of fewer triangles, and for each triangle of this one the nearest there."""
     open3d = load_open3d()
     mesh = open3d.geometry.TriangleMesh(
@@ -98,12 +158,18 @@ def _simplified(scene: Scene, most: int) -> tuple[Scene, NDArray[np.integer]]:
     while len((small := mesh.simplify_vertex_clustering(cell)).triangles) > most:
         cell *= 1.5
     vertices, faces = np.asarray(small.vertices), np.asarray(small.triangles, np.int32)
-    closest = open3d.t.geometry.RaycastingScene()
-    closest.add_triangles(open3d.t.geometry.TriangleMesh.from_legacy(small))
-    middles = scene.vertices[scene.faces].mean(axis=1).astype(np.float32)
-    nearest = closest.compute_closest_points(middles)["primitive_ids"].numpy().astype(np.int64)
     one = np.zeros(len(faces), np.int32)
-    return Scene(vertices, faces, one, ("all",), scene.origin), nearest
+    coarse = Scene(vertices, faces, one, ("all",), scene.origin)
+    return coarse, _nearest(coarse, scene)
+
+
+def _nearest(scene: Scene, others: Scene) -> NDArray[np.int64]:
+    """Give the nearest triangle of a scene for each triangle of another."""
+    closest = load_open3d().t.geometry.RaycastingScene()
+    closest.add_triangles(scene.vertices.astype(np.float32), scene.faces.astype(np.uint32))
+    middles = others.vertices[others.faces].mean(axis=1).astype(np.float32)
+    found = closest.compute_closest_points(middles)["primitive_ids"].numpy()
+    return np.asarray(found, np.int64)
 
 
 class MeshNode:
@@ -119,7 +185,7 @@ class MeshNode:
         self._nodes: dict[str, Any] = {}
         self._alone_at = 0.0  # when the last but one may go
 
-    def show(self, corners: NDArray[np.float32], colours: NDArray[np.uint8], visible: bool) -> None:
+    def show(self, corners: NDArray[np.float32], colours: NDArray[np.uint8]) -> None:
         """Show triangles (f, 3, 3), each of one colour, (f, 3); nothing if there are none."""
         if not len(corners):
             for name in tuple(self._nodes):
@@ -132,7 +198,6 @@ class MeshNode:
             coloured_mesh(corners, colours),
             cast_shadow=False,
             receive_shadow=False,
-            visible=visible,
         )
         self._alone_at = time.monotonic() + SWAP_S
 

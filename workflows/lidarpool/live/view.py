@@ -17,13 +17,13 @@ from ..columns.table import AXES, Column, Z
 from ..plan import Planning
 from ..render.closeup import CUT, around_ways
 from ..render.colouring import colours_of
-from ..render.theme import object_colours
+from ..render.theme import CLAY, object_colours, rgb
 from ..run.picture_file import SensorWay, ways_of
 from ..scene.scene import Scene
 from ..sensor.trajectory import quaternions_of
 from .colouring import as_bytes, legend_of
 from .page import LivePage
-from .surface import MeshNode, Surface
+from .surface import MeshNode, Surface, below, colours_for
 
 MOST_POSES = 1000  # that have a ball
 MOST_LABELS = 20  # of actors
@@ -36,6 +36,8 @@ _PATH, _DISC = (20, 150, 90), (120, 130, 150)
 _BALL, _POSE, _END = 0.009, 0.0054, 0.008
 _MOVES = 0.4  # of that: what moves through a large scene is looked at from near
 _POINT, _POINT_OF_MANY = 0.0035, 0.6
+HIDDEN = "not shown"
+Hits = tuple[NDArray[Any], Cloud | None]  # of each triangle (f,), and points evenly chosen
 _PLAY_S = (6.0, 60.0)  # that a survey takes which is played, however short or long it is
 
 
@@ -61,6 +63,8 @@ class View:
         Box (2, 3) of what there is to see, metres.
     duration_ns
         How long the survey lasts.
+    reflectance
+        (objects,): of each object of the scene, 0 to 1; None if it is not known.
     """
 
     def __init__(
@@ -72,13 +76,15 @@ class View:
         origin: NDArray[np.float64],
         bounds: NDArray[np.float64],
         duration_ns: float = 0.0,
+        reflectance: NDArray[np.float64] | None = None,
     ) -> None:
         self._page, self._scene, self._sensors = page, scene, sensors
+        self._reflectance = reflectance
         self._poses = places_of(sensors)
         self._actors = () if scene is None else scene.actors
         self._origin, self._ground = origin, float(bounds[0, 2])
         near = around_ways(bounds, ways_of(sensors, self._actors, duration_ns))
-        self._from_near = near is not None  # points are dense there, and hits would hide them
+        from_near = near is not None
         near = bounds if near is None else near
         self._size_m = float(np.linalg.norm(near[1] - near[0])) or 1.0
         self._columns = {c.name: c for c in (Z, *(c for c in table if c not in AXES))}
@@ -95,7 +101,7 @@ class View:
         self._ends_ns = duration_ns
         page.frame_scene(near)
         self._add_controls(bounds, duration_ns / 1e9)
-        if self._from_near:  # towers would hide the street
+        if from_near:  # towers would hide the street
             self._cut.value = min(float(near[1, 2] + origin[2]), self._top)
         self._add_poses()
         self._add_actors()
@@ -124,8 +130,8 @@ class View:
             self._cloud_legend = gui.add_html("")
         if self._scene is not None:
             with gui.add_folder("scene"):
-                self._show_scene = gui.add_checkbox("show", initial_value=True)
-                self._show_hits = gui.add_checkbox("hits", initial_value=not self._from_near)
+                colours = colours_for(self._scene, self._reflectance)
+                self._scene_colour = gui.add_dropdown("scene colour", (*colours, HIDDEN))
                 self._show_rays = gui.add_checkbox("rays", initial_value=True)
                 self._scene_legend = gui.add_html("")
 
@@ -197,23 +203,44 @@ class View:
                     self._cloud.colors = colours
                     self._cloud.point_size = size_m
 
-    def draw_scene(self, hit_counts: Callable[[], NDArray[Any]], version: Hashable) -> None:
-        """Show the scene with the hits (f,) of each triangle; another version has other hits."""
+    def draw_scene(self, hits: Callable[[], Hits], version: Hashable) -> None:
+        """Show the scene; another version has other hits."""
         self._mesh.settle()
         if self._scene is None:
             return
         if self._surface is None:
-            self._surface = Surface(self._scene)
+            self._surface = Surface(self._scene, self._reflectance)
             self._look_around(self._surface)
-        hits = self._show_hits.value
-        if self._changed("scene", version if hits else 0, self.cut, hits):
-            counts = hit_counts() if hits else np.zeros(len(self._scene.faces))
-            colours, self._scene_legend.content = self._surface.coloured(counts)
-            corners, kept = self._surface.below(self.cut)
-            self._mesh.show(corners, colours[kept], self._show_scene.value)
-        if self._changed("scene shown", self._show_scene.value):
-            self._mesh.set_visible(self._show_scene.value)
-            self._scene_legend.visible = self._show_scene.value
+        colour = self._scene_colour.value
+        if colour != HIDDEN and self._changed(
+            "scene", version if colour == "hits" else 0, self.cut, colour
+        ):
+            counts, cloud = hits() if colour == "hits" else (np.zeros(0), None)
+            places = np.zeros((0, 3), np.float32) if cloud is None else self._on_scene(cloud)
+            corners, colours, legend = self._surface.coloured(colour, counts, places)
+            corners, kept = below(corners, self.cut)
+            self._scene_legend.content = legend
+            self._mesh.show(corners, colours[kept])
+            self._colour_actors(colour == "object")
+        if self._changed("scene shown", colour == HIDDEN):
+            self._mesh.set_visible(colour != HIDDEN)
+            self._scene_legend.visible = colour != HIDDEN
+
+    def _colour_actors(self, own: bool) -> None:
+        """Give actors their objects' colours, or grey."""
+        names = () if self._scene is None else self._scene.all_names
+        colours = as_bytes(
+            object_colours(len(names)) if own else rgb(CLAY)[None].repeat(len(names), 0)
+        )
+        for body, colour in zip(self._bodies[::-1], colours[::-1].tolist(), strict=False):
+            body.color = tuple(colour)
+
+    def _on_scene(self, cloud: Cloud) -> NDArray[np.float32]:
+        """Places (n, 3) of the points that are on what does not move, local."""
+        places = (cloud.positions - self._origin).astype(np.float32)
+        if self._actors and "object" in cloud.columns and self._scene is not None:
+            places = places[cloud["object"] < len(self._scene.names)]
+        return places
 
     def _look_around(self, surface: Surface) -> None:
         """Let one look into a building, where the sensors stand in one, and find the floor."""
@@ -289,7 +316,6 @@ class View:
                     body.wxyz = np.roll(quaternions_of(rotations)[0], 1)
 
     def _add_actors(self) -> None:
-        colours = as_bytes(object_colours(len(self._actors)))
         for number, actor in enumerate(self._actors):
             name = f"/actors/{number}"
             self._bodies.append(
@@ -297,7 +323,6 @@ class View:
                     name,
                     actor.mesh.vertices,
                     actor.mesh.faces,
-                    color=tuple(colours[number].tolist()),
                     flat_shading=True,
                     side="double",
                     cast_shadow=False,

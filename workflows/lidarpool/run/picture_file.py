@@ -20,6 +20,7 @@ from ..scene.actors import Actor
 from ..scene.mesh import Mesh
 from ..scene.scene import Scene
 from ..sensor import Survey, Track
+from ..sensor.materials import MaterialTable
 from ..sensor.trajectory import quaternions_of
 from .result import Result
 
@@ -83,6 +84,9 @@ class Pictured:
         two ends, metres, local coordinates.
     duration_ns
         How long the survey lasted, by its own clock.
+    reflectance
+        float64 (objects,): share of light that each object reflects, actors after the others;
+        None if it is not known.
     own
         Columns of the cloud that are not in the table of columns; their values are in its file.
     """
@@ -96,6 +100,7 @@ class Pictured:
     trials: Sequence[NDArray[np.float64]]
     duration_ns: float = 0.0
     own: Sequence[Column] = ()
+    reflectance: NDArray[np.float64] | None = None
 
     @classmethod
     def of(cls, result: Result) -> Pictured:
@@ -112,6 +117,7 @@ class Pictured:
             [trial.waypoints for trial in result.trials],
             survey.duration_ns,
             [replace(c, source="") for c in survey.stored_columns if c.name not in TABLE],
+            MaterialTable.of(survey.materials, scene.all_names).reflectance,
         )
 
     @property
@@ -166,6 +172,8 @@ class Pictured:
             "hit_counts": self.hit_counts,
             "sample_rays": self.sample_rays,
         }
+        if self.reflectance is not None:
+            arrays["reflectance"] = self.reflectance
         for number, way in enumerate(self.sensors):
             arrays |= {f"sensor{number}_times": way.times_ns, f"sensor{number}": way.positions}
         for number, actor in enumerate(self.scene.actors):
@@ -238,13 +246,14 @@ class Pictured:
             raise ValueError(f"hit_counts of {counts.shape} for {scene.triangles} triangles")
         rays, duration = arrays["sample_rays"], float(arrays["duration_ns"])
         own = [Column(**column) for column in names["own"]]
+        shares = arrays.get("reflectance")
         if "path" not in arrays:
-            return cls(scene, sensors, counts, rays, None, None, (), duration, own)
+            return cls(scene, sensors, counts, rays, None, None, (), duration, own, shares)
         start, target = arrays["ends"]
         planning = Planning(start, target, arrays["centres"], arrays["radii"])
         numbers = {name: arrays[name].item() for name in _PLAN_NUMBERS}
         plan, trials = Plan(path=arrays["path"], **numbers), tuple(arrays["waypoints"])
-        return cls(scene, sensors, counts, rays, planning, plan, trials, duration, own)
+        return cls(scene, sensors, counts, rays, planning, plan, trials, duration, own, shares)
 
 
 def sensor_ways(survey: Survey) -> list[SensorWay]:
