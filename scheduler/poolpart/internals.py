@@ -14,6 +14,8 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable
 from contextlib import AbstractContextManager
+from functools import cache, wraps
+from multiprocessing import spawn
 from typing import Any
 
 import dask
@@ -526,6 +528,25 @@ def forked_workers() -> AbstractContextManager[object]:
     """
     distributed.utils._forkserver_preload_set = True
     return dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"})
+
+
+@cache  # once is enough
+def spare_workers_the_script() -> None:
+    """Have workers that are started from here not import the script that starts them.
+
+    multiprocessing imports it to find functions by name, and a script without a main guard would
+    start itself again in each worker. Dask sends what a script defines by value.
+    """
+    prepare = spawn.get_preparation_data
+
+    @wraps(prepare)
+    def without_script(name: str) -> dict[str, Any]:
+        data = prepare(name)
+        if name.startswith("Dask Worker process"):
+            data = {key: data[key] for key in data if not key.startswith("init_main_from")}
+        return data
+
+    spawn.get_preparation_data = without_script
 
 
 class FixedCluster(SpecCluster):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import multiprocessing
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,7 +10,7 @@ import dask
 from distributed import Nanny, Scheduler, Security, SpecCluster
 
 from .errors import PoolError
-from .internals import FixedCluster
+from .internals import FixedCluster, spare_workers_the_script
 from .rules import check_name
 
 LOOPBACK = "127.0.0.1"
@@ -34,8 +33,8 @@ def local_cluster(
     """Start a Dask cluster on this machine, divided into partitions.
 
     Scheduler, workers and dashboard listen on the loopback interface only. Workers are processes
-    with a nanny, which restarts them when they die. They import the script that starts them:
-    there, call this under ``if __name__ == "__main__":``.
+    with a nanny, which restarts them when they die. They do not import the script that starts
+    them, which needs no main guard for it.
 
     Parameters
     ----------
@@ -65,7 +64,6 @@ def local_cluster(
     >>> with local_cluster({"GPU": (2, 1), "IO": (1, 8)}) as cluster:    # doctest: +SKIP
     ...     parts = Pool.from_client(Client(cluster)).partitions()
     """
-    _refuse_in_import()
     for name, (count, slots) in partitions.items():
         check_name(name)
         check_count(f"The number of workers of partition {name!r}", count, least=0)
@@ -90,6 +88,7 @@ def local_cluster(
             "dashboard_address": f"{LOOPBACK}:{dashboard_port or 0}",
         },
     }
+    spare_workers_the_script()
     try:
         with dask.config.set(_PRE_SPAWN):
             return FixedCluster(
@@ -97,9 +96,8 @@ def local_cluster(
             )
     except RuntimeError as error:
         raise PoolError(
-            f"The workers did not start ({error.__cause__ or error}). Each imports the script "
-            "that starts the cluster: do that under `if __name__ == '__main__':` in it. If it does "
-            "so, or there is none, one was killed while it started: look whether memory is short."
+            f"The workers did not start ({error.__cause__ or error}): look what they wrote above "
+            "this, and whether memory is short."
         ) from error
 
 
@@ -123,10 +121,3 @@ def check_count(name: str, count: object, least: int = 1) -> None:
     """Check a number; PoolError unless it is whole and large enough."""
     if not isinstance(count, int) or count < least:
         raise PoolError(f"{name} is {count!r}; give a whole number, {least} or more.")
-
-
-def _refuse_in_import() -> None:
-    """End a worker that has come here by importing the script which is starting it."""
-    # What multiprocessing itself goes by; its error, a page from each worker, hides ours.
-    if getattr(multiprocessing.current_process(), "_inheriting", False):
-        raise SystemExit(1)

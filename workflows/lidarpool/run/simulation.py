@@ -108,9 +108,9 @@ def simulate(
     Examples
     --------
     >>> from lidarpool import Scene, Survey, simulate
-    >>> if __name__ == "__main__":                                     # doctest: +SKIP
-    ...     result = simulate(Scene.seed(), Survey(poses=[(0, 0, 1)]))
-    ...     print(len(result.cloud), "points")
+    >>> result = simulate(Scene.seed(), Survey(poses=[(0, 0, 1)]))    # doctest: +SKIP
+    >>> print(len(result.cloud), "points")                            # doctest: +SKIP
+    327 points
     """
     job = Job(
         scene,
