@@ -120,6 +120,7 @@ def write(tmp_path: Path) -> Callable[..., tuple[str, dict[str, Any]]]:
                 "duplicates_dropped": 17,
                 "resumed": 0,
                 "notes": (),
+                "identity": {},
                 "_hit_counts": lambda: np.zeros(len(scene.faces), np.int64),
                 "_sample_rays": lambda: np.zeros((0, 2, 3), np.float32),
             }

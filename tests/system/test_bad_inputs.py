@@ -98,7 +98,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "a.stl").write_bytes(BOX.export(file_type="stl"))
     (tmp_path / "good.ply").touch()
     (tmp_path / "lidarpool-out").mkdir()
-    for name in ("cloud.ply", "path.png", "report.json", "notes of mine.txt"):
+    for name in ("cloud.ply", "path.png", "report.html", "notes of mine.txt"):
         (tmp_path / "lidarpool-out" / name).write_text(f"an earlier {name}")
     return tmp_path
 

@@ -30,7 +30,7 @@ import pytest
 import yaml
 from distributed.cli import dask_scheduler, dask_worker
 
-import lidarpool.run.simulation
+import lidarpool.api.simulation
 from lidarpool import Cloud, save_cloud
 from lidarpool.cli.commands import cli
 from lidarpool.scenario.scenario import Scenario
@@ -103,7 +103,7 @@ def in_threads(monkeypatch, cluster_client):
     theirs = partial(distributed.LocalCluster, processes=False, protocol="tcp")
     monkeypatch.setattr(distributed, "LocalCluster", theirs)
     ours = nullcontext(cluster_client)
-    monkeypatch.setattr(lidarpool.run.simulation, "local_client", lambda **_: ours)
+    monkeypatch.setattr(lidarpool.api.simulation, "local_client", lambda **_: ours)
 
 
 @pytest.mark.parametrize("block", PROGRAMS, ids=lambda block: block.where)

@@ -24,4 +24,5 @@ def test_the_notebook_shows_progress_a_result_a_table_and_a_picture(tmp_path):
         o.data["text/html"] for o in shown if "survey" in o.get("data", {}).get("text/html", "")
     )
     assert "180 scans, 144,688 rays" in result
-    assert "cloud.parquet" in shown[-1].data["text/plain"]
+    assert result.count("data:image/png;base64") == 2
+    assert "<iframe src=" in shown[-1].data["text/html"]

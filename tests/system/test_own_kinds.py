@@ -15,7 +15,6 @@ from lidarpool import (
     Sensor,
     Survey,
     read_cloud,
-    save_result,
     simulate,
 )
 
@@ -112,7 +111,7 @@ def test_a_result_tells_of_itself_and_its_points_become_frames_and_clouds(result
 
 
 def test_both_are_in_the_files_of_the_result(result, tmp_path, no_pictures):
-    save_result(tmp_path, result)
+    result.report(tmp_path)
     report = json.loads((tmp_path / "report.json").read_text())
     names = [column["name"] for column in report["columns"]]
     assert names == ["scan", "channel", "object", "brightness", "time", "range", "intensity"]

@@ -6,16 +6,16 @@ from typing import TYPE_CHECKING, Any
 from ._version import __version__
 
 if TYPE_CHECKING:
+    from .api.result import Result
+    from .api.simulation import simulate
     from .base.errors import LidarpoolError
     from .columns.cloud import Cloud
     from .columns.table import Column
     from .export.ply import read_cloud, save_cloud
     from .plan import Plan, Planning
-    from .report.output import save_result
-    from .run.result import Result
-    from .run.simulation import simulate
     from .run.store import remove_run
     from .scan import Frame
+    from .scene.mesh import Mesh
     from .scene.scene import Scene
     from .sensor import (
         Beams,
@@ -41,6 +41,7 @@ __all__ = [
     "Frame",
     "LidarpoolError",
     "Material",
+    "Mesh",
     "Mounted",
     "Noise",
     "Optics",
@@ -61,23 +62,22 @@ __all__ = [
     "read_cloud",
     "remove_run",
     "save_cloud",
-    "save_result",
     "simulate",
 ]
 
 # Where the names above are. They are imported when they are asked for, which takes a second:
 # the command has to see to its signals before (`__main__.py`).
 _MODULES = {
+    "api.result": ("Result",),
+    "api.simulation": ("simulate",),
     "base.errors": ("LidarpoolError",),
     "columns.cloud": ("Cloud",),
     "columns.table": ("Column",),
     "export.ply": ("read_cloud", "save_cloud"),
     "plan": ("Plan", "Planning"),
-    "run.result": ("Result",),
-    "run.simulation": ("simulate",),
-    "report.output": ("save_result",),
     "run.store": ("remove_run",),
     "scan": ("Frame",),
+    "scene.mesh": ("Mesh",),
     "scene.scene": ("Scene",),
     "sensor.models": ("load_sensor",),
     "sensor": (

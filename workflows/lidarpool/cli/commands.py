@@ -53,6 +53,7 @@ _SHOWN = (
         type=click.Choice(["cloud"]),
         help="Write the cloud and report.json, no pictures and no page.",
     ),
+    click.option("--overwrite", is_flag=True, help="Replace the result of another survey."),
     click.option("--quiet", "-q", is_flag=True, help="No progress, only the result."),
     click.option(
         "--verbose",

@@ -22,8 +22,9 @@ from ..base.choice import one_of_each_part
 from ..base.errors import LidarpoolError
 from ..columns.cloud import CHUNK_POINTS
 from ..export.formats import Format
-from ..report.output import ROOM_BYTES
+from ..report.output import ROOM_BYTES, refuse_to_replace
 from ..run.checks import check_backend_here, find_workers, slots_needed
+from ..run.identity import identity_of
 from ..run.job import Job
 from ..run.local import default_workers, usable_cores
 from ..run.store import RUN_FOLDER
@@ -98,6 +99,10 @@ def forecast(
         do. `memory` is of all processes on this machine, or, on another cluster, of a GPU worker.
     """
     reasons, notes = _look_at_folder(out)
+    try:
+        refuse_to_replace(out, lambda: identity_of(job))
+    except LidarpoolError as error:
+        notes.append(str(error).rstrip("."))
     for one in formats:
         try:
             one.check_installed()

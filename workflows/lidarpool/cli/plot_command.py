@@ -11,21 +11,14 @@ import click
 from ..base.errors import LidarpoolError
 from ..base.vocabulary import PICTURES
 
-SIDE_LEAST, SIDE_MOST = 480, 4096  # letters need some pixels; each takes 0.4 kB of memory
-SIDES_RATIO = 2  # at most, or legends do not fit
-
 
 def _size(ctx: click.Context, param: click.Parameter, value: Any) -> tuple[int, int]:
     """Width and height in pixels of a text such as 1600x1000."""
-    found = re.fullmatch(r"(\d{1,6})[xX×](\d{1,6})", value)
-    size = (int(found[1]), int(found[2])) if found else (0, 0)
-    least, most = min(size), max(size)
-    if least < SIDE_LEAST or most > SIDE_MOST or most > SIDES_RATIO * least:
-        raise click.BadParameter(
-            f"{value!r} is no size for a picture: give width x height in pixels, each "
-            f"{SIDE_LEAST} to {SIDE_MOST}, one at most twice the other, such as 1600x1000."
-        )
-    return size
+    if found := re.fullmatch(r"(\d{1,6})[xX×](\d{1,6})", value):
+        return int(found[1]), int(found[2])
+    raise click.BadParameter(
+        f"{value!r} is no size of a picture: give width x height in pixels, such as 1600x1000."
+    )
 
 
 @click.command()
@@ -67,7 +60,7 @@ def plot(
       lidarpool plot lidarpool-out --only cloud --colour intensity --size 2400x1500 --out figures
     """  # noqa: D301 - click wants the character, not its name
     from ..base.fork_server import keep_freed_memory
-    from ..report.pictures import picture_makers
+    from ..report.pictures import draw_pictures
     from ..run.picture_file import PICTURE_FILE, Pictured
 
     if not (result / PICTURE_FILE).exists():
@@ -76,19 +69,6 @@ def plot(
             "folder of a finished run (its --out)."
         )
     keep_freed_memory()
-    makers = picture_makers(
-        Pictured.load(result / PICTURE_FILE), result / "cloud.ply", size, colour
-    )
-    out = result if out is None else out
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise LidarpoolError(
-            f"The folder {out} cannot be made ({error.strerror}): give another with --out."
-        ) from error
-    for name in only or makers:
-        if name not in makers:
-            raise LidarpoolError(f"{result} has no picture {name!r}: its run planned no path.")
-        path = out / f"{name}.png"
-        makers[name](path)
+    shown = Pictured.load(result / PICTURE_FILE)
+    for path in draw_pictures(shown, result / "cloud.ply", out or result, only, size, colour):
         click.echo(click.format_filename(path))

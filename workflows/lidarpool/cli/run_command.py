@@ -17,14 +17,16 @@ from ..base.vocabulary import PATIENCE_S, WAIT_S
 from ..base.words import counted
 from ..export.folder import result_folder
 from ..export.formats import Format
-from ..report.output import write_result
+from ..report.output import refuse_to_replace, write_result
 from ..report.report import summary
 from ..run.checks import check_backend_here
 from ..run.connection import TlsFiles, connected, local_client
+from ..run.identity import identity_of
 from ..run.job import Job, make_job
-from ..run.result import Result
+from ..run.result import RunResult
 from ..run.run import Run, make_result
 from ..run.store import RUN_FOLDER, RunStore, remove_run
+from ..scan.database import FILE
 from ..scenario.scenario import Scenario
 from .logs import set_logs
 from .terminal import shown_progress, shown_status, tell
@@ -42,7 +44,8 @@ class RunOptions:
 
     `resumable` says whether the run is kept in the output folder; without that, `resume` and
     `fresh` mean nothing. `stay` says whether the page of `live` stays when all is done. `only` is
-    "cloud" for a cloud without pictures and page. `parts` is where the parts go meanwhile.
+    "cloud" for a cloud without pictures and page. `overwrite` replaces the result of another
+    survey. `parts` is where the parts go meanwhile.
     """
 
     out: Path
@@ -60,6 +63,7 @@ class RunOptions:
     live: bool = False
     stay: bool = True
     only: str | None = None
+    overwrite: bool = False
     parts: str | None = None
     wait_s: float = WAIT_S
     patience_s: float = PATIENCE_S
@@ -102,7 +106,7 @@ def _simulate(
     options: RunOptions,
     live: LiveRun | None,
     whole: ExitStack,
-) -> tuple[Result, dict[str, Any]]:
+) -> tuple[RunResult, dict[str, Any]]:
     """Do what is not done yet, and write the result; returns also the report.
 
     As soon as the result is in its place, an error or interrupt that ends `whole` says so.
@@ -111,6 +115,9 @@ def _simulate(
     for one in formats:
         one.check_installed()
     with result_folder(options.out):
+        goes_on = options.resume and (options.out / RUN_FOLDER / FILE).exists()
+        if not (options.overwrite or goes_on):
+            refuse_to_replace(options.out, lambda: identity_of(job))
         store = _store(job, options)
 
         def in_place() -> None:
@@ -181,7 +188,7 @@ def _store(job: Job, options: RunOptions) -> RunStore:
 
 def _drive(
     scenario: Scenario, store: RunStore, options: RunOptions, live: LiveRun | None
-) -> Result:
+) -> RunResult:
     """Run on a cluster, on one of this machine if none is given."""
     if options.scheduler is None:
         check_backend_here(store.backend or store.job.backend, store.advice)
@@ -220,7 +227,7 @@ def _local_client(scenario: Scenario, options: RunOptions, planning: bool) -> It
         yield client
 
 
-def _tell(out: Path, result: Result, job: Job, files: list[str]) -> None:
+def _tell(out: Path, result: RunResult, job: Job, files: list[str]) -> None:
     for note in result.notes:
         click.echo(f"note: {note}")
     if not result.hits:
@@ -228,8 +235,7 @@ def _tell(out: Path, result: Result, job: Job, files: list[str]) -> None:
     click.echo(
         f"{job.survey.scan_count:,} scans, {result.rays:,} rays, {result.hits:,} hits on "
         f"{counted(len(job.scene.all_names), 'object')}, {len(result.points):,} points in the "
-        "cloud "
-        f"({result.backend}, {result.survey_seconds:.1f} s)"
+        f"cloud{result.thinned} ({result.backend}, {result.survey_seconds:.1f} s)"
     )
     if result.plan is not None:
         plan = result.plan

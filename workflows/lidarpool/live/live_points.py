@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud
 from ..columns.parts import read_part
-from ..run.result import Result
+from ..run.result import RunResult
 from ..run.store import RunStore
 from ..scan import Receipt
 
@@ -85,7 +85,7 @@ class LivePoints:
         self.cloud = cloud
         self.version += 1
 
-    def finish(self, result: Result) -> None:
+    def finish(self, result: RunResult) -> None:
         """Take an even choice of all points, and all hits; the parts may be removed after that."""
         with self._lock:
             self._waiting = []

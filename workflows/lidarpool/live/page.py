@@ -13,13 +13,17 @@ import time
 import webbrowser
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from html import escape
 from urllib.parse import urlsplit
 
+import click
 import numpy as np
 import rich
 import viser
 from numpy.typing import ArrayLike, NDArray
 from viser.infra import WebsockClientConnection
+
+from ..base.notebook import cell_display
 
 HOST = "127.0.0.1"
 PORT = 8080  # or the next that is free
@@ -180,16 +184,53 @@ def refuse_strangers(server: viser.ViserServer) -> None:
 @contextmanager
 def live_page(title: str, port: int = PORT) -> Iterator[LivePage]:
     """Serve a page while the body runs; see `LivePage`."""
-    console = rich.get_console()  # viser tells there what is going on, as it runs and as it ends
+    with _without_words():
+        page = LivePage(title, port)
+    try:
+        yield page
+    finally:
+        with _without_words():
+            page.stop()
+
+
+@contextmanager
+def _without_words() -> Iterator[None]:
+    """Keep from the terminal what viser tells as it begins and as it ends."""
+    console = rich.get_console()
     before, console.quiet = console.quiet, True
     try:
-        page = LivePage(title, port)
-        try:
-            yield page
-        finally:
-            page.stop()
+        yield
     finally:
         console.quiet = before
+
+
+@contextmanager
+def announced(page: LivePage, words: str, browser: bool) -> Iterator[None]:
+    """Say where a page is while the body runs: on stderr, or by the page itself in a notebook.
+
+    Parameters
+    ----------
+    page
+        The page.
+    words
+        What is said, with its address.
+    browser
+        Whether to open a browser where there is a desktop, and no notebook.
+    """
+    display = cell_display()
+    if display is None:
+        click.echo(words, err=True)
+        if browser:
+            open_browser(page.url)
+        yield
+        return
+    link = f'<a href="{page.url}" target="_blank">{escape(words)}</a>'
+    frame = f'<iframe src="{page.url}" style="width:100%;height:560px;border:0"></iframe>'
+    shown = display.display(display.HTML(f"{link}<br>{frame}"), display_id=True)
+    try:
+        yield
+    finally:
+        shown.update(display.HTML(""))
 
 
 @contextmanager

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -13,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import LidarpoolError
+from ..base.notebook import cell_display
 from ..export.cloud_file import CloudFile
 from ..run.picture_file import PICTURE_FILE, Pictured, SensorWay
 from ..run.store import RUN_FOLDER
 from ..scan.database import FILE
-from .page import LivePage, live_page, open_browser, redrawn
+from .page import PORT, LivePage, announced, live_page, redrawn
 from .view import View, bounds_of, described, places_of
 
 CLOUD = "cloud.ply"
@@ -117,17 +119,48 @@ def _around(file: CloudFile) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return origin, box - origin
 
 
-def view_result(path: Path, *, port: int, browser: bool = True) -> None:
-    """Show a result until Ctrl-C.
+@contextmanager
+def result_page(
+    file: CloudFile,
+    pictured: Pictured | None = None,
+    note: str = "",
+    *,
+    title: str = "lidarpool",
+    port: int = PORT,
+    browser: bool = True,
+) -> Iterator[None]:
+    """Serve the page of a result while the body runs, and say where.
 
     Parameters
     ----------
-    path
-        Folder of a result, or a cloud.
+    file, pictured, note
+        What it shows, see `ResultView`.
+    title
+        Title of its panel.
     port
-        Port to listen on, or the next that is free.
+        Port to listen on, or the next that is free; 0 for any.
     browser
         Whether to open a browser where there is a desktop.
+    """
+    with live_page(title, port) as page:
+        view = ResultView(page, file, pictured, note)
+        ends = "" if cell_display() else "; Ctrl-C ends it"
+        with (
+            announced(page, f"{page.url} shows {len(file):,} points{ends}", browser),
+            redrawn(view.draw, DRAW_EVERY_S),
+        ):
+            yield
+
+
+def wait_for_interrupt() -> None:
+    """Let a page be looked at until Ctrl-C."""
+    with suppress(KeyboardInterrupt):
+        while True:
+            time.sleep(1.0)
+
+
+def view_result(path: Path, *, port: int, browser: bool = True) -> None:
+    """Show a folder of a result, or a cloud, until Ctrl-C; see `result_page`.
 
     Raises
     ------
@@ -137,17 +170,9 @@ def view_result(path: Path, *, port: int, browser: bool = True) -> None:
     file, pictured, note = open_result(path)
     if note:
         click.echo(f"note: {note}", err=True)
-    with live_page(f"lidarpool: {path.resolve().name}", port) as page:
-        view = ResultView(page, file, pictured, note)
-        click.echo(f"{page.url} shows {len(file):,} points; Ctrl-C ends it", err=True)
-        if browser:
-            open_browser(page.url)
-        try:
-            with redrawn(view.draw, DRAW_EVERY_S):
-                while True:
-                    time.sleep(1.0)
-        except KeyboardInterrupt:
-            return
+    title = f"lidarpool: {path.resolve().name}"
+    with result_page(file, pictured, note, title=title, port=port, browser=browser):
+        wait_for_interrupt()
 
 
 def open_result(path: Path) -> tuple[CloudFile, Pictured | None, str]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from html import escape
 from threading import Event
@@ -25,12 +25,12 @@ from ..plan import best
 from ..run.job import Job
 from ..run.picture_file import sensor_ways
 from ..run.progress import STAGES, Progress, Show, in_words, is_sure, time_in_words
-from ..run.result import Result
+from ..run.result import RunResult
 from ..run.store import RunStore
 from ..scan import Frame
 from ..sensor.materials import MaterialTable
 from .live_points import LivePoints
-from .page import PORT, LivePage, live_page, open_browser, redrawn
+from .page import PORT, LivePage, announced, live_page, redrawn
 from .view import View, bounds_of, described, places_of
 
 DRAW_EVERY_S = 0.2
@@ -113,6 +113,16 @@ class LiveRun:
         """Note a frame; it is displayed unless many others come at once."""
         self._frames.append(frame)
 
+    def with_frames(self, take: Callable[[Frame], None] | None) -> Callable[[Frame], None]:
+        """Return a function to call with each frame: it tells the page, and calls `take`."""
+
+        def tell(frame: Frame) -> None:
+            self.on_frame(frame)
+            if take is not None:
+                take(frame)
+
+        return tell
+
     def on_progress(self, progress: Progress) -> None:
         """Note how far the run is; raises KeyboardInterrupt if it was stopped."""
         self._first = self._first or progress
@@ -126,7 +136,7 @@ class LiveRun:
         if self.stopped.is_set():
             raise KeyboardInterrupt
 
-    def finish(self, result: Result) -> None:
+    def finish(self, result: RunResult) -> None:
         """Say that the run is over, and show all of it; its parts may be removed after that."""
         if self._points is not None:
             self._points.finish(result)
@@ -256,8 +266,8 @@ def live_run(job: Job, *, port: int = PORT, browser: bool = True) -> Iterator[Li
     """
     with live_page("lidarpool", port) as page:
         live = LiveRun(page, job)
-        click.echo(f"live page: {page.url}", err=True)
-        if browser:
-            open_browser(page.url)
-        with redrawn(live.draw, DRAW_EVERY_S):
+        with (
+            announced(page, f"live page: {page.url}", browser),
+            redrawn(live.draw, DRAW_EVERY_S),
+        ):
             yield live

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -13,12 +13,12 @@ from ..base.errors import LidarpoolError
 from ..base.interrupts import deferred_interrupts
 from ..base.vocabulary import FORMATS, PICTURES
 from ..columns.storage import flush
-from ..export.folder import result_folder, staging
+from ..export.folder import staging
 from ..export.formats import Format, remove
 from ..export.ply import save_cloud
 from ..export.sweeps import SWEEPS_FILE, Sweeps
 from ..run.picture_file import PICTURE_FILE, Pictured
-from ..run.result import Result
+from ..run.result import RunResult
 from ..scenario.scenario import Scenario
 from .cloud_numbers import CountedCloud
 from .report import make_report
@@ -29,40 +29,43 @@ CLOUD, PAGE, REPORT = "cloud.ply", "report.html", "report.json"
 _OF_CLOUD = "cloud.png"  # the picture that is drawn from the cloud's file
 _IMAGES = tuple(f"{name}.png" for name in PICTURES)
 FILES = (CLOUD, *_IMAGES, PICTURE_FILE, SWEEPS_FILE, PAGE, REPORT)
+_SURVEY = ("scene", "survey")  # what tells one from another
 EXPORTS = tuple(file for file, _ in FORMATS.values())
 
 
-def save_result(
-    folder: str | Path,
-    result: Result,
-    *,
-    only_cloud: bool = False,
-    formats: Sequence[str] = (),
-) -> None:
-    """Write what `lidarpool run` does: cloud, pictures and report, all of them or none.
+def refuse_to_replace(folder: Path, identity: Callable[[], Mapping[str, str]]) -> None:
+    """Refuse a folder that holds the result of another survey.
 
     Parameters
     ----------
     folder
-        Made if it is not there; an earlier result in it is replaced.
-    only_cloud
-        Leave pictures and `report.html` out.
-    formats
-        Other formats to write the cloud in as well, such as "laz"; see `lidarpool export`.
+        Where a result is to go.
+    identity
+        Returns that of this result, see `RunResult.identity`; large scenes take a moment.
 
     Raises
     ------
     LidarpoolError
-        If a file cannot be written, or a format lacks a package or column.
+        If there is a result, and it is of another scene or survey, or cannot be read.
     """
-    wanted = [Format(name) for name in formats]
-    with result_folder(Path(folder)):
-        write_result(Path(folder), result, only_cloud=only_cloud, formats=wanted)
+    try:
+        report = json.loads((folder / REPORT).read_text("utf-8"))
+        there = {name: report["identity"][name] for name in _SURVEY}
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    except (OSError, ValueError, TypeError, LookupError):
+        there = {}
+    here = identity()
+    if there != {name: here[name] for name in _SURVEY}:
+        raise LidarpoolError(
+            f"{folder} holds the result of another survey: give another folder with --out, or "
+            "replace it with --overwrite (in Python overwrite=True)."
+        )
 
 
 def write_result(
     folder: Path,
-    result: Result,
+    result: RunResult,
     scenario: Scenario | None = None,
     then: Callable[[], object] = lambda: None,
     only_cloud: bool = False,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import LidarpoolError
+from ..base.vocabulary import PICTURES
 from ..base.words import did_you_mean
 from ..columns.table import Z
 from ..export.cloud_file import CloudFile
@@ -19,6 +20,51 @@ from ..render.shot import SIZE, Shot, take_shot
 from ..run.picture_file import Pictured, ways_of
 from ..scene.scene import Scene
 from .path_picture import draw_path
+
+SIDE_LEAST, SIDE_MOST = 480, 4096  # letters need some pixels; each takes 0.4 kB of memory
+SIDES_RATIO = 2  # at most, or legends do not fit
+
+
+def check_size(size: tuple[int, int]) -> None:
+    """Check that a picture may have so many pixels; LidarpoolError says how many it may have."""
+    least, most = min(size), max(size)
+    if least < SIDE_LEAST or most > SIDE_MOST or most > SIDES_RATIO * least:
+        raise LidarpoolError(
+            f"A picture cannot be {size[0]} x {size[1]} pixels: give width and height of "
+            f"{SIDE_LEAST} to {SIDE_MOST} each, one at most twice the other, such as 1600 x 1000."
+        )
+
+
+def draw_pictures(
+    shown: Pictured,
+    cloud: Path,
+    folder: str | Path,
+    only: Sequence[str] = (),
+    size: tuple[int, int] = SIZE,
+    colour: str = Z.name,
+) -> Iterator[Path]:
+    """Draw pictures into a folder, which is made, and give the file of each; see `picture_makers`.
+
+    `only` are names of some of them.
+    """
+    check_size(size)
+    makers = picture_makers(shown, cloud, size, colour)
+    for name in only:
+        if name not in PICTURES:
+            there = did_you_mean(name, PICTURES) or f" There are {', '.join(PICTURES)}."
+            raise LidarpoolError(f"There is no picture {name!r}.{there}")
+        if name not in makers:
+            raise LidarpoolError(f"There is no picture {name!r}: its run planned no path.")
+    try:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise LidarpoolError(
+            f"The folder {folder} cannot be made ({error.strerror}): give another."
+        ) from error
+    for name in only or makers:
+        path = Path(folder) / f"{name}.png"
+        makers[name](path)
+        yield path
 
 
 def picture_makers(

@@ -14,7 +14,7 @@ import numpy as np
 
 from .._version import __version__
 from ..base.task_book import StageTotals, union
-from ..run.result import Result
+from ..run.result import RunResult
 from ..run.trials import TRIAL
 from ..scan import COLLECT, GENERATE, INTERSECT, SORT
 from ..scene.scene import Scene
@@ -48,7 +48,7 @@ def versions() -> dict[str, str]:
 
 
 def make_report(
-    result: Result,
+    result: RunResult,
     files: Sequence[str],
     cloud: CountedCloud,
 ) -> dict[str, Any]:
@@ -59,6 +59,7 @@ def make_report(
     scene, survey = result.scene, result.survey
     return {
         "versions": versions(),
+        "identity": dict(result.identity),
         "machine": {"system": platform.platform(), "processor": platform.machine()},
         "backend": result.backend,
         "notes": list(result.notes),
@@ -199,7 +200,7 @@ def overlap_seconds(totals: Iterable[StageTotals]) -> float:
     return sum(max(0.0, min(a[1], b[1]) - max(a[0], b[0])) for a in casting for b in planning)
 
 
-def _planning(result: Result) -> dict[str, Any] | None:
+def _planning(result: RunResult) -> dict[str, Any] | None:
     """Tell what was planned and found; places are in world coordinates, as in the scenario."""
     plan, planning = result.plan, result.planning
     if plan is None or planning is None:

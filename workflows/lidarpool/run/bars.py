@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -10,6 +9,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn
 from rich.progress import Progress as Bars
 
+from ..base.notebook import cell_display
 from .progress import STAGES, Progress, Show, in_words, is_sure, time_in_words
 
 
@@ -66,11 +66,11 @@ def bars(console: Console) -> Iterator[Show]:
 
 
 @contextmanager
-def notebook_bars() -> Iterator[Show | None]:
-    """Bars in the output of a notebook's cell; None anywhere else."""
-    console = Console() if "ipykernel" in sys.modules else None
-    if console is None or not console.is_jupyter:
-        yield None
-        return
-    with bars(console) as show:
-        yield show
+def bars_here() -> Iterator[Show]:
+    """Bars in the cell of a notebook or at the terminal of a script; elsewhere nothing is shown."""
+    console = Console(stderr=cell_display() is None)
+    if console.is_jupyter or (console.is_terminal and not console.is_dumb_terminal):
+        with bars(console) as show:
+            yield show
+    else:
+        yield lambda progress: None

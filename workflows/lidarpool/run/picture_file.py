@@ -22,7 +22,7 @@ from ..scene.scene import Scene
 from ..sensor import Survey, Track
 from ..sensor.materials import MaterialTable
 from ..sensor.trajectory import quaternions_of
-from .result import Result
+from .result import RunResult
 
 PICTURE_FILE = "pictures.npz"
 
@@ -103,7 +103,7 @@ class Pictured:
     reflectance: NDArray[np.float64] | None = None
 
     @classmethod
-    def of(cls, result: Result) -> Pictured:
+    def of(cls, result: RunResult) -> Pictured:
         """Return what the pictures of a result show."""
         scene, survey = result.scene, result.survey
         actors = tuple(_sampled(actor, survey.duration_ns) for actor in scene.actors)

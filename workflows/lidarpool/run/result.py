@@ -1,11 +1,10 @@
-"""What a run gives."""
+"""What a run gives, before anything is made of it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from html import escape
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +12,6 @@ from numpy.typing import NDArray
 from poolpart import TaskRecord
 
 from ..base.task_book import StageTotals
-from ..base.words import counted
 from ..columns.cloud import Cloud
 from ..columns.parts import StoredCloud
 from ..plan import Plan, Planning, Trial
@@ -21,9 +19,9 @@ from ..scene.scene import Scene
 from ..sensor import Survey
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Result:
-    """What a run gives.
+@dataclass(frozen=True, eq=False)
+class RunResult:
+    """What a run gives, before anything is made of it; `lidarpool.api.result` adds to that.
 
     Parameters
     ----------
@@ -49,6 +47,8 @@ class Result:
         Scans whose points are of an earlier run. `records` and seconds are of this run only.
     notes
         What a user should know, such as that the GPU partition had no GPU.
+    identity
+        Fingerprints of scene, survey and planning, and versions of what computed with them.
     """
 
     scene: Scene
@@ -64,6 +64,7 @@ class Result:
     stages: tuple[StageTotals, ...]
     resumed: int
     notes: tuple[str, ...]
+    identity: Mapping[str, str]
     _hit_counts: Callable[[], NDArray[np.int64]] = field(repr=False)
     _sample_rays: Callable[[], NDArray[np.float32]] = field(repr=False)
     seconds: float = 0.0
@@ -72,37 +73,11 @@ class Result:
     replayed: int = 0
     duplicates_dropped: int = 0
 
-    def __repr__(self) -> str:
-        return "\n".join(f"{name}: {value}" for name, value in self._figures())
-
-    def _repr_html_(self) -> str:
-        """Table that notebooks show."""
-        rows = (
-            f"<tr><th style='text-align:left'>{escape(name)}</th>"
-            f"<td style='text-align:left'>{escape(value)}</td></tr>"
-            for name, value in self._figures()
-        )
-        return f"<table>{''.join(rows)}</table>"
-
-    def _figures(self) -> Iterator[tuple[str, str]]:
-        """Names and values of what a reader looks for first."""
-        yield (
-            "survey",
-            f"{self.survey.scan_count:,} scans, {self.rays:,} rays, {self.hits:,} hits on "
-            f"{counted(len(self.scene.all_names), 'object')} ({self.backend}, "
-            f"{self.survey_seconds:.1f} s)",
-        )
-        names = ", ".join(("x", "y", "z", *(column.in_files for column in self.points.table)))
-        yield "cloud", f"{len(self.points):,} points: {names}"
-        if self.plan is not None:
-            free = "free of collisions" if self.plan.collision_free else "not free of collisions"
-            yield (
-                "path",
-                f"{self.plan.length:.2f} m, {free} ({self.plan.trials} trials, "
-                f"{self.planning_seconds:.1f} s)",
-            )
-        for note in self.notes:
-            yield "note", note
+    @property
+    def thinned(self) -> str:
+        """Why there are fewer points than hits, for behind their number; empty if all are kept."""
+        every = self.survey.keep_every
+        return f", one of every {every:,} hits of a scan (keep_every)" if every > 1 else ""
 
     @cached_property
     def cloud(self) -> Cloud:

@@ -34,7 +34,7 @@ from ..scan import (
 )
 from .checks import find_workers
 from .progress import Progress
-from .result import Result
+from .result import RunResult
 from .store import RunStore
 from .trials import TrialPump
 
@@ -128,7 +128,7 @@ class Run:
         self,
         on_frame: Callable[[Frame], None] | None,
         on_progress: Callable[[Progress], None] | None,
-    ) -> Result:
+    ) -> RunResult:
         """Run to the end; whatever is raised, everything has been stopped by then."""
         started = time.monotonic()
         pumps: list[SurveyDriver | TrialPump] = []
@@ -256,11 +256,11 @@ class Run:
 
 def make_result(
     store: RunStore, books: Sequence[TaskBook] = (), notes: Iterable[str] = (), **figures: Any
-) -> Result:
-    """Put the result together once everything is committed; `figures` are others of `Result`."""
+) -> RunResult:
+    """Put the result together once everything is committed; `figures` are others of `RunResult`."""
     job = store.job
     trials = tuple(sorted(store.db.trials, key=lambda trial: trial.trial))
-    return Result(
+    return RunResult(
         scene=job.scene,
         survey=job.survey,
         planning=job.planning,
@@ -274,6 +274,7 @@ def make_result(
         stages=tuple(totals for book in books for totals in book.stages.values()),
         resumed=store.resumed,
         notes=(*store.notes, *notes),
+        identity=store.identity,
         _hit_counts=store.hit_counts,
         _sample_rays=store.sample_rays,
         **figures,

@@ -76,7 +76,7 @@ class RunStore:
         self.notes: list[str] = []  # what a user should know
         self.on_parts: Callable[[list[Receipt]], None] | None = None  # called with new ones
         self._gone = False
-        here = identity_of(job)
+        self.identity = here = identity_of(job)
         if folder is None:
             folder = Path(tempfile.mkdtemp(prefix="lidarpool-"))
             weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)

@@ -16,7 +16,7 @@ from markupsafe import Markup
 
 from ...base.words import counted
 from ...render.page import shortened, without_common_prefix
-from ...run.result import Result
+from ...run.result import RunResult
 from ...run.trials import TRIAL
 from ...scan import COLLECT, GENERATE, INTERSECT, SORT
 from ...scenario.scenario import Scenario
@@ -67,7 +67,7 @@ class Bar(NamedTuple):
 def write_page(
     path: Path,
     report: Report,
-    result: Result,
+    result: RunResult,
     cloud: CountedCloud,
     scenario: Scenario | None = None,
 ) -> None:

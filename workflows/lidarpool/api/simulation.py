@@ -4,24 +4,28 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from distributed import Client
 
 from ..base.vocabulary import PATIENCE_S, WAIT_S
 from ..plan import Planning
+from ..run.bars import bars_here
+from ..run.checks import check_backend_here
+from ..run.connection import local_client
+from ..run.job import Job
+from ..run.progress import Progress
+from ..run.run import Run, make_result
+from ..run.store import RunStore
 from ..scan import Frame
 from ..scene.scene import Scene
 from ..sensor import Survey
-from .bars import notebook_bars
-from .checks import check_backend_here
-from .connection import local_client
-from .job import Job
-from .progress import Progress
 from .result import Result
-from .run import Run, make_result
-from .store import RunStore
+
+if TYPE_CHECKING:
+    from ..live.run_page import LiveRun
 
 logger = logging.getLogger(__name__)
 
@@ -35,6 +39,7 @@ def simulate(
     backend: str = "auto",
     on_frame: Callable[[Frame], None] | None = None,
     on_progress: Callable[[Progress], None] | None = None,
+    live: bool = False,
     queue_capacity: int = 10,
     collectors: int = 2,
     gpu_workers: int | None = None,
@@ -65,8 +70,11 @@ def simulate(
         then, see `Frame.points`. It is called in this thread: while it takes its time the
         pipeline waits, and nothing is lost.
     on_progress
-        Called some ten times a second with how far things are. In a notebook there are bars
-        without it.
+        Called some ten times a second with how far things are. Without it there are bars in a
+        notebook and at a terminal.
+    live
+        Show the run in the browser meanwhile, as `lidarpool run --live` does; in a notebook, in the
+        cell. `Result.view` shows the result afterwards.
     queue_capacity
         Items that stage 1 may be ahead of stage 2.
     collectors
@@ -129,7 +137,7 @@ def simulate(
     with store.kept_on_error():
         if store.complete:
             store.db.unlock()
-            return make_result(store)
+            return Result(**vars(make_result(store)))
         if client is None:
             check_backend_here(store.backend or backend, store.advice)
         with (
@@ -142,10 +150,21 @@ def simulate(
             )
             if client is None
             else nullcontext(client) as client,
-            notebook_bars() if on_progress is None else nullcontext(on_progress) as show,
+            bars_here() if on_progress is None else nullcontext(on_progress) as show,
+            _page_of(job) if live else nullcontext() as page,
         ):
             run = Run(client, store, logger.info)
+            if page is not None:
+                page.follow(store)
+                on_frame = page.with_frames(on_frame)
+                show = page.with_progress(show, run.partitions)
             with nullcontext() if own else run.partitions_page():
                 result = run.drive(on_frame, show)
             store.db.unlock()
-            return result
+            return Result(**vars(result))
+
+
+def _page_of(job: Job) -> AbstractContextManager[LiveRun]:
+    from ..live.run_page import live_run  # with viser, which takes half a second
+
+    return live_run(job)

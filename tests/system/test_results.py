@@ -1,0 +1,100 @@
+"""What a result makes of itself in Python, and that another survey's is not replaced unasked."""
+
+from __future__ import annotations
+
+import json
+import urllib.request
+from dataclasses import replace
+
+import pytest
+
+from lidarpool import LidarpoolError, Mesh, Planning, Scene, Sensor, Survey, read_cloud, simulate
+from lidarpool.api.result import Result
+from lidarpool.scene.shapes import seed_objects
+
+SENSOR = Sensor.grid(rays_per_revolution=90, layers=6)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    shapes = seed_objects(rings=6, segments=8)[:2]  # any triangles will do, those of trimesh too
+    return Scene.from_meshes(Mesh(one.name, one.vertices, one.faces) for one in shapes)
+
+
+@pytest.fixture(scope="module")
+def result(cluster_client, scene) -> Result:
+    planning = Planning((25, 25), (-30, -20), trials=1, particles=10, iterations=2)
+    return simulate(scene, Survey(SENSOR, [(0, 0, 1)], 36), planning, client=cluster_client)
+
+
+@pytest.fixture
+def another(result) -> Result:
+    """The same points, as if another survey had given them."""
+    return replace(result, identity={**result.identity, "survey": "another"})
+
+
+def test_it_is_told_in_three_lines_and_shown_as_a_table_with_pictures(result, scene):
+    survey, cloud, path = repr(result).splitlines()
+    assert survey.startswith("survey: 36 scans, 540 rays, ") and "2 objects" in survey
+    assert "1 point, one of every 5 hits of a scan (keep_every): x, y" in cloud
+    assert path.startswith("path: ") and "; note: no GPU" in path
+    shown = result._repr_html_()
+    assert shown.startswith("<table>") and shown.count("data:image/png;base64,") == 2
+    assert result.objects == scene.names
+
+
+def test_pictures_are_drawn_and_what_they_cannot_be_is_told(result, tmp_path):
+    made = result.pictures(tmp_path / "new", only=["cloud"], size=(480, 480), colour="channel")
+    assert made == [tmp_path / "new/cloud.png"] and made[0].read_bytes().startswith(b"\x89PNG")
+    for wrong, words in (
+        ({"only": ["clod"]}, "Did you mean 'cloud'"),
+        ({"size": (10, 10)}, "480 to 4096"),
+        ({"only": ["cloud"], "colour": "rang"}, "no column 'rang'"),
+    ):
+        with pytest.raises(LidarpoolError, match=words):
+            result.pictures(tmp_path, **wrong)
+
+
+def test_a_report_does_not_replace_that_of_another_survey_unasked(result, another, tmp_path):
+    result.report(tmp_path, only_cloud=True)
+    assert len(read_cloud(tmp_path / "cloud.ply")) == len(result.points)
+    result.report(tmp_path, only_cloud=True)  # its own
+    with pytest.raises(LidarpoolError, match=r"holds the result of another survey: .*overwrite"):
+        another.report(tmp_path)
+    another.report(tmp_path, only_cloud=True, overwrite=True)
+    assert json.loads((tmp_path / "report.json").read_text())["identity"]["survey"] == "another"
+    (tmp_path / "report.json").write_text("somebody's own")
+    with pytest.raises(LidarpoolError, match="another survey"):
+        another.report(tmp_path)
+
+
+def test_the_command_does_not_either(tmp_path, cluster, lidarpool, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "s.yaml").write_text("sensor: {layers: 2}\nsteps: 1\nplanning: {enabled: false}\n")
+    run = ("run", "s.yaml", "--scheduler", cluster, "--only", "cloud", "--quiet")
+    assert lidarpool(*run).code == lidarpool(*run).code == 0
+    (tmp_path / "s.yaml").write_text("sensor: {layers: 3}\nsteps: 1\nplanning: {enabled: false}\n")
+    refused = lidarpool(*run)
+    assert refused.code == 2 and "another survey: give another folder with --out" in refused.err
+    assert (
+        "note: lidarpool-out holds the result of another survey" in lidarpool("check", "s.yaml").out
+    )
+    assert lidarpool(*run, "--overwrite").code == 0
+
+
+def test_its_page_and_that_of_its_run(result, scene, cluster_client, monkeypatch, capsys):
+    def look() -> None:
+        url = capsys.readouterr().err.split()[0]
+        with urllib.request.urlopen(url, timeout=120) as page:
+            assert page.status == 200
+
+    monkeypatch.setattr("lidarpool.live.result_page.wait_for_interrupt", look)
+    result.view(port=0, browser=False)
+    frames = []
+    monkeypatch.setattr("lidarpool.live.page.open_browser", lambda url: True)
+    simulate(
+        scene, Survey(SENSOR, [(0, 0, 1)], 2), client=cluster_client, on_frame=frames.append,
+        live=True,
+    )  # fmt: skip
+    assert "live page: http://127.0.0.1:" in capsys.readouterr().err
+    assert [frame.scan for frame in frames] == [0, 1]

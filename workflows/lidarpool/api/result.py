@@ -1,0 +1,191 @@
+"""What a run gives, and everything that the command makes of it."""
+
+from __future__ import annotations
+
+import shutil
+import weakref
+from base64 import b64encode
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import cached_property
+from html import escape
+from pathlib import Path
+from tempfile import TemporaryDirectory, mkdtemp
+from typing import TYPE_CHECKING
+
+from ..base.notebook import cell_display
+from ..base.words import counted
+from ..export.ply import save_cloud
+from ..run.result import RunResult
+
+if TYPE_CHECKING:
+    from ..run.picture_file import Pictured
+
+# In a notebook: what is drawn of a result, and how large.
+_SHOWN, _SIZE = ("intensity", "cloud"), (800, 500)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Result(RunResult):
+    """What a run gives, and everything that the command makes of it.
+
+    A notebook shows it as a table with two pictures.
+    """
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """Names of the objects, in the order of the column `object`."""
+        return self.scene.all_names
+
+    def report(
+        self,
+        folder: str | Path,
+        *,
+        only_cloud: bool = False,
+        formats: Sequence[str] = (),
+        overwrite: bool = False,
+    ) -> None:
+        """Write what `lidarpool run` does: cloud, pictures and report, all of them or none.
+
+        Parameters
+        ----------
+        folder
+            Made if it is not there. An earlier result of the same survey in it is replaced.
+        only_cloud
+            Leave pictures and `report.html` out.
+        formats
+            Other formats to write the cloud in as well, such as "laz"; see `lidarpool export`.
+        overwrite
+            Replace the result of another survey, too.
+
+        Raises
+        ------
+        LidarpoolError
+            If a file cannot be written, the folder holds the result of another survey, or a
+            format lacks a package or column.
+        """
+        from ..export.folder import result_folder
+        from ..export.formats import Format
+        from ..report.output import refuse_to_replace, write_result
+
+        wanted = [Format(name) for name in formats]
+        with result_folder(Path(folder)):
+            if not overwrite:
+                refuse_to_replace(Path(folder), lambda: self.identity)
+            write_result(Path(folder), self, only_cloud=only_cloud, formats=wanted)
+
+    def pictures(
+        self,
+        folder: str | Path,
+        *,
+        only: Sequence[str] = (),
+        size: tuple[int, int] = (1600, 1000),
+        colour: str = "z",
+    ) -> list[Path]:
+        """Draw pictures, as `lidarpool plot` does.
+
+        Parameters
+        ----------
+        folder
+            Where they go; made if it is not there.
+        only
+            Which: scene, intensity, cloud, path; by default all.
+        size
+            Width and height in pixels.
+        colour
+            Column that the points of the cloud are coloured by.
+
+        Returns
+        -------
+        Their files.
+
+        Raises
+        ------
+        LidarpoolError
+            If there is no such picture, size or column, or a file cannot be written.
+        """
+        from ..report.pictures import draw_pictures
+
+        return list(draw_pictures(self._pictured, self._cloud_file, folder, only, size, colour))
+
+    def view(self, *, port: int = 8080, browser: bool = True) -> None:
+        """Show it in the browser, as `lidarpool view` does, until Ctrl-C.
+
+        In a notebook the page is shown in the cell, and stays as long as the result is in use.
+
+        Parameters
+        ----------
+        port
+            Port on 127.0.0.1, or the next that is free; 0 for any.
+        browser
+            Whether to open a browser where there is a desktop.
+        """
+        from ..export.cloud_file import CloudFile
+        from ..live.result_page import result_page, wait_for_interrupt
+
+        with ExitStack() as stack:
+            file = CloudFile(self._cloud_file, self._pictured.own)
+            stack.enter_context(result_page(file, self._pictured, port=port, browser=browser))
+            if cell_display() is None:
+                wait_for_interrupt()
+            else:
+                weakref.finalize(self, stack.pop_all().close)
+
+    @cached_property
+    def _pictured(self) -> Pictured:
+        from ..run.picture_file import Pictured
+
+        return Pictured.of(self)
+
+    @cached_property
+    def _cloud_file(self) -> Path:
+        """The cloud as a file, in a folder that goes with this object."""
+        folder = mkdtemp(prefix="lidarpool-")
+        weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+        path = Path(folder) / "cloud.ply"
+        save_cloud(path, self.points, precision_m=self.survey.precision_m)
+        return path
+
+    def __repr__(self) -> str:
+        survey, cloud, *others = (f"{name}: {value}" for name, value in self._figures())
+        return "\n".join([survey, cloud, "; ".join(others)]).rstrip()
+
+    def _repr_html_(self) -> str:
+        """Table and pictures that notebooks show."""
+        rows = (
+            f"<tr><th style='text-align:left'>{escape(name)}</th>"
+            f"<td style='text-align:left'>{escape(value)}</td></tr>"
+            for name, value in self._figures()
+        )
+        return f"<table>{''.join(rows)}</table>{self._images}"
+
+    @cached_property
+    def _images(self) -> str:
+        with TemporaryDirectory(prefix="lidarpool-") as folder:
+            drawn = self.pictures(folder, only=_SHOWN, size=_SIZE)
+            data = [b64encode(path.read_bytes()).decode() for path in drawn]
+        return "".join(
+            f'<img alt="{name}" src="data:image/png;base64,{one}" style="width:49%">'
+            for name, one in zip(_SHOWN, data, strict=True)
+        )
+
+    def _figures(self) -> Iterator[tuple[str, str]]:
+        """Names and values of what a reader looks for first."""
+        yield (
+            "survey",
+            f"{self.survey.scan_count:,} scans, {self.rays:,} rays, {self.hits:,} hits on "
+            f"{counted(len(self.objects), 'object')} ({self.backend}, "
+            f"{self.survey_seconds:.1f} s)",
+        )
+        names = ", ".join(("x", "y", "z", *(column.in_files for column in self.points.table)))
+        yield "cloud", f"{counted(len(self.points), 'point')}{self.thinned}: {names}"
+        if self.plan is not None:
+            free = "free of collisions" if self.plan.collision_free else "not free of collisions"
+            yield (
+                "path",
+                f"{self.plan.length:.2f} m, {free} ({self.plan.trials} trials, "
+                f"{self.planning_seconds:.1f} s)",
+            )
+        for note in self.notes:
+            yield "note", note

@@ -1,0 +1,16 @@
+"""Notebooks: whether this is one, and what is shown in its cells."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+
+def cell_display() -> Any:
+    """Return `IPython.display` where what is printed goes to the cell of a notebook, else None."""
+    if "ipykernel" not in sys.modules:
+        return None
+    from IPython import display, get_ipython
+
+    shell: Any = get_ipython()
+    return display if type(shell).__name__ == "ZMQInteractiveShell" else None
