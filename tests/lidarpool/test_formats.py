@@ -1,7 +1,9 @@
 """Clouds in other formats, read back by the libraries of those formats."""
 
+import json
 import signal
 import sys
+import types
 from dataclasses import replace
 
 import laspy
@@ -22,10 +24,13 @@ from lidarpool import (
     Sensor,
     Survey,
     Track,
+    load_trajectory,
+    read_cloud,
     save_cloud,
 )
 from lidarpool.base.vocabulary import FORMATS
 from lidarpool.columns.table import TABLE
+from lidarpool.export import threads
 from lidarpool.export.cloud_file import CloudFile
 from lidarpool.export.formats import Format
 from lidarpool.export.sweeps import Sweeps
@@ -182,6 +187,7 @@ def test_kitti_poses_bring_the_sweeps_of_a_sensor_together(written, cloud):
         np.testing.assert_allclose(poses[0], np.eye(4)[:3], atol=1e-9)
         np.testing.assert_allclose(np.loadtxt(sequence / "times.txt"), np.arange(5) / 10)
         firsts = []
+        back = np.loadtxt(sequence / "calib.txt", usecols=range(1, 13))[4].reshape(3, 4)[:, :3]
         for number, pose in enumerate(poses):
             points = of_sweep(cloud, 5 * sensor + number)
             rows = np.fromfile(sequence / f"velodyne/{number:06}.bin", "<f4").reshape(-1, 4)
@@ -189,7 +195,7 @@ def test_kitti_poses_bring_the_sweeps_of_a_sensor_together(written, cloud):
             labels = np.fromfile(sequence / f"labels/{number:06}.label", "<u4")
             np.testing.assert_array_equal(labels & 0xFFFF, points["class"])
             np.testing.assert_array_equal(labels >> 16, points.object + 1)
-            firsts.append(rows[:, :3] @ pose[:, :3].T + pose[:, 3])
+            firsts.append(rows[:, :3] @ back.T @ pose[:, :3].T + pose[:, 3])
         # All in the axes of the first pose: distances are those in the world.
         own = cloud.part(np.flatnonzero(cloud.sensor == sensor)).positions
         placed = np.concatenate(firsts)
@@ -197,8 +203,17 @@ def test_kitti_poses_bring_the_sweeps_of_a_sensor_together(written, cloud):
         np.testing.assert_allclose(apart, np.linalg.norm(own[1:] - own[:-1], axis=1), atol=1e-4)
 
 
+def test_kitti_poses_are_read_as_a_trajectory(written, sweeps):
+    """As KITTI's are: a camera's, which are turned to a carrier's."""
+    folder = written("kitti") / "sequences/01"
+    track = load_trajectory(folder / "poses.txt", times=folder / "times.txt")
+    places = sweeps.pose.positions[5:]
+    turn = matrices(sweeps.pose.quaternions[5:6])[0]
+    np.testing.assert_allclose(track.positions, (places - places[0]) @ turn, atol=1e-6)
+
+
 def test_nuscenes_has_a_folder_for_each_sensor(written, cloud):
-    folder = written("nuscenes")
+    folder = written("nuscenes") / "samples"
     assert {path.name for path in folder.iterdir()} == {"front", "rear"}
     rows = np.fromfile(folder / "rear/000002.pcd.bin", "<f4").reshape(-1, 5)
     points = of_sweep(cloud, 7)
@@ -210,7 +225,7 @@ def test_nuscenes_has_a_folder_for_each_sensor(written, cloud):
 @pytest.mark.parametrize(("layout", "step"), [("velodyne", 22), ("autoware", 32), ("ouster", 48)])
 def test_bags_have_points_frames_and_a_clock(written, cloud, sweeps, name, layout, step):
     store = get_typestore(Stores.ROS2_HUMBLE)
-    clouds, frames, clocks = {}, {}, []
+    clouds, frames, boxes, clocks = {}, {}, {}, []
     with AnyReader([written(name, layout)], default_typestore=store) as bag:
         for connection, when, data in bag.messages():
             message = bag.deserialize(data, connection.msgtype)
@@ -219,11 +234,19 @@ def test_bags_have_points_frames_and_a_clock(written, cloud, sweeps, name, layou
             elif connection.topic == "/tf":
                 for transform in message.transforms:
                     frames[transform.child_frame_id, when] = transform
+            elif connection.topic == "/actors":
+                (box,) = message.markers
+                boxes[box.ns, when] = box
             else:
                 clocks.append(when)
     assert {topic for topic, _ in clouds} == {"/front/points", "/rear/points"}
     assert {frame for frame, _ in frames} == {"front", "rear", "Car"}
-    assert len(clouds) == len(clocks) == 10
+    assert len(clouds) == len(clocks) == len(boxes) == 10
+    box = boxes["front", 300_000_000]  # of the sweep without points: where it begins
+    assert (box.header.frame_id, box.text, box.type) == ("map", "Car", box.CUBE)
+    place = box.pose.position
+    np.testing.assert_allclose([place.x, place.y, place.z], [5.6, 5, 0.75], atol=1e-12)
+    assert (box.scale.x, box.scale.y, box.scale.z) == (4, 2, 1.5)
     sweep, when = 7, 200_000_000
     message, points = clouds["/rear/points", when], of_sweep(cloud, sweep)
     assert (message.point_step, message.header.frame_id) == (step, "rear")
@@ -339,7 +362,8 @@ def test_any_name_makes_a_topic_a_frame_and_a_folder(cloud, sweeps, tmp_path):
     """Also one that would lead out of the folder, and an actor called as the world's frame."""
     odd = replace(sweeps, sensors=("../front", ".. front"), actors=("map",))
     Format("nuscenes").write(tmp_path / "nuscenes", cloud, odd)
-    assert {path.name for path in (tmp_path / "nuscenes").iterdir()} == {"___front", "___front_2"}
+    folders = {path.name for path in (tmp_path / "nuscenes/samples").iterdir()}
+    assert folders == {"___front", "___front_2"}
     Format("mcap").write(tmp_path / "cloud.mcap", cloud, odd)
     store = get_typestore(Stores.ROS2_HUMBLE)
     frames = set()
@@ -350,3 +374,176 @@ def test_any_name_makes_a_topic_a_frame_and_a_folder(cloud, sweeps, tmp_path):
                 transforms = bag.deserialize(data, connection.msgtype).transforms
                 frames |= {transform.child_frame_id for transform in transforms}
     assert frames == {"___front", "___front_2", "map_2"}
+
+
+@pytest.fixture(scope="module")
+def traffic(scene) -> tuple[Cloud, Sweeps]:
+    """Two turns of a sensor, in which cars that pass and turn are hit all over their boxes."""
+    tracks = (
+        Track([0, 1], [[-5, 8, 0], [15, 8, 0]]),
+        Track(
+            [0, 1], [[8, 8, 0.1], [8, -4, 0.1]], [[0, 0, 0, 1], [0, 0, np.sin(0.7), np.cos(0.7)]]
+        ),
+        Track([0, 1], [[90, 0, 0], [90, 1, 0]]),
+    )
+    names = ("Car 1", "Car 2", "Far away")
+    actors = tuple(
+        Actor(box(name, (4, 2, 1.5)), track) for name, track in zip(names, tracks, strict=True)
+    )
+    scene = replace(scene, actors=actors)
+    mount = Pose((0, 1, 2), 20.0)
+    survey = Survey(sensors=[Mounted(Sensor.grid(360, 4), mount)], poses=[(0, 0, 0)], steps=72)
+    rng, clouds = np.random.default_rng(3), []
+    for scan in range(72):
+        # Each is hit within a tenth of a turn.
+        for actor, track in enumerate(tracks[:2]):
+            if (scan - 11 * actor) % 36 in (25, 26, 27, 28):
+                place, turn = track.poses(0, np.array([survey.begins_ns(scan)]))
+                inside = rng.uniform([-2, -1, 0], [2, 1, 1.5], (50, 3))
+                clouds.append((inside @ turn[0].T + place, scan, len(scene.names) + actor))
+    columns = {
+        "scan": np.repeat([scan for _, scan, _ in clouds], 50),
+        "object": np.repeat([number for _, _, number in clouds], 50),
+    }
+    count = len(columns["scan"])
+    columns |= {"channel": np.zeros(count), "intensity": np.ones(count), "class": np.ones(count)}
+    columns["time"] = np.zeros(count)
+    sweeps = Sweeps.of(survey, scene)
+    places = np.concatenate([places for places, _, _ in clouds])
+    return Cloud(places, columns, sweeps=lambda: sweeps), sweeps
+
+
+def inside_box(points, centre, axes, size, tolerance_m):
+    return (np.abs((points - centre) @ axes) <= np.array(size) / 2 + tolerance_m).all(axis=1)
+
+
+def test_boxes_of_kitti_hold_the_points_of_their_actors(traffic, tmp_path):
+    cloud, sweeps = traffic
+    cloud.save(tmp_path / "kitti", format="kitti")
+    folder = tmp_path / "kitti/sequences/00"
+    back = np.loadtxt(folder / "calib.txt", usecols=range(1, 13))[4].reshape(3, 4)[:, :3]
+    for sweep in (0, 1):
+        points = np.fromfile(folder / f"velodyne/{sweep:06}.bin", "<f4").reshape(-1, 4)[:, :3]
+        instances = np.fromfile(folder / f"labels/{sweep:06}.label", "<u4") >> 16
+        lines = (folder / f"label_2/{sweep:06}.txt").read_text().splitlines()
+        assert [line.split()[0] for line in lines] == ["Car", "Car"]  # the third has no points
+        for actor, line in enumerate(lines):
+            height, width, length, *place, around = map(float, line.split()[8:])
+            camera = points[instances == len(sweeps.objects) + actor + 1] @ back.T
+            assert len(camera) == 200
+            turn = np.array([[np.cos(around), 0, np.sin(around)], [0, 1, 0],
+                             [-np.sin(around), 0, np.cos(around)]])  # fmt: skip
+            centre = np.array(place) - [0, height / 2, 0]
+            # It moves by 0.6 m or less while it is hit, and turns.
+            assert inside_box(camera, centre, turn, (length, height, width), 0.45).all()
+
+
+def test_boxes_of_nuscenes_hold_the_points_of_their_actors(traffic, tmp_path):
+    cloud, sweeps = traffic
+    cloud.save(tmp_path / "nu", format="nuscenes")
+    tables = {
+        path.stem: json.loads(path.read_text()) for path in (tmp_path / "nu").glob("v1.0-*/*.json")
+    }
+    samples = [row["token"] for row in tables["sample"]]
+    assert [row["timestamp"] for row in tables["sample"]] == [0, 100_000]
+    counts = {}
+    for row in tables["sample_annotation"]:
+        sweep = samples.index(row["sample_token"])
+        actor = [one["token"] for one in tables["instance"]].index(row["instance_token"])
+        rows = (cloud.scan // 36 == sweep) & (cloud.object == len(sweeps.objects) + actor)
+        points = cloud.part(np.flatnonzero(rows))
+        counts[actor, sweep] = row["num_lidar_pts"]
+        w, *turn = row["rotation"]
+        width, length, height = row["size"]
+        axes = matrices(np.array([[*turn, w]]))[0]
+        size = length, width, height
+        assert inside_box(points.positions, row["translation"], axes, size, 0.45).all()
+    assert counts == {(0, 0): 200, (0, 1): 200, (1, 0): 200, (1, 1): 200, (2, 0): 0, (2, 1): 0}
+    assert [row["name"] for row in tables["category"]] == ["Car", "Far_away"]
+
+
+@pytest.mark.parametrize("name", ["ply", *FORMATS])
+def test_a_cloud_is_saved_twice_with_the_same_bytes(cloud, sweeps, tmp_path, name):
+    known = replace(cloud, sweeps=lambda: sweeps)
+    written = []
+    for folder in (tmp_path / "a", tmp_path / "b"):
+        folder.mkdir()
+        known.save(folder / "it", format=name) if name != "ply" else known.save(folder / "it.ply")
+        files = sorted(path for path in folder.rglob("*") if path.is_file())
+        written.append({path.relative_to(folder): path.read_bytes() for path in files})
+    assert written[0] == written[1]
+    if name == "las":  # which would be that of the day
+        assert str(laspy.read(tmp_path / "a/it").header.creation_date) == "1980-01-06"
+
+
+def test_a_cloud_is_saved_in_the_format_of_its_ending(cloud, sweeps, tmp_path):
+    bare, known = cloud, replace(cloud, sweeps=lambda: sweeps)
+    (tmp_path / "a.laz").write_text("an earlier one")
+    bare.save(tmp_path / "a.laz")
+    las = laspy.read(tmp_path / "a.laz")
+    assert len(las) == len(cloud) and las.header.scales[0] == 0.001
+    known.part(slice(9)).save(tmp_path / "b.las")
+    assert laspy.read(tmp_path / "b.las").header.scales[0] == sweeps.precision_m
+    known.save(tmp_path / "c.mcap", layout="ouster")
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    with AnyReader([tmp_path / "c.mcap"], default_typestore=store) as bag:
+        assert {"/front/points", "/rear/points", "/tf", "/actors", "/clock"} == set(bag.topics)
+    (tmp_path / "result").mkdir()
+    sweeps.save(tmp_path / "result/sweeps.npz")
+    known.save(tmp_path / "result/cloud.ply")
+    read_cloud(tmp_path / "result/cloud.ply").save(tmp_path / "kitti", format="kitti")
+    assert len(list((tmp_path / "kitti/sequences/00/velodyne").iterdir())) == 5
+
+    before = sorted(tmp_path.rglob("*"))
+    for told, path, more in (
+        (r"ends as no format does: use .ply, .las, .*, or give a format", "x.xyz", {}),
+        ("There is no format 'xyz': use", "x", {"format": "xyz"}),
+        ("There is no layout 'sick': use velodyne", "x.mcap", {"layout": "sick"}),
+        ("is a folder: remove it, or give another path", "kitti", {"format": "kitti"}),
+        ("is a folder", "result", {"format": "laz"}),
+        ("cannot be written: No such file", "gone/x.laz", {}),
+    ):
+        with pytest.raises(LidarpoolError, match=told):
+            known.save(tmp_path / path, **more)
+    with pytest.raises(LidarpoolError, match="mcap stores single sweeps, and this cloud knows of"):
+        bare.save(tmp_path / "x.mcap")
+    with pytest.raises(LidarpoolError, match="kitti needs scan, object, intensity, class, which"):
+        Cloud(cloud.positions, {}, sweeps=lambda: sweeps).save(tmp_path / "x", format="kitti")
+    with pytest.raises(LidarpoolError, match="not in the order of their scans"):
+        known.part(np.arange(len(cloud))[::-1]).save(tmp_path / "x.e57")
+    shorter = replace(sweeps, scans=sweeps.scans[:6], begins_ns=sweeps.begins_ns[:5])
+    with pytest.raises(LidarpoolError, match="or not of the survey that the sweeps are of"):
+        replace(cloud, sweeps=lambda: shorter).save(tmp_path / "x.mcap")
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_format_is_named_as_in_a_scenario():
+    assert Format.of("laz") == Format("laz")
+    assert Format.of({"format": "mcap", "layout": "ouster"}) == Format("mcap", "ouster")
+    for entry in ({"layout": "ouster"}, {"format": "mcap", "step": 3}, 5):
+        with pytest.raises(LidarpoolError, match="names no format: give a name, or"):
+            Format.of(entry)
+
+
+def test_an_error_in_a_thread_ends_the_writing(sweeps, cloud, tmp_path, monkeypatch):
+    """The first one: no more files are begun, and what is there goes."""
+    begun = []
+
+    def full(path, data):
+        begun.append(path)
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("pathlib.Path.write_bytes", full)
+    monkeypatch.setattr(threads, "THREADS", 2)
+    with pytest.raises(LidarpoolError, match="kitti cannot be written: No space left on device"):
+        Format("kitti").write(tmp_path / "kitti", cloud, sweeps)
+    assert len(begun) <= 3
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_cloud_becomes_a_dataframe_of_a_library(cloud, monkeypatch):
+    assert list(cloud.to_dataframe().columns[:5]) == ["x", "y", "z", "scan", "ring"]
+    made = types.SimpleNamespace(DataFrame=dict)
+    monkeypatch.setitem(sys.modules, "polars", made)  # which is not installed for one test
+    frame = cloud.to_dataframe("polars")
+    np.testing.assert_array_equal(frame["ring"], cloud.channel)

@@ -58,7 +58,7 @@ def test_a_run_writes_what_its_scenario_asks_for_and_a_result_is_exported(
     assert refused.code == 2 and "Another run or export is using the folder" in refused.err
     elsewhere = lidarpool("export", out, "-f", "nuscenes", "--out", tmp_path / "other")
     assert elsewhere.code == 0 and "nuscenes does not hold" in elsewhere.err
-    assert len(list((tmp_path / "other/nuscenes/rear").iterdir())) == 3
+    assert len(list((tmp_path / "other/nuscenes/samples/rear").iterdir())) == 3
 
     # What an earlier run or export left would pass for this one's.
     (tmp_path / "s.yaml").write_text(SCENARIO.replace("laz, ", ""))

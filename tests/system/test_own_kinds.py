@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, field
 
+import laspy
 import numpy as np
 import pytest
 
@@ -108,6 +109,17 @@ def test_a_result_tells_of_itself_and_its_points_become_frames_and_clouds(result
     found = cloud.to_open3d().point
     np.testing.assert_array_equal(found["positions"].numpy(), cloud.positions)
     np.testing.assert_array_equal(found["ring"].numpy()[:, 0], cloud.channel)
+
+
+def test_points_and_cloud_are_saved_alike_with_every_column(result, tmp_path):
+    result.points.save(tmp_path / "points.laz")
+    result.cloud.save(tmp_path / "cloud.laz")
+    assert (tmp_path / "points.laz").read_bytes() == (tmp_path / "cloud.laz").read_bytes()
+    las = laspy.read(tmp_path / "cloud.laz")
+    np.testing.assert_allclose(las.xyz, result.cloud.positions, atol=1e-9)
+    np.testing.assert_array_equal(las["brightness"], result.cloud["brightness"])
+    result.points.save(tmp_path / "pcd", format="pcd")
+    assert len(list((tmp_path / "pcd").iterdir())) == len(result.cloud.sweeps())
 
 
 def test_both_are_in_the_files_of_the_result(result, tmp_path, no_pictures):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import weakref
 from base64 import b64encode
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
@@ -43,7 +43,7 @@ class Result(RunResult):
         folder: str | Path,
         *,
         only_cloud: bool = False,
-        formats: Sequence[str] = (),
+        formats: Sequence[str | Mapping[str, str]] = (),
         overwrite: bool = False,
     ) -> None:
         """Write what `lidarpool run` does: cloud, pictures and report, all of them or none.
@@ -55,7 +55,8 @@ class Result(RunResult):
         only_cloud
             Leave pictures and `report.html` out.
         formats
-            Other formats to write the cloud in as well, such as "laz"; see `lidarpool export`.
+            Other formats to write the cloud in as well, as under `output.write` of a scenario:
+            "laz", or {"format": "mcap", "layout": "ouster"}.
         overwrite
             Replace the result of another survey, too.
 
@@ -69,7 +70,7 @@ class Result(RunResult):
         from ..export.formats import Format
         from ..report.output import refuse_to_replace, write_result
 
-        wanted = [Format(name) for name in formats]
+        wanted = [Format.of(entry) for entry in formats if entry != "ply"]
         with result_folder(Path(folder)):
             if not overwrite:
                 refuse_to_replace(Path(folder), lambda: self.identity)

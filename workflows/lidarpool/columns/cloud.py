@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -34,8 +36,52 @@ class CloudLike(Protocol):
         """Give the points in order, at most so many at a time."""
 
 
+class Savable:
+    """What clouds in memory and in parts share: they can be saved."""
+
+    # Gives the `lidarpool.export.sweeps.Sweeps` of the survey; None where nobody knows them.
+    sweeps: Callable[[], Any] | None
+
+    def save(
+        self,
+        path: str | Path,
+        *,
+        format: str | None = None,  # noqa: A002 - as scenarios and the command call it
+        layout: str = "velodyne",
+        precision_m: float | None = None,
+    ) -> None:
+        """Write the points in the format that the path ends in, whole or not at all.
+
+        The same points give the same bytes. About a million points are in memory at a time, or
+        those of the largest sweep.
+
+        Parameters
+        ----------
+        path
+            Its ending is .ply, .las, .laz, .e57, .mcap or .parquet, unless there is a `format`.
+            The folder it goes to must exist. A file that is there is replaced, a folder is not.
+        format
+            Such as "laz", and for folders of many files "parquet", "pcd", "kitti", "nuscenes" or
+            "rosbag2".
+        layout
+            Of the points of mcap and rosbag2: velodyne, autoware or ouster.
+        precision_m
+            Metres that positions are kept to; by default as they were rounded, else 0.001.
+
+        Raises
+        ------
+        LidarpoolError
+            If there is no such format, a column or package is missing that it needs, the cloud
+            is not of a result and the format stores single sweeps, or it cannot be written.
+        """
+        # Formats are in a room above this one, which does not import it: it is found by name, as
+        # they are.
+        save = import_module("lidarpool.export.formats").save
+        save(Path(path), self, format, layout, precision_m)
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class Cloud:
+class Cloud(Savable):
     """Points of a survey, ordered by scan and ray.
 
     A column is read as ``cloud["channel"]``, and ``cloud.scan`` will do where a name is free.
@@ -48,6 +94,8 @@ class Cloud:
         {name: (n,)}: the other columns, of `lidarpool.columns.table` or one's own.
     own
         Descriptions of the columns that are not in the table.
+    sweeps
+        Gives the sweeps of the survey to `save`; clouds of a `Result` have it.
 
     Raises
     ------
@@ -58,6 +106,7 @@ class Cloud:
     positions: NDArray[np.floating]
     columns: Mapping[str, NDArray[Any]]
     own: tuple[Column, ...] = ()
+    sweeps: Callable[[], Any] | None = None
 
     def __post_init__(self) -> None:
         positions = np.asarray(self.positions)
@@ -101,7 +150,7 @@ class Cloud:
         raise AttributeError(f"a cloud has no attribute or column {name!r}")
 
     def __getstate__(self) -> dict[str, Any]:
-        return dict(self.__dict__)
+        return self.__dict__ | {"sweeps": None}  # the scene would go along
 
     @property
     def table(self) -> tuple[Column, ...]:
@@ -119,12 +168,11 @@ class Cloud:
             return np.zeros((2, 3), self.positions.dtype)
         return np.stack([self.positions.min(axis=0), self.positions.max(axis=0)])
 
-    def to_dataframe(self) -> Any:
-        """Return a pandas DataFrame of all columns, by their names in files."""
-        import pandas as pd
-
+    def to_dataframe(self, library: Literal["pandas", "polars"] = "pandas") -> Any:
+        """Return a DataFrame of pandas or polars with all columns, by their names in files."""
         columns = dict(zip("xyz", self.positions.T, strict=True))
-        return pd.DataFrame(columns | {c.in_files: self[c.name] for c in self.table})
+        columns |= {column.in_files: self[column.name] for column in self.table}
+        return import_module(library).DataFrame(columns)
 
     def to_open3d(self) -> Any:
         """Return an `open3d.t.geometry.PointCloud` of all columns, by their names in files."""
@@ -138,7 +186,7 @@ class Cloud:
     def part(self, rows: slice | NDArray[np.integer]) -> Cloud:
         """Return some of the points; consecutive ones as views."""
         columns = {name: array[rows] for name, array in self.columns.items()}
-        return Cloud(self.positions[rows], columns, self.own)
+        return Cloud(self.positions[rows], columns, self.own, self.sweeps)
 
     def chunks(self, points: int = CHUNK_POINTS) -> Iterator[Cloud]:
         """Give the points in order, at most so many at a time, as views."""
@@ -154,7 +202,9 @@ class Cloud:
         columns = {
             name: np.concatenate([part.columns[name] for part in parts]) for name in first.columns
         }
-        return cls(np.concatenate([part.positions for part in parts]), columns, first.own)
+        return cls(
+            np.concatenate([part.positions for part in parts]), columns, first.own, first.sweeps
+        )
 
 
 def described(cloud: CloudLike) -> str:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import io
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ..base.choice import one_of_each_part
 from ..base.errors import LidarpoolError
-from .cloud import CHUNK_POINTS, Cloud, described
+from .cloud import CHUNK_POINTS, Cloud, Savable, described
 from .storage import Storage
 from .table import AXES, SCAN, Column
 
@@ -182,7 +182,7 @@ def read_tally(storage: Storage, name: str) -> tuple[NDArray[np.int32], NDArray[
         ) from error
 
 
-class StoredCloud:
+class StoredCloud(Savable):
     """The points of parts in (scan, ray) order, read as many at a time as wanted; a `CloudLike`.
 
     Parameters
@@ -201,6 +201,8 @@ class StoredCloud:
         World position of the scene's local origin, (3,), metres.
     keeper
         Whatever has to live as long as the parts are to be read.
+    sweeps
+        Gives the sweeps of the survey to `save`.
     """
 
     def __init__(
@@ -213,11 +215,12 @@ class StoredCloud:
         precision_m: float,
         origin: NDArray[np.float64],
         keeper: Any = None,
+        sweeps: Callable[[], Any] | None = None,
     ) -> None:
         self.storage, self.names, self.rows = storage, tuple(names), tuple(rows)
         self._columns = tuple(columns)
         self._cells, self._precision_m, self._origin = cells, precision_m, origin
-        self._keeper = keeper
+        self._keeper, self.sweeps = keeper, sweeps
 
     def __repr__(self) -> str:
         return described(self)
@@ -250,7 +253,8 @@ class StoredCloud:
         return Cloud(
             positions(cells, self._precision_m, self._origin),
             columns,
-            tuple(c for c in self.table),
+            self.table,
+            self.sweeps,
         )
 
     def chunks(self, points: int = CHUNK_POINTS) -> Iterator[Cloud]:
@@ -316,7 +320,7 @@ class StoredCloud:
         if parts:
             return Cloud.joined(parts)
         columns = {c.name: np.zeros(0, c.dtype) for c in self.table}
-        return Cloud(np.zeros((0, 3)), columns, self.table)
+        return Cloud(np.zeros((0, 3)), columns, self.table, self.sweeps)
 
 
 def positions(

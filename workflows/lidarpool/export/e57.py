@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pye57
 from pye57 import libe57
 
+from ..base.fingerprint import fingerprint
 from ..columns.cloud import CloudLike
 from .sweeps import Sweeps
 
 
 def write_e57(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
     """Write each sweep that has points, in the sensor's axes, with its pose and intensity."""
-    with pye57.E57(str(path), mode="w") as file:
+    content = fingerprint(sweeps, len(cloud), np.asarray(cloud.bounds))
+    with _named_by(content), pye57.E57(str(path), mode="w") as file:
         try:
             _write(file, cloud, sweeps)
             file.close()
@@ -41,3 +48,16 @@ def _write(file: Any, cloud: CloudLike, sweeps: Sweeps) -> None:
             rotation=np.array([w, x, y, z]),
             translation=sweeps.pose.positions[sweep],
         )
+
+
+@contextmanager
+def _named_by(content: str) -> Iterator[None]:
+    """Have the GUIDs of a file and its scans follow from a text: pye57 draws them by chance."""
+    numbers, drawn = count(), pye57.e57.uuid
+    pye57.e57.uuid = SimpleNamespace(
+        uuid4=lambda: uuid.uuid5(uuid.NAMESPACE_OID, f"{content} {next(numbers)}")
+    )
+    try:
+        yield
+    finally:
+        pye57.e57.uuid = drawn

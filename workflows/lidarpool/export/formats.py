@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from ..base.errors import LidarpoolError
-from ..base.vocabulary import FORMATS, LAYOUTS
-from ..columns.cloud import CloudLike
+from ..base.vocabulary import FORMATS, LAYOUTS, columns_needed
+from ..columns.cloud import Cloud, CloudLike
+from ..columns.parts import StoredCloud
 from ..columns.storage import flush
 from .folder import staging
+from .ply import save_cloud
 from .sweeps import Sweeps
 
 # The module of each that writes it, and what has to be installed for it.
@@ -24,7 +27,7 @@ _MODULES = {
     "pcd": ("pcd", "pcd"),
     "e57": ("e57", "e57"),
     "kitti": ("kitti", ""),
-    "nuscenes": ("kitti", ""),
+    "nuscenes": ("nuscenes", ""),
     "mcap": ("ros", "ros"),
     "rosbag2": ("ros", "ros"),
 }
@@ -35,6 +38,7 @@ _PACKAGES = {
     "e57": ("pye57",),
     "ros": ("rosbags",),
 }
+_ENDINGS = {Path(file).suffix: name for name, (file, _) in FORMATS.items() if "." in file}
 # Columns that are held, of those formats that do not hold all.
 _HELD = {
     "e57": {"intensity"},
@@ -74,6 +78,17 @@ class Format:
             if given not in known:
                 raise LidarpoolError(f"There is no {what} {given!r}: use {', '.join(known)}.")
 
+    @classmethod
+    def of(cls, entry: str | Mapping[str, str]) -> Format:
+        """Return what an entry of a scenario's `output.write` names."""
+        try:
+            fields = {"format": entry} if isinstance(entry, str) else dict(entry)
+            return cls(fields.pop("format"), **fields)
+        except (KeyError, TypeError, ValueError) as error:
+            raise LidarpoolError(
+                f"{entry!r} names no format: give a name, or {{'format': name, 'layout': name}}."
+            ) from error
+
     @property
     def file(self) -> str:
         """Its file or folder in the folder of a result."""
@@ -87,7 +102,7 @@ class Format:
     @property
     def needs(self) -> tuple[str, ...]:
         """Names of the columns that a cloud must have."""
-        return LAYOUTS[self.layout] if self._laid_out else FORMATS[self.name][1]
+        return columns_needed(self.name, self.layout)
 
     def left_out(self, cloud: CloudLike) -> list[str]:
         """Names of the cloud's columns that it cannot hold."""
@@ -158,6 +173,32 @@ class Format:
                 shutil.rmtree(beside, ignore_errors=True)
         except OSError as error:
             raise LidarpoolError(f"{path} cannot be written: {error.strerror or error}.") from error
+
+
+def save(
+    path: Path, cloud: Cloud | StoredCloud, name: str | None, layout: str, precision_m: float | None
+) -> None:
+    """Write a cloud by itself; see `Cloud.save`."""
+    if name is None:
+        name = "ply" if path.suffix == ".ply" else _ENDINGS.get(path.suffix)
+    if name is None:
+        raise LidarpoolError(
+            f"{path} ends as no format does: use .ply, {', '.join(_ENDINGS)}, or give a format."
+        )
+    one = None if name == "ply" else Format(name, layout)
+    sweeps = Sweeps.unknown() if cloud.sweeps is None else cloud.sweeps()
+    sweeps = replace(sweeps, precision_m=precision_m or sweeps.precision_m)
+    if one is None:
+        save_cloud(path, cloud, precision_m=sweeps.precision_m)
+        return
+    if path.is_dir():
+        raise LidarpoolError(f"{path} is a folder: remove it, or give another path.")
+    if cloud.sweeps is None and "scan" in one.needs:
+        raise LidarpoolError(
+            f"{name} stores single sweeps, and this cloud knows of none: save the cloud of a "
+            "Result, or one that was read from the folder of a result."
+        )
+    one.write(path, cloud, sweeps, overwrite=True)
 
 
 def remove(path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Folders of plain binary files: KITTI with the labels of SemanticKITTI, and nuScenes."""
+"""KITTI: folders of binary files with the labels of SemanticKITTI, and boxes of actors."""
 
 from __future__ import annotations
 
@@ -7,11 +7,15 @@ from pathlib import Path
 import numpy as np
 
 from ..base.errors import LidarpoolError
-from ..columns.cloud import CloudLike
+from ..columns.cloud import Cloud, CloudLike
 from ..sensor.trajectory import matrices
-from .sweeps import Sweeps, plain_names
+from .boxes import Boxes, type_of
+from .sweeps import Floats, Sweeps
+from .threads import write_each
 
 INSTANCES_MOST = 65_535
+# From the sensor's axes to KITTI's of a camera: x to the right, y down, z ahead.
+_CAMERA = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 
 
 def write_kitti(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
@@ -19,56 +23,74 @@ def write_kitti(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
 
     In each are `velodyne/000000.bin` (float32 x, y, z in the sensor's axes when the sweep began,
     intensity), `labels/000000.label` (uint32: instance << 16 | class; the instance is the object's
-    number + 1), `poses.txt` (the sensor's, 3 x 4, from its first), `times.txt` in seconds and
-    `calib.txt`, in which camera and lidar have the same axes. KITTI's own tools look for the poses
-    in `poses/00.txt`.
+    number + 1), where there are actors `label_2/000000.txt` (boxes of those that have points),
+    `poses.txt` (3 x 4, from the first), `times.txt` in seconds and `calib.txt`. Poses and boxes
+    are in axes of a camera as KITTI's are, which sits where the sensor does; `Tr` leads to them.
+    KITTI's own tools look for the poses in `poses/00.txt`.
 
     Behley et al., SemanticKITTI, 2019; Geiger et al., 2012.
     """
     if len(sweeps.objects) + len(sweeps.actors) > INSTANCES_MOST:
         raise LidarpoolError(f"KITTI labels hold {INSTANCES_MOST:,} objects at most.")
-    numbers = [0] * len(sweeps.sensors)
-    for sweep, points in enumerate(sweeps.points(cloud)):
-        sensor = int(sweeps.sensor[sweep])
-        folder = path / "sequences" / f"{sensor:02}"
-        if not numbers[sensor]:
-            for name in ("velodyne", "labels"):
-                (folder / name).mkdir(parents=True)
-        number = numbers[sensor]
-        numbers[sensor] += 1
+    folders = [path / "sequences" / f"{sensor:02}" for sensor in range(len(sweeps.sensors))]
+    for folder in folders:
+        for name in ("velodyne", "labels", *(["label_2"] if sweeps.actors else [])):
+            (folder / name).mkdir(parents=True)
+
+    def write(sweep: int, points: Cloud) -> None:
+        folder, name = folders[sweeps.sensor[sweep]], f"{sweeps.numbers[sweep]:06}"
         inside = sweeps.in_sensor(sweep, points.positions)
         rows = np.column_stack([inside, points["intensity"]]).astype("<f4")
-        (folder / "velodyne" / f"{number:06}.bin").write_bytes(rows.tobytes())
+        (folder / "velodyne" / f"{name}.bin").write_bytes(rows.tobytes())
         labels = (points["object"].astype("<u4") + 1) << 16 | points["class"]
-        (folder / "labels" / f"{number:06}.label").write_bytes(labels.tobytes())
-    for sensor in range(len(sweeps.sensors)):
-        folder, own = path / "sequences" / f"{sensor:02}", sweeps.sensor == sensor
+        (folder / "labels" / f"{name}.label").write_bytes(labels.tobytes())
+        if sweeps.actors:
+            lines = _labels(sweeps, sweep, Boxes.of(sweeps, sweep, points))
+            (folder / "label_2" / f"{name}.txt").write_text(lines)
+
+    write_each(write, sweeps.points(cloud))
+    (path / "poses").mkdir()
+    for sensor, folder in enumerate(folders):
+        own = sweeps.sensor == sensor
         turns, places = matrices(sweeps.pose.quaternions[own]), sweeps.pose.positions[own]
-        first = turns[0].T
-        rows = np.concatenate([first @ turns, ((places - places[0]) @ first.T)[..., None]], axis=2)
-        (path / "poses").mkdir(exist_ok=True)
+        first = _CAMERA @ turns[0].T
+        rows = np.concatenate(
+            [first @ turns @ _CAMERA.T, ((places - places[0]) @ first.T)[..., None]], axis=2
+        )
         for file in (folder / "poses.txt", path / "poses" / f"{sensor:02}.txt"):
             np.savetxt(file, rows.reshape(-1, 12), "%.9e")
         np.savetxt(folder / "times.txt", sweeps.begins_ns[own] / 1e9, "%.9e")
-        unit = " ".join(f"{value:.9e}" for value in np.eye(4)[:3].ravel())
         (folder / "calib.txt").write_text(
-            "".join(f"{name}: {unit}\n" for name in ("P0", "P1", "P2", "P3", "Tr"))
+            "".join(f"P{camera}: {_row(np.eye(3))}\n" for camera in range(4))
+            + f"Tr: {_row(_CAMERA)}\n"
         )
 
 
-def write_nuscenes(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
-    """Write `NAME/000000.pcd.bin` for each sweep: float32 x, y, z, intensity (0 to 255), ring.
+def _row(turn: Floats) -> str:
+    """Write a rotation as a 3 x 4 matrix."""
+    return " ".join(f"{value:.9e}" for value in np.column_stack([turn, np.zeros(3)]).ravel())
 
-    NAME is that of the sensor, LIDAR_TOP where it has none. Caesar et al., nuScenes, 2020.
+
+def _labels(sweeps: Sweeps, sweep: int, boxes: Boxes) -> str:
+    """Lines of label_2: nobody has cut or looked at them, and there is no picture.
+
+    The place is the middle of the underside; boxes are turned about the camera's y alone.
     """
-    folders = plain_names(name or "LIDAR_TOP" for name in sweeps.sensors)
-    numbers = [0] * len(sweeps.sensors)
-    for sweep, points in enumerate(sweeps.points(cloud)):
-        sensor = int(sweeps.sensor[sweep])
-        folder = path / folders[sensor]
-        folder.mkdir(parents=True, exist_ok=True)
-        inside = sweeps.in_sensor(sweep, points.positions)
-        light = np.clip(points["intensity"], 0, 1) * 255
-        rows = np.column_stack([inside, light, points["channel"]]).astype("<f4")
-        (folder / f"{numbers[sensor]:06}.pcd.bin").write_bytes(rows.tobytes())
-        numbers[sensor] += 1
+    turn = matrices(sweeps.pose.quaternions[sweep, None])[0]
+    axes = turn.T @ matrices(boxes.quaternions)  # of the actors, in the sensor's
+    under = -axes[:, :, 2] * boxes.sizes[:, 2:] / 2
+    places = (sweeps.pose.inward(sweep, boxes.centres) + under) @ _CAMERA.T
+    around = _wrapped(-np.arctan2(axes[:, 1, 0], axes[:, 0, 0]) - np.pi / 2)
+    seen = _wrapped(around - np.arctan2(places[:, 0], places[:, 2]))
+    lines = []
+    for actor in np.flatnonzero(boxes.points):
+        length, width, height = boxes.sizes[actor]
+        values = (seen[actor], 0, 0, 0, 0, height, width, length, *places[actor], around[actor])
+        numbers = " ".join(f"{value:.4f}" for value in values)
+        lines.append(f"{type_of(sweeps.actors[actor])} 0.00 3 {numbers}\n")
+    return "".join(lines)
+
+
+def _wrapped(angles: Floats) -> Floats:
+    """Angles between -pi and pi."""
+    return np.angle(np.exp(1j * angles))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import date
 from pathlib import Path
 from textwrap import shorten
 from typing import Any
@@ -44,6 +45,7 @@ def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> N
     """
     header = laspy.LasHeader(version="1.4", point_format=6)
     header.generating_software = "lidarpool"
+    header.creation_date = date(1980, 1, 6)  # of GPS time 0, at which surveys begin
     # LAS 1.4 wants it of formats 6 and above, with a coordinate system or without; PDAL before
     # 2.7.2, and what reads through it, opens no others (PDAL's issue 4412).
     header.global_encoding.wkt = True

@@ -8,9 +8,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from ..columns.cloud import CloudLike
+from ..columns.cloud import Cloud, CloudLike
 from ..columns.table import AXES
 from .sweeps import Sweeps
+from .threads import write_each
 
 
 def write_parquet(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
@@ -26,14 +27,15 @@ def write_parquet(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
     ]
     schema = pa.schema(fields, {"coordinates": sweeps.coordinates, "objects": _list(sweeps)})
     path.mkdir()
-    number = -1
-    for number, chunk in enumerate(cloud.chunks()):
+
+    def write(number: int, chunk: Cloud) -> None:
         arrays = [*chunk.positions.T.astype(np.float64), *(chunk[c.name] for c in cloud.table)]
         table = pa.Table.from_arrays(
             [pa.array(np.ascontiguousarray(a)) for a in arrays], schema=schema
         )
         pq.write_table(table, path / f"part-{number:05}.parquet")
-    if number < 0:
+
+    if not write_each(write, cloud.chunks()):
         pq.write_table(schema.empty_table(), path / "part-00000.parquet")
 
 

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 from pypcd4.pypcd4 import Encoding, PointCloud
 
-from ..columns.cloud import CloudLike
+from ..columns.cloud import Cloud, CloudLike
 from .sweeps import Sweeps
+from .threads import write_each
 
 
 def write_pcd(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
@@ -18,7 +19,8 @@ def write_pcd(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
     were in the world. Times are seconds since the sweep began, as float32.
     """
     path.mkdir()
-    for sweep, points in enumerate(sweeps.points(cloud)):
+
+    def write(sweep: int, points: Cloud) -> None:
         inside = sweeps.in_sensor(sweep, points.positions)
         names, arrays = ["x", "y", "z"], list(inside.T.astype(np.float32))
         for column in cloud.table:
@@ -34,3 +36,5 @@ def write_pcd(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
         place = sweeps.pose.positions[sweep].tolist()
         file.metadata.viewpoint = (*place, w, x, y, z)
         file.save(path / f"{sweep:06}.pcd", Encoding.BINARY)
+
+    write_each(write, sweeps.points(cloud))

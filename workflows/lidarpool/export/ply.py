@@ -6,6 +6,7 @@ import os
 import secrets
 import shutil
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,6 +22,7 @@ from ..columns.storage import flush
 from ..columns.table import AXES as POSITION
 from ..columns.table import TABLE, Column, check_names
 from .ply_format import AXES, as_held, header, layout, row_type
+from .sweeps import SWEEPS_FILE, Sweeps
 
 # Single precision positions are kept where they err by less than this part of the precision.
 _ROUNDING_SHARE = 0.05
@@ -74,7 +76,9 @@ def save_cloud(path: str | Path, cloud: CloudLike, *, precision_m: float = 0.01)
 
 
 def read_cloud(path: str | Path) -> Cloud:
-    """Read a point cloud that `save_cloud` wrote, with all columns that it holds.
+    """Read a point cloud that a run or `Cloud.save` wrote as .ply, with all its columns.
+
+    In the folder of a result it knows its sweeps, and can be saved in all formats.
 
     Raises
     ------
@@ -96,7 +100,9 @@ def read_cloud(path: str | Path) -> Cloud:
         for name in rows.dtype.names or ()
         if name not in AXES
     }
-    return Cloud(positions, columns)
+    beside = path.with_name(SWEEPS_FILE)
+    sweeps = partial(Sweeps.load, beside) if beside.exists() else None
+    return Cloud(positions, columns, sweeps=sweeps)
 
 
 def _narrowed(name: str, values: NDArray[Any]) -> NDArray[Any]:

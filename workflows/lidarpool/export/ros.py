@@ -1,4 +1,4 @@
-"""Bags of ROS 2, as MCAP, through rosbags: PointCloud2, /tf and /clock."""
+"""Bags of ROS 2, as MCAP, through rosbags: PointCloud2, /tf, /actors and /clock."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from ..columns.cloud import Cloud, CloudLike
+from .boxes import Boxes
 from .sweeps import Placed, Sweeps, plain_names
 
 WORLD = "map"  # the frame of the world
@@ -56,7 +57,8 @@ def write_mcap(path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str) -> Non
 
     Each sweep is a PointCloud2 on `/NAME/points`, NAME that of its sensor, or on `/points`. Points
     are in the sensor's axes when the sweep began. `/tf` has the frames of sensors and actors in
-    `map`, and `/clock` the time, both at each sweep. The survey begins at time 0.
+    `map`, and `/clock` the time, both at each sweep. The survey begins at time 0. `/actors` has a
+    MarkerArray of the boxes of actors where their points of the sweep are.
 
     Layouts of a point: `velodyne` (22 bytes; its time in seconds since the sweep began),
     `autoware` (PointXYZIRCAEDT, 32 bytes; angles in radians, time_stamp in ns since the sweep
@@ -87,7 +89,8 @@ def _messages(
     make = _Messages(types)
     named = (*(name or "lidar" for name in sweeps.sensors), *sweeps.actors)
     _, *frames = plain_names((WORLD, *named))
-    placed = list(zip(frames[len(sweeps.sensors) :], sweeps.actor_poses, strict=True))
+    actors = frames[len(sweeps.sensors) :]
+    placed = list(zip(actors, sweeps.actor_poses, strict=True))
     for sweep, points in enumerate(sweeps.points(cloud)):
         time_ns = round(sweeps.begins_ns[sweep])
         frame = frames[sweeps.sensor[sweep]]
@@ -100,6 +103,9 @@ def _messages(
             step * len(rows), rows.view(np.uint8).ravel(), True,
         )  # fmt: skip
         yield topic, message, time_ns
+        if actors:
+            boxes = Boxes.of(sweeps, sweep, points)
+            yield "/actors", make.markers(boxes, frame, actors, time_ns), time_ns
 
 
 def _rows(row: np.dtype[np.void], points: Cloud, sweeps: Sweeps, sweep: int) -> NDArray[np.void]:
@@ -161,4 +167,27 @@ class _Messages:
                 ),
             )
             for name, placed in frames
+        ])  # fmt: skip
+
+    def markers(self, boxes: Boxes, sensor: str, actors: list[str], time_ns: int) -> Any:
+        """Boxes of actors as a sensor saw them."""
+        kind, types = "geometry_msgs/msg/", self._types
+        point, turn, pose, vector = (
+            types[f"{kind}{name}"] for name in ("Point", "Quaternion", "Pose", "Vector3")
+        )
+        marker = types["visualization_msgs/msg/Marker"]
+        image = types["sensor_msgs/msg/CompressedImage"]
+        mesh = types["visualization_msgs/msg/MeshFile"]
+        header, none = self.header(WORLD, time_ns), np.empty(0, np.uint8)
+        orange = types["std_msgs/msg/ColorRGBA"](1, 0.6, 0, 0.4)
+        always = types["builtin_interfaces/msg/Duration"](0, 0)
+        return types["visualization_msgs/msg/MarkerArray"]([
+            marker(
+                header, sensor, number, marker.CUBE, marker.ADD,
+                pose(point(*boxes.centres[number].tolist()),
+                     turn(*boxes.quaternions[number].tolist())),
+                vector(*boxes.sizes[number].tolist()), orange, always, False, [], [], "",
+                image(header, "", none), [], name, "", mesh("", none), False,
+            )
+            for number, name in enumerate(actors)
         ])  # fmt: skip

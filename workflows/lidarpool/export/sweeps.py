@@ -7,6 +7,7 @@ import json
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -93,6 +94,20 @@ class Sweeps:
         exact = points.astype(np.float64)
         return exact if self.coordinates == "sensor" else self.pose.inward(sweep, exact)
 
+    @cached_property
+    def numbers(self) -> NDArray[np.int64]:
+        """int64 (n,): number of each sweep among those of its sensor, from 0."""
+        return np.arange(len(self)) - np.searchsorted(self.sensor, self.sensor)
+
+    @classmethod
+    def unknown(cls) -> Sweeps:
+        """Return none at all, for points whose survey nobody knows; in steps of a millimetre."""
+        none = Placed(np.empty((0, 3)), np.empty((0, 4)))
+        return cls(
+            np.zeros(1, np.int64), np.empty(0), np.empty(0, np.uint8), none, (), (), (), (),
+            np.empty((0, 2, 3)), "world", 0.001,
+        )  # fmt: skip
+
     @classmethod
     def of(cls, survey: Survey, scene: Scene) -> Sweeps:
         """Return the sweeps of a survey of a scene."""
@@ -136,12 +151,23 @@ class Sweeps:
         )
 
     def points(self, cloud: CloudLike) -> Iterator[Cloud]:
-        """Give the points of each sweep in order, also of those without any."""
+        """Give the points of each sweep in order, also of those without any.
+
+        Raises
+        ------
+        LidarpoolError
+            If they are not in the order of scans, or of another survey.
+        """
         held: list[Cloud] = []
         empty = Cloud(np.empty((0, 3)), {c.name: np.empty(0, c.dtype) for c in cloud.table})
         current = 0
         for chunk in cloud.chunks():
             sweep = np.searchsorted(self.scans, chunk["scan"], "right") - 1
+            if sweep[0] < current or sweep[-1] >= len(self) or (np.diff(sweep) < 0).any():
+                raise LidarpoolError(
+                    "The points are not in the order of their scans, or not of the survey that "
+                    "the sweeps are of."
+                )
             for first, end in pairwise([0, *(np.flatnonzero(np.diff(sweep)) + 1), len(sweep)]):
                 while current < sweep[first]:
                     yield Cloud.joined(held) if held else empty

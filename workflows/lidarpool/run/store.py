@@ -9,6 +9,7 @@ import tempfile
 import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud
 from ..columns.parts import SUFFIX, StoredCloud, read_part, read_tally
 from ..columns.storage import Storage
+from ..export.sweeps import Sweeps
 from ..scan.database import FILE, RunDatabase, parts_place
 from ..scan.messages import Receipt, samples_of_scan, summary_type
 from .checks import AUTO_TAKES
@@ -224,6 +226,7 @@ class RunStore:
             survey.precision_m,
             self._cloud_origin,
             keeper=self,
+            sweeps=partial(Sweeps.of, survey, self.job.scene),
         )
 
     def points_of_scan(self, scan: int) -> Cloud:

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, Strict, model_validator
 
-from ..base.vocabulary import BACKENDS, FORMATS, LAYOUTS
+from ..base.vocabulary import BACKENDS, FORMATS, LAYOUTS, columns_needed
 from ..columns.table import COORDINATES, OPTIONAL
 from ..scene.transform import Transform
 from ..sensor import Sensor
@@ -336,9 +336,7 @@ class OutputSection(Section):
             name
             for one in self.write
             if one.format != "ply"
-            for name in (
-                LAYOUTS[one.layout] if one.format in ("mcap", "rosbag2") else FORMATS[one.format][1]
-            )
+            for name in columns_needed(one.format, one.layout)
         ]
         return tuple(dict.fromkeys(names))
 

@@ -1,0 +1,75 @@
+"""Boxes of actors in single sweeps: what labels of data sets and markers are made of."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..columns.cloud import Cloud
+from ..sensor.trajectory import matrices
+from .sweeps import Floats, Sweeps
+
+
+@dataclass(frozen=True, eq=False)
+class Boxes:
+    """Boxes of all actors in a sweep, where they were when their points were measured.
+
+    An actor drives on while the head turns. Its box is where it was at the mean time of its
+    points, by their scans, so that it holds them; at the sweep's begin where it has none.
+
+    Parameters
+    ----------
+    centres
+        float64 (a, 3): metres, world coordinates.
+    quaternions
+        float64 (a, 4): x, y, z, w of the rotation from the actor's axes to the world's.
+    sizes
+        float64 (a, 3): length, width and height, metres, along the actor's axes.
+    points
+        int64 (a,): how many points of the sweep are the actor's.
+    """
+
+    centres: Floats
+    quaternions: Floats
+    sizes: Floats
+    points: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, sweeps: Sweeps, sweep: int, points: Cloud) -> Boxes:
+        """Return the boxes of a sweep, whose points are given."""
+        count = len(sweeps.actors)
+        actor = points["object"].astype(np.int64) - len(sweeps.objects)
+        rows = np.flatnonzero(actor >= 0)
+        counts = np.bincount(actor[rows], minlength=count)
+        since = points["scan"][rows] + 0.5 - sweeps.scans[sweep]
+        passed = np.bincount(actor[rows], since, count) / np.maximum(counts, 1)
+        # Poses are known where sweeps of the sensor begin; after the last as before it.
+        own = np.flatnonzero(sweeps.sensor == sweeps.sensor[sweep])
+        before = max(min(sweep, own[-1] - 1), own[0])
+        pair = [before, min(before + 1, own[-1])]
+        share = sweep - before + passed[:, None] / np.diff(sweeps.scans)[own].max()
+        places, turns = (
+            np.array([getattr(pose, what)[pair] for pose in sweeps.actor_poses]).reshape(-1, 2, n)
+            for what, n in (("positions", 3), ("quaternions", 4))
+        )
+        turns[(turns[:, 0] * turns[:, 1]).sum(axis=1) < 0, 1] *= -1
+        place, turn = ((p[:, 0] + share * (p[:, 1] - p[:, 0])) for p in (places, turns))
+        turn /= np.linalg.norm(turn, axis=1, keepdims=True)
+        low, high = sweeps.actor_bounds[:, 0], sweeps.actor_bounds[:, 1]
+        middle = (matrices(turn) @ ((low + high) / 2)[..., None])[..., 0]
+        return cls(place + middle, turn, high - low, counts)
+
+
+def type_of(name: str) -> str:
+    """Type of an actor for labels: its name without a number at the end, and without spaces.
+
+    Examples
+    --------
+    >>> [type_of(name) for name in ("Car 1", "Car.2", "Delivery van", "7")]
+    ['Car', 'Car', 'Delivery_van', '7']
+    """
+    plain = re.sub(r"[\s._-]*\d+$", "", name.strip())
+    return re.sub(r"\s+", "_", plain or name.strip())

@@ -1,0 +1,150 @@
+"""nuScenes: binary files of points, and the tables that nuscenes-devkit reads."""
+
+from __future__ import annotations
+
+import json
+from hashlib import md5
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from ..base.fingerprint import fingerprint
+from ..columns.cloud import Cloud, CloudLike
+from .boxes import Boxes, type_of
+from .sweeps import Sweeps, plain_names
+from .threads import write_each
+
+VERSION = "v1.0-lidarpool"
+_SCENE, _LOG = "scene-0001", "survey"
+_DATE = "1980-01-06"  # surveys begin at time 0 of no date
+_MAP = "maps/none.png"
+
+
+def write_nuscenes(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
+    """Write a data set: `NuScenes("v1.0-lidarpool", path)` of nuscenes-devkit opens it.
+
+    Each sweep is `samples/NAME/000000.pcd.bin`: float32 x, y, z in the sensor's axes when it
+    began, intensity (0 to 255), ring. NAME is that of the sensor, LIDAR_TOP where it has none. The
+    first sensor's sweeps are the samples; of another sensor, the first sweep that begins in a
+    sample is its key frame, and more are in `sweeps/NAME`. The ego vehicle's pose is the
+    sensor's, at each sweep. Actors are annotated in each sample.
+
+    Caesar et al., nuScenes, 2020.
+    """
+    channels = plain_names(name or "LIDAR_TOP" for name in sweeps.sensors)
+    begins = sweeps.begins_ns[sweeps.sensor == 0]
+    sample = np.clip(np.searchsorted(begins, sweeps.begins_ns, "right") - 1, 0, None)
+    first = np.diff(sample, prepend=-1).astype(bool) | (sweeps.numbers == 0)
+    names = [
+        f"{'samples' if key else 'sweeps'}/{channels[sensor]}/{number:06}.pcd.bin"
+        for key, sensor, number in zip(first, sweeps.sensor, sweeps.numbers, strict=True)
+    ]
+    for folder in {(path / name).parent for name in names}:
+        folder.mkdir(parents=True)
+
+    def write(sweep: int, points: Cloud) -> Boxes:
+        inside = sweeps.in_sensor(sweep, points.positions)
+        light = np.clip(points["intensity"], 0, 1) * 255
+        rows = np.column_stack([inside, light, points["channel"]]).astype("<f4")
+        (path / names[sweep]).write_bytes(rows.tobytes())
+        return Boxes.of(sweeps, sweep, points)
+
+    boxes = write_each(write, sweeps.points(cloud))
+    tables = _Tables(sweeps)
+    tables.add_frames(channels, sample, names)
+    counts = np.zeros((len(begins), len(sweeps.actors)), np.int64)
+    for sweep in np.flatnonzero(first):
+        counts[sample[sweep]] += boxes[sweep].points
+    tables.add_actors(boxes[: len(begins)], counts)
+    (path / VERSION).mkdir()
+    for name, rows in tables.rows.items():
+        (path / VERSION / f"{name}.json").write_text(json.dumps(rows, indent=1))
+    (path / _MAP).parent.mkdir()
+    Image.new("L", (1, 1)).save(path / _MAP)  # the devkit looks whether there is one
+
+
+class _Tables:
+    """Tables of a data set; what its rows are called by follows from the survey."""
+
+    def __init__(self, sweeps: Sweeps) -> None:
+        self.sweeps = sweeps
+        self._salt = fingerprint(sweeps)
+        self.rows: dict[str, list[dict[str, Any]]] = {"attribute": [], "visibility": []}
+        self._add("log", _LOG, logfile="", vehicle="", date_captured=_DATE, location="")
+        logs = [self._token("log", _LOG)]
+        self._add("map", _MAP, category="semantic_prior", filename=_MAP, log_tokens=logs)
+
+    def _token(self, table: str, what: object) -> str:
+        return md5(f"{self._salt} {table} {what}".encode(), usedforsecurity=False).hexdigest()
+
+    def _add(self, table: str, what: object, **fields: Any) -> None:
+        self.rows.setdefault(table, []).append({"token": self._token(table, what), **fields})
+
+    def _chain(self, table: str, whats: list[Any]) -> list[dict[str, str]]:
+        """Tokens of the rows before and after each."""
+        tokens = ["", *(self._token(table, what) for what in whats), ""]
+        return [{"prev": a, "next": b} for a, b in zip(tokens, tokens[2:], strict=False)]
+
+    def add_frames(self, channels: list[str], sample: Any, names: list[str]) -> None:
+        """Add the survey, its samples and sensors, and all sweeps."""
+        sweeps = self.sweeps
+        count = int((sweeps.sensor == 0).sum())
+        self._add(
+            "scene", _SCENE, name=_SCENE, description="", nbr_samples=count,
+            log_token=self._token("log", _LOG), first_sample_token=self._token("sample", 0),
+            last_sample_token=self._token("sample", count - 1),
+        )  # fmt: skip
+        times = [round(begin / 1000) for begin in sweeps.begins_ns]  # microseconds
+        for number, beside in enumerate(self._chain("sample", list(range(count)))):
+            scene = self._token("scene", _SCENE)
+            self._add("sample", number, timestamp=times[number], scene_token=scene, **beside)
+        for sensor, channel in enumerate(channels):
+            self._add("sensor", channel, channel=channel, modality="lidar")
+            self._add(
+                "calibrated_sensor", channel, sensor_token=self._token("sensor", channel),
+                translation=[0.0] * 3, rotation=[1.0, 0.0, 0.0, 0.0], camera_intrinsic=[],
+            )  # fmt: skip
+            own = np.flatnonzero(sweeps.sensor == sensor).tolist()
+            for sweep, beside in zip(own, self._chain("sample_data", own), strict=True):
+                x, y, z, w = sweeps.pose.quaternions[sweep].tolist()
+                place = sweeps.pose.positions[sweep].tolist()
+                when = times[sweep]
+                self._add(
+                    "ego_pose", sweep, timestamp=when, rotation=[w, x, y, z], translation=place
+                )
+                self._add(
+                    "sample_data", sweep, sample_token=self._token("sample", sample[sweep]),
+                    ego_pose_token=self._token("ego_pose", sweep),
+                    calibrated_sensor_token=self._token("calibrated_sensor", channel),
+                    timestamp=when, fileformat="pcd", height=0, width=0, filename=names[sweep],
+                    is_key_frame=names[sweep].startswith("samples/"), **beside,
+                )  # fmt: skip
+
+    def add_actors(self, boxes: list[Boxes], counts: Any) -> None:
+        """Add what actors are, and where they were in each sample."""
+        kinds = [type_of(name) for name in self.sweeps.actors]
+        self.rows |= {"category": [], "instance": [], "sample_annotation": []}
+        for kind in dict.fromkeys(kinds):
+            self._add("category", kind, name=kind, description="")
+        for actor, kind in enumerate(kinds):
+            whats = [(actor, number) for number in range(len(boxes))]
+            self._add(
+                "instance", actor, category_token=self._token("category", kind),
+                nbr_annotations=len(boxes),
+                first_annotation_token=self._token("sample_annotation", whats[0]),
+                last_annotation_token=self._token("sample_annotation", whats[-1]),
+            )  # fmt: skip
+            chain = self._chain("sample_annotation", whats)
+            for number, (box, beside) in enumerate(zip(boxes, chain, strict=True)):
+                x, y, z, w = box.quaternions[actor].tolist()
+                length, width, height = box.sizes[actor].tolist()
+                self._add(
+                    "sample_annotation", (actor, number),
+                    sample_token=self._token("sample", number),
+                    instance_token=self._token("instance", actor), visibility_token="",
+                    attribute_tokens=[], translation=box.centres[actor].tolist(),
+                    size=[width, length, height], rotation=[w, x, y, z],
+                    num_lidar_pts=int(counts[number, actor]), num_radar_pts=0, **beside,
+                )  # fmt: skip
