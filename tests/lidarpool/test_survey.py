@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tests.lidarpool.casting import Cart
 
-from lidarpool import LidarpoolError, Pose, Sensor, Spin, Survey
+from lidarpool import LidarpoolError, Mounted, Pose, Sensor, Spin, Survey, Track
 from lidarpool.sensor import Stations
 
 
@@ -78,3 +78,32 @@ def test_rotation_is_yaw_then_pitch_then_roll():
 def test_values_out_of_range_say_which(arguments, message):
     with pytest.raises(LidarpoolError, match=message):
         Survey(**({"poses": [(0, 0, 0)]} | arguments))
+
+
+def test_each_sensor_may_start_later_and_take_steps_of_its_own():
+    way = Track([0, 10], [[0, 0, 1], [20, 0, 1]])
+    head = Spin(100, step_deg=36, rate_hz=10)
+    late = Mounted(Sensor(head=head, start_ns=2e9), name="late", steps=20)
+    survey = Survey(trajectory=way, sensors=[Mounted(Sensor(head=head), name="all"), late])
+    assert survey.steps_each == (1000, 20)
+    first, last = survey.scan(1000), survey.scan(1019)
+    assert (first.sensor, first.firings, last.firings) == (1, (0, 10), (190, 200))
+    assert survey.begins_ns(1000) == 2e9 and survey.begins_ns(1019) == pytest.approx(2.19e9)
+    assert survey.pose(1000).position == pytest.approx((4, 0, 1))
+    until = Survey(trajectory=way, sensors=[replace(late, steps=None)])
+    assert until.steps_each == (800,)
+    with pytest.raises(
+        LidarpoolError, match=r"steps 900 take until 10[.]99.* trajectory lasts 10 s"
+    ):
+        Survey(trajectory=way, sensors=[replace(late, steps=900)])
+    with pytest.raises(LidarpoolError, match="steps is 0"):
+        Survey(trajectory=way, sensors=[replace(late, steps=0)])
+    with pytest.raises(LidarpoolError, match="start_ns is -1"):
+        Sensor(start_ns=-1)
+
+
+@pytest.mark.parametrize("pitch", [90, -90])
+@pytest.mark.parametrize("yaw", [0, 30, 200])
+def test_a_pose_that_looks_straight_up_or_down_is_found_again(yaw, pitch):
+    turned = Pose((0, 0, 0), yaw, pitch, 20).rotation
+    assert np.allclose(Pose.of((1, 2, 3), turned).rotation, turned, atol=1e-12)

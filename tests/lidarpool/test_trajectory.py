@@ -115,7 +115,7 @@ class TestSurveys:
         assert Survey(Sensor.grid(), steps=5, trajectory=self.track).scan_count == 5
 
     def test_no_more_than_it_lasts(self):
-        with pytest.raises(LidarpoolError, match=r"steps 400 take 1.111.* s, 0.061.* s less"):
+        with pytest.raises(LidarpoolError, match=r"steps 400 take until 1.111.* s, 0.061.* s less"):
             Survey(Sensor.grid(rate_hz=10), steps=400, trajectory=self.track)
         with pytest.raises(LidarpoolError, match="one time step"):
             Survey(Sensor.grid(rate_hz=0.01), trajectory=self.track)

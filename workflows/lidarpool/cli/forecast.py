@@ -175,7 +175,8 @@ def _drive(survey: Survey) -> dict[str, Any] | None:
     for carried, steps in zip(survey.carried, survey.steps_each, strict=True):
         firings = carried.sensor.firings(steps - 1)[1]
         rate_hz = getattr(carried.sensor.head, "rate_hz", None)
-        turns = rate_hz and seconds * rate_hz
+        on_ns = carried.sensor.begins_ns(np.array([firings])).item() - carried.sensor.start_ns
+        turns = rate_hz and on_ns / 1e9 * rate_hz
         sensors.append(
             {
                 "name": carried.name,
@@ -184,7 +185,7 @@ def _drive(survey: Survey) -> dict[str, Any] | None:
                 "scans": steps * survey.path.stations,
                 "firings": firings * survey.path.stations,
                 "turns": turns,
-                "metres_a_turn": turns and metres / turns,
+                "metres_a_turn": rate_hz and metres / seconds / rate_hz,
             }
         )
     return {"seconds": seconds, "metres": metres, "sensors": sensors}

@@ -263,12 +263,12 @@ def plain_names(names: Iterable[str]) -> list[str]:
 
 
 def _of_head(sensor: Sensor, steps: int) -> tuple[NDArray[np.int64], Floats]:
-    """First time step of each sweep of so many, and when they begin since the head started."""
+    """First time step of each sweep of so many, and when they begin since the station did."""
     begins = sensor.begins_ns(np.array([sensor.firings(step)[0] for step in range(steps)]))
     rate_hz = getattr(sensor.head, "rate_hz", None)
     if rate_hz is None:  # a head of one's own: nobody knows when it has been everywhere
         return np.arange(steps), begins + sensor.lead_ns
-    turn = np.floor(begins * (rate_hz / 1e9) + 1e-6)
+    turn = np.floor((begins - sensor.start_ns) * (rate_hz / 1e9) + 1e-6)
     firsts = np.flatnonzero(np.diff(turn, prepend=-1))
     return firsts, begins[firsts] + sensor.lead_ns
 

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from pydantic import Field, Strict, model_validator
 
 from ..base.errors import LidarpoolError
-from ..sensor import Pose, Track, load_trajectory
+from ..sensor import Mounted, Pose, Track, load_trajectory
+from ..sensor.survey import STEPS_MOST
 from ..sensor.trajectory_files import FORMATS, quaternions_from_degrees
 from .sections import (
     Angle,
@@ -43,9 +44,22 @@ class MountSection(Section):
 
 
 class CarriedSection(SensorSection):
-    """One of several sensors, and where it sits."""
+    """One of several sensors, where it sits, and when it scans."""
 
     mount: MountSection = MountSection()
+    start_s: Annotated[
+        float,
+        Field(ge=0, le=1e9, description="when it starts, seconds after the survey, or its station"),
+    ] = 0.0
+    steps: Annotated[
+        Annotated[int, Field(ge=1, le=STEPS_MOST)] | None,
+        Field(description="its time steps (scans), in place of the survey's", examples=[120]),
+    ] = None
+
+    def mounted(self, folder: Path, name: str) -> Mounted:
+        """Return it on its carrier; LidarpoolError if its files cannot be used."""
+        sensor = replace(self.sensor(folder), start_ns=self.start_s * 1e9)
+        return Mounted(sensor, self.mount.pose(), name, self.steps)
 
 
 class TimedPose(PoseSection):

@@ -359,8 +359,7 @@ class Scenario(Section):
             return {"sensors": [Mounted(self.sensor.sensor(self._folder), self.mount.pose())]}
         return {
             "sensors": [
-                Mounted(section.sensor(self._folder), section.mount.pose(), name)
-                for name, section in self.sensors.items()
+                section.mounted(self._folder, name) for name, section in self.sensors.items()
             ]
         }
 

@@ -116,5 +116,5 @@ class ListedSensor(Sensor):
     def begins_ns(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
         """See `Sensor.begins_ns`."""
         cycles, shots = np.divmod(firings, len(self.rays))
-        times: NDArray[np.float64] = cycles * self.cycle_ns + self.shot_ns[shots]
+        times: NDArray[np.float64] = self.start_ns + cycles * self.cycle_ns + self.shot_ns[shots]
         return times

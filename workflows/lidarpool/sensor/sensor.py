@@ -33,11 +33,13 @@ class Sensor:
         Of the model, for reports; by default that of the class.
     optics
         Its light, and how finely it reports.
+    start_ns
+        When its head starts, nanoseconds after the survey, or the station, begins.
 
     Raises
     ------
     LidarpoolError
-        If a range is out of bounds.
+        If a range or the start is out of bounds.
 
     Examples
     --------
@@ -52,12 +54,14 @@ class Sensor:
     max_range_m: float = float("inf")
     name: str = ""
     optics: Optics = field(default_factory=Optics)
+    start_ns: float = 0.0
     cycle: ClassVar[str] = "turn"  # what is done so many times a second, in a word
 
     def __post_init__(self) -> None:
         checks = (
             ("min_range_m", 0 <= self.min_range_m < float("inf"), "finite, at least 0"),
             ("max_range_m", self.max_range_m > self.min_range_m, "above min_range_m"),
+            ("start_ns", 0 <= self.start_ns < float("inf"), "finite, at least 0"),
         )
         for name, good, allowed in checks:
             if not good:
@@ -200,11 +204,11 @@ class Sensor:
         return out if self.axes is None else out @ self.axes.T
 
     def begins_ns(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
-        """When firings (k,) begin, since the head started: (k,)."""
-        return self.head.times_ns(firings)
+        """When firings (k,) begin, since the station did: (k,)."""
+        return self.start_ns + self.head.times_ns(firings)
 
     def times_ns(self, firings: NDArray[np.int64]) -> NDArray[np.int64]:
-        """When the rays of firings (k,) are fired, since the head started: (k, channels)."""
+        """When the rays of firings (k,) are fired, since the station began: (k, channels)."""
         times = self.begins_ns(firings)[:, None] + self.beams.time_ns
         return np.rint(times).astype(np.int64)
 

@@ -35,11 +35,14 @@ class Mounted:
         Where it sits and how it is turned, in the carrier's axes.
     name
         What it is called where there are several.
+    steps
+        Time steps from each station; by default those of the survey.
     """
 
     sensor: Sensor
     mount: Pose = CENTRE
     name: str = ""
+    steps: int | None = None
 
 
 @dataclass(frozen=True)
@@ -172,8 +175,9 @@ class Survey:
         check_numbers(self, {"visibility_km": (1e-3, 1e6)})
         for carried in self.carried:
             self.returns.of(carried.sensor.optics)  # LidarpoolError if they do not fit together
-        for name, least in (("keep_every", 1), ("precision_m", 1e-6), ("steps", 1)):
-            value = getattr(self, name)
+        limits = [("keep_every", 1), ("precision_m", 1e-6), ("steps", 1)]
+        values = [(name, getattr(self, name), least) for name, least in limits]
+        for name, value, least in [*values, *(("steps", c.steps, 1) for c in self.carried)]:
             if value is not None and not least <= value < float("inf"):
                 raise LidarpoolError(f"{name} is {value}; it must be at least {least}.")
         if self.steps is None and self.path.duration_ns == float("inf"):
@@ -182,9 +186,9 @@ class Survey:
             needed, there = _end_ns(carried.sensor, steps) / 1e9, self.path.duration_ns / 1e9
             if needed > there:
                 raise LidarpoolError(
-                    f"steps {steps} take {needed:.6g} s and the trajectory lasts {there:.6g} s, "
-                    f"{needed - there:.6g} s less: take fewer steps, or leave them out for as many "
-                    "as it lasts."
+                    f"steps {steps} take until {needed:.6g} s and the trajectory lasts "
+                    f"{there:.6g} s, {needed - there:.6g} s less: take fewer steps, or leave them "
+                    "out for as many as it lasts."
                 )
 
     @cached_property
@@ -215,17 +219,18 @@ class Survey:
     @cached_property
     def steps_each(self) -> tuple[int, ...]:
         """Time steps of each sensor from each station."""
-        if self.steps is not None:
-            return (self.steps,) * len(self.carried)
         counts = []
-        for sensor in (carried.sensor for carried in self.carried):
+        for carried in self.carried:
+            if given := carried.steps or self.steps:
+                counts.append(given)
+                continue
             lasts = range(1, STEPS_MOST + 1)
-            ends = partial(_end_ns, sensor)
+            ends = partial(_end_ns, carried.sensor)
             counts.append(bisect_right(lasts, self.path.duration_ns, key=ends))
             if not counts[-1]:
                 raise LidarpoolError(
                     f"The trajectory lasts {self.path.duration_ns / 1e9:.6g} s, and one time step "
-                    f"of the sensor takes {ends(1) / 1e9:.6g} s."
+                    f"of the sensor takes until {ends(1) / 1e9:.6g} s."
                 )
         return tuple(counts)
 

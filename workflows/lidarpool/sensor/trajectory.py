@@ -69,9 +69,13 @@ class Pose:
         place = tuple(np.asarray(position, np.float64).tolist())
         if rotation is None:
             return cls(place)
-        yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
-        pitch = -np.arcsin(np.clip(rotation[2, 0], -1, 1))
-        roll = np.arctan2(rotation[2, 1], rotation[2, 2])
+        level = np.hypot(rotation[0, 0], rotation[1, 0])
+        pitch = np.arctan2(-rotation[2, 0], level)
+        if level > 1e-9:
+            yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
+            roll = np.arctan2(rotation[2, 1], rotation[2, 2])
+        else:  # straight up or down, where yaw and roll are about one axis
+            yaw, roll = np.arctan2(-rotation[0, 1], rotation[1, 1]), 0.0
         return cls(place, *np.degrees([yaw, pitch, roll]).tolist())
 
 
