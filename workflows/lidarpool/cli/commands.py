@@ -27,6 +27,7 @@ from ..base.vocabulary import PATIENCE_S, WAIT_S
 from . import options
 from .check_command import check
 from .export_command import export
+from .import_command import import_
 from .logs import set_logs
 from .plot_command import plot
 from .scenario_commands import init, schema
@@ -89,7 +90,7 @@ def cli() -> None:
     """Simulate lidar surveys on a partitioned Dask cluster."""
 
 
-for _command in (init, check, schema, scene, sensors, view, plot, export):
+for _command in (init, import_, check, schema, scene, sensors, view, plot, export):
     cli.add_command(_command)
 
 

@@ -32,6 +32,12 @@ def floor_under(scene: Scene, x: float, y: float) -> float:
     return float(scene.bounds[0, 2] + scene.origin[2])
 
 
+def heights_at(scene: Scene, x: float, y: float) -> NDArray[np.float64]:
+    """Heights (k,), world metres, at which a vertical line at a place crosses triangles."""
+    heights, _ = _crossings(scene, np.array([x, y]) - scene.origin[:2])
+    return heights + scene.origin[2]
+
+
 def _crossings(
     scene: Scene, at: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:

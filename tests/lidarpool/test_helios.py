@@ -1,0 +1,371 @@
+"""Surveys of HELIOS++: their scenarios fire the pulses that its own formulas give."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from lidarpool import LidarpoolError
+from lidarpool.cli.import_command import import_
+from lidarpool.scan.rig import Rig, RigPlan
+from lidarpool.scenario.helios import import_survey
+
+X, Y, Z = np.eye(3)
+SQUARE = "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nf 1 2 3\nf 1 3 4\n"
+MOUNT = '<scannerMount z="0.5"><rot axis="x" angle_deg="-90"/><rot axis="z" angle_deg="80"/>'
+PLANE = f'<platform id="plane" type="linearpath">{MOUNT}</scannerMount></platform>'
+TRIPOD = '<platform id="tripod" type="static"><scannerMount z="1.5"/></platform>'
+EMITTER = '<beamOrigin y="0.1"><rot axis="x" angle_deg="10"/><rot axis="z" angle_deg="20"/>'
+GROUND = """<scene id="field"><part>
+  <filter type="objloader"><param type="string" key="filepath" value="parts/ground.obj"/></filter>
+  <filter type="scale"><param type="double" key="scale" value="100"/></filter>
+  <filter type="translate"><param type="vec3" key="offset" value="5;0;2"/></filter>
+</part></scene>"""
+ON_GROUND = "newmtl soil\nhelios_isGround true\nhelios_classification 2\nhelios_reflectance 0.3\n"
+
+
+def scanner(optics, inside=EMITTER + "</beamOrigin>", **values):
+    given = {"scanFreqMin_Hz": 1, "scanFreqMax_Hz": 200, "pulseFreqs_Hz": "1000"} | values
+    attributes = " ".join(f'{name}="{value}"' for name, value in given.items())
+    return f'<scanner id="s" name="S/1" optics="{optics}" {attributes}>{inside}</scanner>'
+
+
+def legs(settings, *places, platform='movePerSec_m="10"'):
+    return "".join(
+        f'<leg><platformSettings x="{x}" y="{y}" z="50" {platform}/>'
+        f"<scannerSettings {settings}/></leg>"
+        for x, y in places or ((0, 0), (3, 4))
+    )
+
+
+@pytest.fixture
+def survey(tmp_path):
+    """Write a survey, with all that it names, in a folder of its own."""
+
+    def write(
+        device, inside, scene=GROUND, platform="plane", around="", names="", parts=()
+    ) -> Path:
+        root = tmp_path / "helios"
+        (root / "parts").mkdir(parents=True, exist_ok=True)
+        (root / "deep").mkdir(exist_ok=True)
+        (root / "parts" / "ground.obj").write_text("mtllib g.mtl\nusemtl soil\n" + SQUARE)
+        (root / "parts" / "g.mtl").write_text(ON_GROUND)
+        for name, text in dict(parts).items():
+            (root / "parts" / name).write_text(text)
+        (root / "devices.xml").write_text(f"<document>{device}{PLANE}{TRIPOD}</document>")
+        path = root / "deep" / "fly.xml"
+        if platform != "interpolated":
+            platform = f"devices.xml#{platform}"
+        path.write_text(
+            f'<?xml version="1.0"?><document>{around}<survey name="fly" scene="deep/fly.xml#field" '
+            f'platform="{platform}" scanner="devices.xml#s" {names}>{inside}</survey>{scene}'
+            "</document>"
+        )
+        return path
+
+    return write
+
+
+@pytest.fixture
+def imported(survey, tmp_path):
+    """Import a survey; return what was written, its scene and survey."""
+
+    def run(*given, **named):
+        made = import_survey(survey(*given, **named), tmp_path / "out")
+        scene = made.scenario.build_scene()
+        return made, scene, made.scenario.survey(scene)
+
+    return run
+
+
+def about(axis, degrees):
+    """Rotation by the formula of Rodrigues, written out another way than in the importer."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return c * np.eye(3) + s * cross + (1 - c) * np.outer(axis, axis)
+
+
+def fired(made, number, firings):
+    """Directions in the world of firings of a sensor: (k, channels, 3)."""
+    carried, path = made.carried[number], made.path
+    firings = np.asarray(firings)
+    _, turns = path.poses(0, carried.sensor.begins_ns(firings))
+    mount = np.eye(3) if carried.mount.rotation is None else carried.mount.rotation
+    return np.einsum("kij,kcj->kci", turns @ mount, carried.sensor.directions(firings))
+
+
+def expected(deflected, head=0.0):
+    """HELIOS++'s product of rotations for the mount and emitter above, heading for (3, 4)."""
+    platform = about(Z, np.degrees(np.arctan2(4, 3)) - 90)
+    mount = about(Z, 80) @ about(X, -90)
+    emitter = about(Z, 20) @ about(X, 10)
+    return np.array([platform @ mount @ about(Z, head) @ emitter @ d @ Y for d in deflected])
+
+
+PULSES = np.array([0, 1, 7, 19])
+
+
+def test_a_cone_is_that_of_helios(imported):
+    device = scanner("conic", scanAngleMax_deg=25, scanFreqMax_Hz=10)
+    settings = 'pulseFreq_hz="1000" scanAngle_deg="20" headRotateStart_deg="30"'
+    made, scene, of = imported(device, legs(settings))
+    there = [about(Y, 3.6 * k) @ about(X, 20) for k in PULSES]
+    assert np.allclose(fired(of, 0, PULSES)[:, 0], expected(there, 30), atol=1e-9)
+    assert of.ray_count == 500  # 5 m at 10 m/s
+    assert of.carried[0].sensor.name == "S/1" and made.path.with_name("s_1.yaml").is_file()
+    # Where mount and emitter sit does not turn with the platform.
+    assert np.allclose(of.path.pose(0).position + scene.origin, [0, 0.1, 50.5])
+
+
+def test_a_polygon_fires_the_pulses_of_helios_within_its_angles(imported):
+    device = scanner("rotating", scanAngleMax_deg=60, scanAngleEffectiveMax_deg=45)
+    _, _, of = imported(device, legs('pulseFreq_hz="1000" scanAngle_deg="30" scanFreq_hz="30"'))
+    # 33.33 pulses a line: it begins anew after 34, at -60 degrees.
+    angles = np.array([-60 + 3.6 * k for k in range(34)])
+    kept = np.flatnonzero((angles > -30) & (angles <= 30))
+    sensor = of.carried[0].sensor
+    times = sensor.begins_ns(np.arange(len(kept) + 1))
+    assert np.allclose(np.diff(times), [1e6] * (len(kept) - 1) + [(35 - len(kept)) * 1e6])
+    there = [about(X, angle) for angle in angles[kept]]
+    assert np.allclose(fired(of, 0, np.arange(len(kept)))[:, 0], expected(there), atol=1e-9)
+
+
+def test_a_swinging_mirror_and_fibres_are_those_of_helios(imported, tmp_path):
+    settings = 'pulseFreq_hz="1000" scanAngle_deg="30" scanFreq_hz="10"'
+    _, _, of = imported(scanner("oscillating", scanProduct=200), legs(settings))
+    there = [about(X, 20 * (abs(4 * (k % 100) / 100 - 2) * -1 + 1)) for k in PULSES]
+    assert np.allclose(fired(of, 0, PULSES)[:, 0], expected(there), atol=1e-9)
+    (tmp_path / "out").rename(tmp_path / "one")
+    _, _, of = imported(scanner("line", numFibers=12, scanAngleMax_deg=30), legs(settings))
+    there = [about(X, -30 + 5 * (k % 12)) for k in PULSES]
+    assert np.allclose(fired(of, 0, PULSES)[:, 0], expected(there), atol=1e-9)
+
+
+@pytest.mark.parametrize("signs", [(1, -1), (-1, 1)])
+def test_two_prisms_are_those_of_helios(imported, signs):
+    rates, wedge, index = (-77.7, 121.6), np.radians(18), 1.51
+    values = {f"rotorFreq{i + 1}_Hz": rates[i] for i in (0, 1)}
+    values |= {f"angle{i + 1}_deg": 18 * signs[i] for i in (0, 1)}
+    _, _, of = imported(
+        scanner("risley", refrIndex1=index, refrIndex2=index, **values),
+        legs('pulseFreq_hz="1000"'),
+    )
+
+    def refracted(ray, normal, ratio):  # normals against the ray, as its code has them
+        cosine = -ray @ normal
+        return ratio * ray + (ratio * cosine - np.sqrt(1 - ratio**2 * (1 - cosine**2))) * normal
+
+    rays = []
+    for pulse in PULSES:
+        ray = Y
+        for sign, rate in zip(signs, rates, strict=True):
+            angle = 2 * np.pi * rate * pulse / 1000
+            slope = sign * np.array([np.sin(angle), 0, np.cos(angle)]) * np.sin(wedge)
+            faces = [slope - np.cos(wedge) * Y, -Y]
+            for face, ratio in zip(faces[::sign], (1 / index, index), strict=True):
+                ray = refracted(ray, face, ratio)
+        rays.append(ray)
+    platform, mount = about(Z, np.degrees(np.arctan2(4, 3)) - 90), about(Z, 80) @ about(X, -90)
+    turn = platform @ mount @ about(Z, 20) @ about(X, 10)
+    assert np.allclose(fired(of, 0, PULSES)[:, 0], np.array(rays) @ turn.T, atol=1e-9)
+
+
+def test_a_head_turns_from_start_to_stop_while_its_mirror_draws_lines(imported):
+    device = scanner(
+        "rotating",
+        '<beamOrigin z="0.2"><rot axis="x" angle_deg="5"/></beamOrigin>',
+        scanAngleMax_deg=120,
+        scanAngleEffectiveMax_deg=50,
+        headRotatePerSecMax_deg=60,
+    )
+    head = 'headRotatePerSec_deg="12" headRotateStart_deg="{}" headRotateStop_deg="{}"'
+    common = 'pulseFreq_hz="1000" scanFreq_hz="20" verticalAngleMin_deg="-40" '
+    upright = common + 'verticalAngleMax_deg="60" '
+    inside = legs(upright + head.format(0, 25), (0, 0), platform='onGround="true"')
+    inside += legs(common + head.format(90, 60).replace('"12"', '"-12"'), (3, 4))
+    inside += legs(common + head.format(90, 60).replace('"12"', '"-12"') + ' active="0"', (3, 4))
+    _, scene, of = imported(device, inside, platform="tripod")
+    elevations = [-120 + 4.8 * k for k in range(50)]
+    kept = [e for e in elevations if -40 < e <= 60]
+    assert [carried.name for carried in of.carried] == ["leg0", "leg1"]
+    assert of.steps_each == (3, 3)
+    for line in (0, 1, 41):
+        made = fired(of, 0, [line])[0]
+        for channel, elevation in enumerate(kept):
+            turned = 12 * (line * 50 + channel) / 1000
+            assert np.allclose(made[channel], about(Z, turned) @ about(X, elevation + 5) @ Y)
+    back = fired(of, 1, [0])[0]
+    assert np.allclose(back[0], about(Z, 90) @ about(X, elevations[17] + 5) @ Y)
+    lines = of.carried[1].sensor.firings(2)[1]
+    assert lines == 50 and of.scan(3).firings == (0, 17)  # 30 degrees at 12 a second, 20 lines
+    last = fired(of, 1, [49])[0, 0]
+    assert np.allclose(last, about(Z, 90 - 12 * 49 / 20) @ about(X, elevations[17] + 5) @ Y)
+    starts = [of.pose(scan).position + scene.origin for scan in (0, 3)]
+    assert np.allclose(starts, [[0, 0, 2 + 1.7], [3, 4, 51.7]])
+    assert of.begins_ns(3) == pytest.approx((25 / 12 + 0.001) * 1e9)
+
+
+def test_angular_resolutions_set_the_rates(imported):
+    device = scanner(
+        "rotating",
+        "",
+        scanAngleMax_deg=90,
+        scanAngleEffectiveMax_deg=50,
+        headRotatePerSecMax_deg=99,
+    )
+    fine = 'pulseFreq_hz="9000" verticalResolution_deg="2" horizontalResolution_deg="0.5" '
+    ends = 'headRotateStart_deg="0" headRotateStop_deg="50"'
+    made, _, of = imported(device, legs(fine + ends, (0, 0)), platform="tripod")
+    head = of.carried[0].sensor.head
+    assert head.firings_per_turn == pytest.approx(720) and head.rate_hz == pytest.approx(50 / 360)
+    assert of.ray_count == 100 * 50  # lines half a degree apart, of -48 to 50 degrees by 2
+    assert made.scenario.sensors["leg0"].steps == 5
+
+
+def test_the_cloud_of_a_flight_lies_on_the_ground_and_knows_its_legs(imported):
+    template = '<scannerSettings id="t" pulseFreq_hz="1000" scanAngle_deg="20" active="true"/>'
+    template += '<platformSettings id="p" movePerSec_m="10"/>'
+    device = scanner("conic", "", scanAngleMax_deg=20, scanFreqMax_Hz=10, accuracy_m=0.01, maxNOR=3)
+    inside = "".join(
+        f'<leg><platformSettings template="p" x="{x}" y="{y}" z="20"/>'
+        f'<scannerSettings template="t" active="{active}"/></leg>'
+        for x, y, active in ((0, 0, 1), (10, 0, 0), (10, 10, "true"), (0, 10, 1))
+    )
+    inside = '<FWFSettings beamSampleQuality="2"/><detectorSettings accuracy_m="0"/>' + inside
+    made, scene, of = imported(device, inside, around=template)
+    assert made.scenario.returns.subrays == 7 and made.scenario.noise.range_m == 0
+    assert made.left_out == ["maxNOR=3 of S/1: all returns of a pulse are kept"]
+    (batch,) = Rig(RigPlan(scene, of, "numpy")).cast(0, 3)
+    columns = {column.name: column.make(batch) for column in of.stored_columns}
+    assert np.ptp(columns["z"]) <= 1 and len(columns["z"]) == 300
+    assert np.allclose(columns["range"], 18.5 / np.cos(np.radians(20)), atol=0.01)
+    assert of.scan_count == 20 and of.begins_ns(10) == pytest.approx(2.002e9)
+
+
+def test_parts_turn_grow_move_and_fall_as_in_helios(imported):
+    scene = GROUND.replace(
+        "</scene>",
+        """<part><filter type="objloader">
+  <param type="string" key="efilepath" value="parts/box_.*[.]obj"/>
+  <param type="string" key="up" value="y"/></filter>
+  <filter type="translate"><param type="integer" key="onGround" value="1"/>
+    <param type="vec3" key="offset" value="1;2;30"/></filter>
+  <filter type="scale"><param type="double" key="scale" value="2"/></filter>
+  <filter type="rotate"><param type="rotation" key="rotation">
+    <rot axis="x" angle_deg="90"/><rot axis="z" angle_deg="90"/></param></filter>
+</part></scene>""",
+    )
+    device = scanner("conic", "", scanAngleMax_deg=20, scanFreqMax_Hz=10)
+    boxes = {f"box_{n}.obj": f"o B{n}\nv 0 0 0\nv {n} 0 0\nv 0 3 0\nf 1 2 3\n" for n in (1, 2)}
+    made, built, _ = imported(device, legs('pulseFreq_hz="1000"'), scene, parts=boxes)
+    assert built.names == ("ground", "B1", "B2")
+    low, high = np.moveaxis(built.object_bounds + built.origin, 1, 0)
+    # Up is y: (x, y, z) -> (x, -z, y); then x, then z turn, twice as large, onto the ground at 2.
+    assert np.allclose(low[1:], [[1, 2, 2], [1, 2, 2]])
+    assert np.allclose(high[1:], [[7, 4, 2], [7, 6, 2]])
+    ground = made.scenario.materials[0]
+    assert (ground.objects, ground.reflectance, ground.semantic_class) == (("ground",), 0.3, 2)
+
+
+def test_a_trajectory_of_its_own_is_followed(imported):
+    rows = "".join(f"{t},{a},0,{90 + a},{10 * t},2,30\n" for t, a in ((5, 0), (6, 4), (7, 8)))
+    names = '#HEADER: "t", "roll", "pitch", "yaw", "x", "y", "z"\n'
+    inside = '<scannerMount z="0.5"/>' + "".join(
+        f'<leg><platformSettings trajectory="parts/way.trj" {times}/>'
+        '<scannerSettings pulseFreq_hz="1000" scanAngle_deg="20"/></leg>'
+        for times in ("", 'tStart="6" tEnd="6.5"')
+    )
+    made, scene, of = imported(
+        scanner("conic", "", scanAngleMax_deg=20, scanFreqMax_Hz=10),
+        inside,
+        platform="interpolated",
+        parts={"way.trj": names + rows},
+    )
+    assert (made.path.parent / "trajectory.tum").is_file()
+    assert [c.sensor.start_ns for c in of.carried] == [0, 1e9]
+    assert [of.scan(s).firings[1] for s in (19, 24)] == [2000, 500]
+    assert np.allclose(of.pose(20).position + scene.origin, [60, 2, 30.5])
+    platform = about(-Z, 94) @ about(Y, 4)  # ARINC 705
+    assert np.allclose(fired(of, 1, [0])[0, 0], platform @ about(X, 20) @ Y)
+
+
+def test_what_is_not_taken_over_is_named(imported, survey, tmp_path):
+    scene = GROUND.replace(
+        "</scene>",
+        """<part><filter type="xyzloader"><param key="filepath" type="string" value="p.xyz"/>
+</filter></part></scene>""",
+    ).replace("</part>", '<dmotion id="m"/></part>', 1)
+    device = scanner("rotating", scanAngleMax_deg=60, scanAngleEffectiveMax_deg=60)
+    device = device.replace("</scanner>", '<deflectionError expr="1"/></scanner>')
+    inside = '<positionXNoise type="NORMAL"/>' + legs('pulseFreq_hz="1000" scanFreq_hz="30"')
+    result = CliRunner().invoke(
+        import_, [str(survey(device, inside, scene)), "-o", str(tmp_path / "out")]
+    )
+    assert result.exit_code == 0, result.output
+    told = [line for line in result.output.splitlines() if line.startswith("not taken over: ")]
+    assert told == [
+        "not taken over: noise of the platform: positionXNoise",
+        "not taken over: <deflectionError> of S/1: errors by a formula",
+        "not taken over: <dmotion> of part 0: it stands as it is at first",
+        "not taken over: part 1, xyzloader of p.xyz: no triangles, left out",
+    ]
+    head = (tmp_path / "out" / "scenario.yaml").read_text().splitlines()
+    assert head[1:5] == [f"# N{line[1:]}." for line in told]
+    again = CliRunner().invoke(import_, [str(survey(device, inside)), "-o", str(tmp_path / "out")])
+    assert "is there already" in str(again.exception)
+
+
+LASER = scanner("conic", "", scanAngleMax_deg=20, scanFreqMax_Hz=10)
+FLY = legs('pulseFreq_hz="1000"')
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("<survey", "<survey <"), "fly.xml is no XML that can be read"),
+        (("document>", "kml>"), "fly.xml is XML, but not of HELIOS[+][+]"),
+        (("survey", "route"), "it has no <survey>"),
+        (("devices.xml#s", "devices.xml#t"), "no <scanner> 't' in .*devices.xml"),
+        (("devices.xml#s", "lasers.xml#s"), "no file 'lasers.xml'.*--assets"),
+        (('scanner="devices.xml#s"', ""), "names no scanner"),
+        (("deep/fly.xml#field", "deep/fly.xml#wood"), "no <scene> 'wood'"),
+        (("ground.obj", "grund.obj"), "scene 'field', part 0: there is no file .*grund.obj"),
+        (("objloader", "objreader"), "part 0: the filter 'objreader' is not known"),
+        (("objloader", "xyzloader"), "has no part that can be read"),
+        (('value="100"', 'value="1;2"'), "part 0: '1;2' is not 1 number"),
+        (('x="3"', 'x="three"'), "leg 1: x is 'three'; it must be a number"),
+        (('x="3" y="4"', 'x="0" y="0"'), "no two legs are at different places"),
+        (('movePerSec_m="10"', 'movePerSec_m="0"'), "leg 0: movePerSec_m is 0; it never ends"),
+        (("<scannerSettings ", '<scannerSettings template="none" '), "no <scannerSettings> 'none'"),
+        (('pulseFreq_hz="1000"', 'pulseFreq_hz="0"'), "leg 0: S/1 has no pulseFreq_hz above 0"),
+        (('pulseFreq_hz="1000"', 'active="false"'), "no leg scans anything"),
+        (("#plane", "#tripod"), "leg 0: nothing moves"),
+        (('pulseFreq_hz="1000"', 'headRotatePerSec_deg="9"'), "only one with rotating optics may"),
+        (('optics="conic"', 'optics="flash"'), "optics 'flash'; there are rotating, oscillating"),
+        (('optics="conic"', 'optics="rotating"'), "cannot scan at scanFreq_hz 0"),
+        (('optics="conic"', 'optics="risley" angle1_deg="9"'), "has 1 prisms; only two"),
+    ],
+)
+def test_mistakes_are_told_in_a_line_and_nothing_is_written(survey, tmp_path, change, message):
+    device = LASER.replace("></scanner>", ' headRotatePerSecMax_deg="9"></scanner>')
+    path = survey(device, FLY)
+    for file in (path, path.parents[1] / "devices.xml"):
+        text = file.read_text()
+        file.write_text(text.replace(*change))
+    with pytest.raises(LidarpoolError, match=message) as told:
+        import_survey(path, tmp_path / "out")
+    assert str(told.value).startswith(str(path)) and "\n" not in str(told.value)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["helios"]
+
+
+def test_entities_are_not_expanded_without_end(survey, tmp_path):
+    path = survey(LASER, FLY)
+    nested = "".join(f'<!ENTITY e{n + 1} "{f"&e{n};" * 10}">' for n in range(9))
+    text = f'<!DOCTYPE document [<!ENTITY e0 "ha">{nested}]><document name="&e9;"/>'
+    path.write_text(text)
+    with pytest.raises(LidarpoolError, match="is no XML that can be read"):
+        import_survey(path, tmp_path / "out")

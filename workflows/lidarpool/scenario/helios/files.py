@@ -1,0 +1,147 @@
+"""The XML files of HELIOS++: where they are, and the values in them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...base.errors import LidarpoolError
+from ...base.words import did_you_mean
+
+Float = NDArray[np.float64]
+
+# Where a checkout of HELIOS++ has what its surveys call data/scanners_als.xml.
+_PACKAGE = Path("python/pyhelios")
+_TEMPLATES_MOST = 10  # that name each other
+
+
+class Asset(NamedTuple):
+    """An element, and the file that it is from, where names without a file are looked up."""
+
+    element: Element
+    home: Path
+
+
+class Assets:
+    """Files that a survey names: in the given folders, or in those that its own lies in."""
+
+    def __init__(self, survey: Path, folders: Sequence[Path]) -> None:
+        above = survey.resolve().parents
+        places = [*folders, Path(), *above, *(folder / _PACKAGE for folder in above)]
+        self.places = tuple(dict.fromkeys(places))
+        self.root = cache(_root)
+
+    def file(self, name: str) -> Path:
+        """Find a file; LidarpoolError if it is nowhere."""
+        for place in self.places:
+            if (place / name).is_file():
+                return place / name
+        raise LidarpoolError(
+            f"there is no file {name!r} in the survey's folder or one above it: give the folder "
+            "that it starts from, --assets DIR."
+        )
+
+    def asset(self, reference: str, kind: str, home: Path) -> Asset:
+        """Find the element of a kind that FILE.xml#ID names, or ID in the file `home`."""
+        file, _, name = reference.rpartition("#")
+        path = self.file(file) if file else home
+        known = {element.get("id", ""): element for element in self.root(path).findall(kind)}
+        if name not in known:
+            raise LidarpoolError(
+                f"there is no <{kind}> {name!r} in {path}.{did_you_mean(name, known)}"
+            )
+        return Asset(known[name], path)
+
+    def settings(self, element: Element | None, home: Path, depth: int = 0) -> dict[str, str]:
+        """Attributes of settings, and beneath them those of the template that they name."""
+        if element is None:
+            return {}
+        own = dict(element.attrib)
+        if (template := own.pop("template", None)) is None:
+            return own
+        if depth == _TEMPLATES_MOST:
+            raise LidarpoolError(f"the template {template!r} names itself, or too many others.")
+        under = self.asset(template, element.tag, home)
+        return self.settings(*under, depth + 1) | own
+
+
+def _root(path: Path) -> Element:
+    """Return the <document> of a file; LidarpoolError if it is none."""
+    try:
+        # Entities are neither read from files nor expanded without end.
+        root = ElementTree.fromstring(path.read_bytes())
+    except OSError as error:
+        raise LidarpoolError(f"{path} cannot be read: {error.strerror}.") from error
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise LidarpoolError(f"{path} is no XML that can be read: {error}.") from error
+    if root.tag != "document":
+        raise LidarpoolError(
+            f"{path} is XML, but not of HELIOS++: it begins with <{root.tag[:40]}>, not <document>."
+        )
+    return root
+
+
+def number(values: Element | dict[str, str], name: str, default: float) -> float:
+    """Return an attribute as a finite number."""
+    text = values.get(name)
+    if text is None:
+        return default
+    try:
+        value = float(text)
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value):
+        raise LidarpoolError(f"{name} is {text!r}; it must be a number.")
+    return value
+
+
+def flag(values: dict[str, str], name: str, default: bool) -> bool:
+    """Return an attribute as true or false."""
+    return values[name].lower() in ("true", "1") if name in values else default
+
+
+def vector(element: Element | None) -> Float:
+    """Return x, y and z of an element; zeros where there is none."""
+    if element is None:
+        return np.zeros(3)
+    return np.array([number(element, axis, 0.0) for axis in "xyz"])
+
+
+def rotation(element: Element | None) -> Float:
+    """Return the rotation (3, 3) of the <rot> in an element, one after the other.
+
+    About the axes around the element; with rotations="local" about its own.
+    """
+    out = np.eye(3)
+    for step in () if element is None else element.findall("rot"):
+        axis = step.get("axis", "").lower()
+        if axis not in ("x", "y", "z"):
+            raise LidarpoolError(f"<rot> has the axis {axis!r}; it must be x, y or z.")
+        turn = about(np.eye(3)["xyz".index(axis)], number(step, "angle_deg", 0.0))
+        local = element is not None and element.get("rotations") == "local"
+        out = out @ turn if local else turn @ out
+    return out
+
+
+def about(axis: Float, degrees: float) -> Float:
+    """Rotation (3, 3) about an axis (Rodrigues, 1840)."""
+    cross = np.cross(np.eye(3), axis / np.linalg.norm(axis))
+    angle = np.radians(degrees)
+    out: Float = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    return out
+
+
+def clean(values: Float | float | Sequence[float]) -> list[float] | float:
+    """Numbers as a scenario has them: 12 digits, nothing that is 0 but for rounding."""
+    array = np.asarray(values, np.float64)
+    if array.ndim:
+        return [clean(value) for value in array.tolist()]  # type: ignore[misc]
+    value = array.item()
+    return float(f"{value:.12g}") if abs(value) > 1e-9 else 0.0

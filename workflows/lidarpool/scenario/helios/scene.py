@@ -1,0 +1,222 @@
+"""Scenes of HELIOS++ as entries of `scene.files`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from ...base.errors import LidarpoolError
+from ...scene.floor import heights_at
+from ...scene.mesh import Mesh
+from ...scene.meshfile import load_meshes
+from ...scene.scene import Scene, unique_names
+from ...scene.transform import Transform
+from ...sensor import Pose
+from .files import Assets, Float, clean, number, rotation
+
+# Loaders whose files hold no triangles.
+_UNREAD = ("geotiffloader", "xyzloader", "detailedvoxels")
+
+
+@dataclass
+class Part:
+    """One mesh file of a scene and where it stands: turned, scaled, moved."""
+
+    file: Path
+    up_axis: str | None
+    turn: Float
+    scale: float
+    offset: Float
+    falls: bool  # until it stands on the ground
+
+    @cached_property
+    def materials(self) -> list[dict[str, str]]:
+        """Values that HELIOS++ reads of the materials of its faces."""
+        text = self.file.read_text("utf-8", "replace")
+        used = set(re.findall(r"^\s*usemtl\s+(\S+)", text, re.MULTILINE))
+        found: dict[str, dict[str, str]] = {}
+        for name in re.findall(r"^\s*mtllib\s+(.+?)\s*$", text, re.MULTILINE):
+            try:
+                lines = (self.file.parent / name).read_text("utf-8", "replace").splitlines()
+            except (OSError, ValueError):  # a zero in the name
+                continue
+            values: dict[str, str] = {}
+            for words in (line.split() for line in lines):
+                if words[:1] == ["newmtl"] and len(words) > 1:
+                    values = found.setdefault(words[1], {})
+                elif len(words) > 1 and words[0].startswith("helios_"):
+                    values[words[0].removeprefix("helios_")] = words[1]
+        return [values for name, values in found.items() if name in used]
+
+    @property
+    def kind(self) -> dict[str, Any]:
+        """Reflectance and class, where all its faces have the same."""
+        kinds = []
+        for values in self.materials:
+            kind: dict[str, Any] = {}
+            if "reflectance" in values and "spectra" not in values:
+                kind["reflectance"] = clean(number(values, "reflectance", 0))
+            if "classification" in values:
+                kind["class"] = int(number(values, "classification", 0))
+            kinds.append(kind)
+        return kinds[0] if kinds and all(kind == kinds[0] for kind in kinds) else {}
+
+    @property
+    def is_ground(self) -> bool:
+        """Whether platforms and parts can stand on it."""
+        return any(values.get("isGround", "").lower() in ("true", "1") for values in self.materials)
+
+    def meshes(self) -> tuple[Mesh, ...]:
+        """Read it, in the world."""
+        placed = Transform(self.turn * self.scale, self.offset)
+        return load_meshes(self.file, up_axis=self.up_axis, transform=placed, tell=lambda _: None)
+
+    def entry(self, name: str) -> dict[str, Any]:
+        """Entry of `scene.files`, the file under a name."""
+        angles = Pose.of((0, 0, 0), self.turn)
+        degrees = (angles.roll_deg, angles.pitch_deg, angles.yaw_deg)
+        placement = {
+            "up_axis": (self.up_axis, None),
+            "scale": (clean(self.scale), 1.0),
+            "rotation_deg": (clean(degrees), [0.0, 0.0, 0.0]),
+            "translation": (clean(self.offset), [0.0, 0.0, 0.0]),
+        }
+        changed = {key: value for key, (value, usual) in placement.items() if value != usual}
+        return {"file": name, **changed}
+
+
+class Surroundings:
+    """The parts of a scene, and the ground among them."""
+
+    def __init__(self, element: Element, assets: Assets) -> None:
+        self.unread: list[str] = []
+        self._missing: set[str] = set()
+        self.parts: list[Part] = []
+        name = f"scene {element.get('id')!r}"
+        for index, part in enumerate(element.findall("part")):
+            try:
+                self.parts += self._read(part, f"part {index}", assets)
+            except LidarpoolError as error:
+                raise LidarpoolError(f"{name}, part {index}: {error}") from error
+        if not self.parts:
+            raise LidarpoolError(
+                f"{name} has no part that can be read: only those of the filter objloader are."
+            )
+        for one in self.parts:
+            if one.falls:
+                self._let_fall(one)
+
+    def _read(self, part: Element, name: str, assets: Assets) -> Iterator[Part]:
+        for tag in ("dmotion", "swap"):
+            if part.find(tag) is not None:
+                self.unread.append(f"<{tag}> of {name}: it stands as it is at first")
+        files: list[Path] = []
+        up, turn, scale, offset, falls = None, np.eye(3), 1.0, np.zeros(3), False
+        for step in part.findall("filter"):
+            kind = step.get("type", "").lower()
+            given = {param.get("key", ""): param for param in step.findall("param")}
+            text = {key: param.get("value", "") for key, param in given.items()}
+            if kind in _UNREAD:
+                what = text.get("filepath") or text.get("efilepath", "")
+                self.unread.append(f"{name}, {kind} of {what}: no triangles, left out")
+                return
+            if kind == "objloader":
+                files, up = _files(text, assets), text.get("up")
+            elif kind == "rotate":
+                turn = rotation(given.get("rotation")) @ turn
+            elif kind == "scale":
+                (scale,) = _numbers(text.get("scale", ""), 1)
+                scale = scale or 1.0
+            elif kind == "translate":
+                offset = _numbers(text.get("offset", ""), 3)
+                falls = text.get("onGround", "0") != "0"
+            else:
+                raise LidarpoolError(
+                    f"the filter {kind!r} is not known; there are objloader, rotate, scale, "
+                    f"translate, {', '.join(_UNREAD)}."
+                )
+        if not files:
+            raise LidarpoolError("no filter loads a file.")
+        up = up if up in ("y", "z") else None
+        yield from (Part(file, up, turn, float(scale), offset.copy(), falls) for file in files)
+
+    @cached_property
+    def _ground(self) -> Scene | None:
+        meshes = [mesh for part in self.parts if part.is_ground for mesh in part.meshes()]
+        return Scene.from_meshes(meshes) if meshes else None
+
+    def height(self, x: float, y: float) -> float:
+        """Height of the lowest ground at a place; 0 where there is none."""
+        found = np.zeros(0) if self._ground is None else heights_at(self._ground, x, y)
+        if not len(found):
+            self._missing.add(f"{x:g}, {y:g}")
+            return 0.0
+        return float(found.min())
+
+    def _let_fall(self, part: Part) -> None:
+        """Move a part up or down so that its lowest point stands on the ground."""
+        points = np.concatenate([mesh.vertices for mesh in part.meshes()])
+        x, y, z = points[points[:, 2].argmin()].tolist()
+        part.offset[2] += self.height(x, y) - z
+
+    def materials(self) -> list[dict[str, Any]]:
+        """List what objects are made of, where the faces of a file are all of one kind."""
+        kinds = [part.kind for part in self.parts]
+        if not any(kinds):
+            return []
+        named = [
+            (mesh.name, k) for p, k in zip(self.parts, kinds, strict=True) for mesh in p.meshes()
+        ]
+        names = unique_names([name for name, _ in named])
+        return [
+            {"objects": name, **kind} for name, (_, kind) in zip(names, named, strict=True) if kind
+        ]
+
+    def left_out(self) -> list[str]:
+        """Say what is not taken over."""
+        spectra = {
+            values["spectra"] for p in self.parts for values in p.materials if "spectra" in values
+        }
+        lines = list(self.unread)
+        if self._missing:
+            lines.append(
+                f"onGround at {'; '.join(sorted(self._missing))}: no ground there, so z is 0"
+            )
+        if spectra:
+            lines.append(f"reflectances from spectra ({', '.join(sorted(spectra))}): they are 0.5")
+        return lines
+
+
+def _files(text: dict[str, str], assets: Assets) -> list[Path]:
+    """Files of a loader: by name, or those in a folder whose names an expression fits."""
+    if "efilepath" not in text:
+        return [assets.file(text.get("filepath", ""))]
+    folder, _, names = text["efilepath"].rpartition("/")
+    try:
+        fits = re.compile(names)
+    except re.error as error:
+        raise LidarpoolError(f"efilepath is {text['efilepath']!r}: {error}.") from error
+    for place in assets.places:
+        if (place / folder).is_dir():
+            found = sorted(p for p in (place / folder).iterdir() if fits.fullmatch(p.name))
+            if found:
+                return found
+    raise LidarpoolError(f"no file fits the efilepath {text['efilepath']!r}.")
+
+
+def _numbers(text: str, count: int) -> Float:
+    """Numbers with ; between them."""
+    try:
+        values = np.array([float(word) for word in text.split(";")])
+    except ValueError:
+        values = np.full(0, np.nan)
+    if values.shape != (count,) or not np.isfinite(values).all():
+        raise LidarpoolError(f"{text!r} is not {count} number{'s' * (count > 1)}.")
+    return values
