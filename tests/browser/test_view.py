@@ -10,6 +10,7 @@ from lidarpool import Column, Scene, Track
 from lidarpool.columns.table import SCAN
 from lidarpool.export.cloud_file import CloudFile
 from lidarpool.export.ply_format import header, row_type
+from lidarpool.live.looking import Filter
 from lidarpool.live.page import live_page, redrawn
 from lidarpool.live.result_page import ResultView
 from lidarpool.run.picture_file import Pictured, SensorWay
@@ -51,9 +52,9 @@ def test_view_shows_the_cloud_and_asks_nobody_else(served, new_tab, tmp_path):
     assert len(np.unique(picture[:, :900].reshape(-1, 3), axis=0)) > 200
     own = (page.url, "data:", "blob:")
     assert [request for request in tab.requests if not request.startswith(own)] == []
-    view._scans.value = (100, 149)
+    view._view.cloud.set_filter(Filter((("scan", 100, 149),)))
     tab.wait_for(lambda text: re.search(r"5,000 of 30,000 points, all\s+shown", text))
-    view._view._colour.value = "wetness"
+    view._view.cloud.colour.value = "wetness"
     tab.wait_for(lambda text: "wetness" in text and "z, m" not in text)
     tab.wait_for(lambda _: colourful(tab.picture(tmp_path / "b.png")) > 500)
     assert tab.errors == []

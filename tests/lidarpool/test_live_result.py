@@ -1,7 +1,9 @@
 """A finished result on a page: its points, scene, sensors, rays and planning; nobody looks yet."""
 
 import io
+import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,11 +13,12 @@ from lidarpool import LidarpoolError, Planning, Scene, Track
 from lidarpool.columns.table import CHANNEL, OBJECT, SCAN
 from lidarpool.export.cloud_file import CloudFile
 from lidarpool.export.ply_format import header, row_type
+from lidarpool.live.cloud_view import HIDDEN
 from lidarpool.live.hits import hit_grid
+from lidarpool.live.looking import Filter
 from lidarpool.live.page import live_page
 from lidarpool.live.result_page import ResultView, view_result
 from lidarpool.live.surface import Surface, coloured_mesh, colours_for
-from lidarpool.live.view import HIDDEN
 from lidarpool.plan import Plan
 from lidarpool.run.picture_file import PICTURE_FILE, Pictured, SensorWay
 from lidarpool.scene.actors import Actor, box
@@ -70,8 +73,7 @@ def test_columns_that_nobody_knows_are_in_the_menu(tmp_path, page):
     file = CloudFile(tmp_path / "theirs.ply")
     view = ResultView(page, file)
     view.draw()
-    assert view._view._colour.options == ("z", "nx")
-    assert view._scans is None
+    assert view._view.cloud.colour.options == ("z", "nx", HIDDEN)
     assert file.choose(100)[0]["nx"].tolist() == list(range(20))
 
 
@@ -148,7 +150,7 @@ def test_the_page_shows_scene_sensors_rays_and_planning(cloud, pictured, page):
     assert "room" in view._view._scene_legend.content
     assert len(page.scene.get_handle_by_name("/poses").batched_positions) == POSES
     assert "10,000 of 10,000 points" in view._facts.content
-    view._scans.value = (10, 19)
+    view._view.cloud.set_filter(Filter((("scan", 10, 19),)))
     view.draw()
     assert "1,000 of 10,000 points" in view._facts.content
 
@@ -173,10 +175,10 @@ def test_under_a_roof_the_page_is_cut_and_can_be_made_whole(cloud, pictured, pag
 
 def test_a_colour_that_is_chosen_is_drawn_and_what_is_hidden_is_not(cloud, pictured, page):
     view = ResultView(page, CloudFile(cloud), pictured)
-    view._view._colour.value = "object"
+    view._view.cloud.colour.value = "object"
     view.draw()
-    assert "room" in view._view._cloud_legend.content
-    view._view._show_cloud.value = view._view._show_rays.value = False
+    assert "room" in view._view.cloud._legend.content
+    view._view.cloud.colour.value, view._view._show_rays.value = HIDDEN, False
     view._view._scene_colour.value = HIDDEN
     view.draw()
     assert len(points(page)) == 0
@@ -201,12 +203,12 @@ def test_what_moves_is_where_it_is_at_the_time_that_is_chosen_or_played(cloud, p
     assert sensor.position == pytest.approx((3, 4, 1))
     assert cart.position == pytest.approx((3, 1, 0))
     assert cart.wxyz == pytest.approx((np.cos(np.pi / 8), 0, 0, np.sin(np.pi / 8)))
-    view._view._colour.value = "object"
+    view._view.cloud.colour.value = "object"
     view._view._start_or_stop()
     view.draw()
     assert 1.0 < view._view._time.value <= 2.0
     assert sensor.position[1] > 4
-    assert "room" in view._view._cloud_legend.content
+    assert "room" in view._view.cloud._legend.content
 
 
 def test_a_drive_through_a_large_scene_is_looked_at_from_near(cloud, page):
@@ -324,3 +326,68 @@ def test_a_scene_is_coloured_by_the_reflectance_of_its_objects():
     assert np.unique(colours[scene.face_object == 0]).tolist() == [255]
     assert colours[scene.face_object == 1].max() < 40
     assert "reflectance" in legend
+
+
+def test_a_filter_is_chosen_by_its_controls_and_told(cloud, pictured, page):
+    view = ResultView(page, CloudFile(cloud), pictured, most=4000)
+    view.draw()
+    shown = view._view.cloud
+    assert "10,000 points, 4,000 shown" in view._facts.content
+    shown._filter_by.value = "z"
+    view.draw()
+    assert shown._input.label == "z, m"
+    shown._input.value = (shown._input.min, 2.0)
+    drawn_until(view, lambda: "reading" not in view._facts.content)
+    assert "z 0 to 2 m" in shown._filter_text.content
+    count = np.count_nonzero(CloudFile(cloud).piece(0, 10_000).positions[:, 2] <= 2.0)
+    assert f"{count:,} of 10,000 points, all shown" in view._facts.content
+    assert points(page)[:, 2].max() <= 2
+    shown._filter_by.value = "object"
+    view.draw()
+    assert shown._input.options == ("all", "room")
+    shown._input.value = "room"
+    view.draw()
+    assert "only room" in shown._filter_text.content
+    shown.set_filter(Filter())
+    view.draw()
+    assert "4,000 shown" in view._facts.content
+    assert shown._input.value == "all"
+    assert not shown._all.visible
+
+
+def drawn_until(view, true):
+    """Draw as often as it takes."""
+    deadline = time.monotonic() + 120
+    while True:
+        view.draw()
+        if true():
+            return
+        assert time.monotonic() < deadline, view._facts.content
+
+
+def test_a_point_that_is_clicked_at_is_told_and_measured_from(cloud, pictured, page):
+    view = ResultView(page, CloudFile(cloud), pictured)
+    view.draw()
+    shown = view._view.cloud
+    assert "Click a point" in shown.picked._text.content
+    wall, eye = shown._even.part(slice(0, 1)), np.array([3.0, 4.0, 1.0])
+    for part, measure in ((wall, False), (shown._even.part(slice(2, 3)), True)):
+        place = part.positions[0] - ORIGIN
+        click = SimpleNamespace(
+            client_id=1,
+            client=SimpleNamespace(camera=SimpleNamespace(fov=0.8, image_height=800)),
+            ray_origin=eye,
+            ray_direction=place - eye,
+            modifier="shift" if measure else None,
+        )
+        view._view._cut.value = view._view._cut.max
+        shown._clicks.put(click)
+        view.draw()
+    told = shown.picked._text.content
+    first, second = shown._even.positions[0], shown._even.positions[2]
+    assert f"{np.linalg.norm(second - first):,.3f} m" in told
+    for words in ("scan <b>0<", "channel <b>2<", "object <b>room<", f"y <b>{second[1]:,.3f} m"):
+        assert words in told
+    assert page.scene.get_handle_by_name("/picked/way") is not None
+    shown.picked.take(None, False, eye)
+    assert page.scene.get_handle_by_name("/picked/0") is None

@@ -79,15 +79,27 @@ class CloudFile:
         count
             How many there are.
         """
-        low, high = 0, len(self)
-        if scans is not None and scans != self.scans:
-            low = bisect_left(self._rows["scan"], scans[0])
-            high = bisect_right(self._rows["scan"], scans[1])
-        rows = self._rows[low + one_of_each_part(high - low, most)]
+        low, high = (0, len(self)) if scans is None else self.rows_of(scans)
+        return self._cloud(self._rows[low + one_of_each_part(high - low, most)]), high - low
+
+    def rows_of(self, scans: tuple[float, float]) -> tuple[int, int]:
+        """First row of these scans and the first after them; all where they are in no order."""
+        if self.scans[0] >= self.scans[1] or scans == self.scans:
+            return 0, len(self)
+        of = self._rows["scan"]
+        return bisect_left(of, scans[0]), bisect_right(of, scans[1])
+
+    def piece(self, first: int, last: int) -> Cloud:
+        """Points of some rows, in order. Those without finite coordinates are left out."""
+        return self._cloud(self._rows[first:last])
+
+    def _cloud(self, rows: NDArray[np.void]) -> Cloud:
         positions = np.stack([rows[axis] for axis in AXES], axis=1, dtype=np.float64)
         known = np.isfinite(positions).all(axis=1)
-        columns = {column.name: rows[column.in_files][known] for column in self.table}
-        return Cloud(positions[known], columns, self.table), high - low
+        if not known.all():
+            rows, positions = rows[known], positions[known]
+        columns = {column.name: rows[column.in_files] for column in self.table}
+        return Cloud(positions, columns, self.table)
 
 
 def _table(row: np.dtype[np.void], own: Sequence[Column]) -> tuple[Column, ...]:

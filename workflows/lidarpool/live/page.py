@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import io
 import itertools
 import logging
 import math
@@ -21,12 +22,14 @@ import numpy as np
 import rich
 import viser
 from numpy.typing import ArrayLike, NDArray
+from PIL import Image
 from viser.infra import WebsockClientConnection
 
 from ..base.notebook import cell_display
 
 HOST = "127.0.0.1"
 PORT = 8080  # or the next that is free
+PICTURE = "lidarpool.png"
 LAST_S = 30.0  # that the last drawing is waited for
 
 # By these names a browser reaches this machine, also through a port forwarded by SSH, which
@@ -35,11 +38,8 @@ OWN_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
 
 _POLICY_VIOLATION = 1008  # RFC 6455, 7.4.1
 _FOV = math.radians(45)
-_AWAY = np.array([0.55, -1.0, 0.62])  # from the scene's middle to the camera
-_AWAY /= np.linalg.norm(_AWAY)
-_RIGHT = np.cross([0.0, 0.0, 1.0], _AWAY)
-_RIGHT /= np.linalg.norm(_RIGHT)
-_UP = np.cross(_AWAY, _RIGHT)
+# From the scene's middle to the camera.
+_SIDES = {"all": (0.55, -1.0, 0.62), "top": (0.0, -1e-3, 1.0), "side": (0.0, -1.0, 0.0)}
 # Of a window, by half its height: what the scene may fill left of the panel, and how far the
 # middle of that is from the middle of the window.
 _WIDE, _HIGH, _ASIDE = 1.15, 0.88, 0.42
@@ -47,6 +47,7 @@ _WIDE, _HIGH, _ASIDE = 1.15, 0.88, 0.42
 # floor of any colour nearly white.
 _AROUND, _SUN = 1.3, 2.0
 _FROM = (0.15, -0.75, 1.2)  # left of the camera's first place, so that no two sides look alike
+_LIGHT, _DARK = (255, 255, 255), (20, 20, 20)  # behind all
 _GRID = (128, 134, 142)
 
 _LOGGER = logging.getLogger(__name__)
@@ -68,12 +69,15 @@ class LivePage(viser.ViserServer):
         refuse_strangers(self)
         self._set_theme(dark=False)
         # It is the last of the panel.
-        dark = self.gui.add_checkbox("dark", initial_value=False, order=1e6)
-        dark.on_update(lambda _: self._set_theme(dark.value))
+        self._dark = self.gui.add_checkbox("dark", initial_value=False, order=1e6)
+        self._dark.on_update(lambda _: self._set_theme(self._dark.value))
         self.scene.configure_environment_map(None)
         self.scene.configure_default_lights(enabled=False, cast_shadow=False)
         self.scene.add_light_ambient("/light/around", intensity=_AROUND)
         self.scene.add_light_directional("/light/sun", intensity=_SUN, position=_FROM)
+
+    SIDES = tuple(_SIDES)
+    _bounds = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
 
     def _set_theme(self, dark: bool) -> None:
         self.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=dark)
@@ -86,18 +90,33 @@ class LivePage(viser.ViserServer):
         """Where it is."""
         return f"http://{HOST}:{self.get_port()}"
 
+    def look_from(self, client: viser.ClientHandle, side: str) -> None:
+        """Move the camera of a browser to a side from which it sees all."""
+        low, high = self._bounds
+        look_at, position = place_camera(low, high, side)
+        place_eye(client, position, look_at)
+
+    def save_picture(self, client: viser.ClientHandle) -> None:
+        """Have a browser save what it shows, without the panel, as a PNG file."""
+        height, width = client.camera.image_height, client.camera.image_width
+        drawn = client.get_render(height, width, transport_format="png", timeout=LAST_S)
+        image = Image.new("RGB", (width, height), _DARK if self._dark.value else _LIGHT)
+        layer = Image.fromarray(drawn)
+        image.paste(layer, mask=layer.getchannel("A"))
+        data = io.BytesIO()
+        image.save(data, "PNG")
+        client.send_file_download(PICTURE, data.getvalue(), save_immediately=True)
+
     def frame_scene(self, bounds: ArrayLike) -> None:
         """Put the camera where it sees all of a box, (2, 3) in metres, with Z up, and a grid below.
 
         The lines of the grid are whole metres apart, or tenths or tens of them.
         """
-        low, high = np.asarray(bounds, np.float64)
+        self._bounds = low, high = np.asarray(bounds, np.float64)
         size = float(np.linalg.norm(high - low)) or 1.0
-        middle, distance = place_camera(low, high)
         camera = self.initial_camera
         camera.fov = _FOV
-        camera.look_at = middle
-        camera.position = middle + distance * _AWAY
+        camera.look_at, camera.position = place_camera(low, high)
         camera.up = np.array([0.0, 0.0, 1.0])
         camera.near, camera.far = size / 500, size * 50
         step = 10.0 ** math.floor(math.log10(size / 4))
@@ -118,15 +137,30 @@ class LivePage(viser.ViserServer):
 
 
 def place_camera(
-    low: NDArray[np.float64], high: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], float]:
-    """Find where a camera looks, (3,), and from how far, to see all corners of a box."""
+    low: NDArray[np.float64], high: NDArray[np.float64], side: str = "all"
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Find where a camera looks, (3,), and where it is, (3,), to see all corners of a box."""
+    away = np.array(_SIDES[side]) / np.linalg.norm(_SIDES[side])
+    right = np.cross([0.0, 0.0, 1.0], away)
+    right /= np.linalg.norm(right)
+    up = np.cross(away, right)
     middle = (low + high) / 2
     corners = np.array(list(itertools.product(*np.stack([low, high]).T))) - middle
-    wide, tall = np.abs(corners @ _RIGHT), np.abs(corners @ _UP)
+    wide, tall = np.abs(corners @ right), np.abs(corners @ up)
     reach = np.maximum(wide / _WIDE, tall / _HIGH) / math.tan(_FOV / 2)
-    distance = float((corners @ _AWAY + reach).max()) or 1.0
-    return middle + _ASIDE * math.tan(_FOV / 2) * distance * _RIGHT, distance
+    distance = float((corners @ away + reach).max()) or 1.0
+    at = middle + _ASIDE * math.tan(_FOV / 2) * distance * right
+    return at, at + distance * away
+
+
+def place_eye(
+    client: viser.ClientHandle, position: NDArray[np.float64], look_at: NDArray[np.float64]
+) -> None:
+    """Move the camera of a browser."""
+    with client.atomic():
+        client.camera.up_direction = np.array([0.0, 0.0, 1.0])
+        client.camera.position = position
+        client.camera.look_at = look_at
 
 
 def may_connect(origins: Iterable[str]) -> bool:

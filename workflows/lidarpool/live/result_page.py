@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from html import escape
 from pathlib import Path
-from typing import Any
 
 import click
 import numpy as np
@@ -15,15 +14,17 @@ from numpy.typing import NDArray
 
 from ..base.errors import LidarpoolError
 from ..base.notebook import cell_display
+from ..columns.cloud import Cloud
 from ..export.cloud_file import CloudFile
 from ..run.picture_file import PICTURE_FILE, Pictured, SensorWay
 from ..run.store import RUN_FOLDER
 from ..scan.database import FILE
+from .blocks import Blocks
 from .page import PORT, LivePage, announced, live_page, redrawn
 from .view import View, bounds_of, described, places_of
 
 CLOUD = "cloud.ply"
-VIEW_POINTS = 500_000  # in the browser at a time
+VIEW_POINTS = 500_000  # of all in a browser, and as many of what is seen from near
 DRAW_EVERY_S, BUSY_SHARE = 0.1, 0.7  # of a core: nothing else is to be done
 
 
@@ -54,14 +55,6 @@ class ResultView:
     ) -> None:
         self._file, self._pictured, self._note, self._most = file, pictured, note, most
         self._facts = page.gui.add_html("")
-        self._scans: Any = None
-        if file.scans[0] < file.scans[1]:
-            first, last = map(str, file.scans)
-            # Marks are centred: spaces keep the last within the panel.
-            marks = ((file.scans[0], first), (file.scans[1], last + len(last) * "\u2007"))
-            self._scans = page.gui.add_multi_slider(
-                "scans", *file.scans, 1, file.scans, marks=marks
-            )
         sensors: Sequence[SensorWay] = ()
         if pictured is None:
             origin, bounds = _around(file)
@@ -71,17 +64,18 @@ class ResultView:
             sensors = pictured.sensors
             bounds = bounds_of(scene, places_of(sensors), pictured.planning)
         self._origin, self._sensors = origin, sensors
-        self._choose(file.scans)
-        self._even = self._cloud  # of all scans
         lasts = 0.0 if pictured is None else pictured.duration_ns
         reflectance = None if pictured is None else pictured.reflectance
         self._view = View(page, scene, sensors, file.table, origin, bounds, lasts, reflectance)
 
+        self._view.cloud.blocks = Blocks(file, origin, most)
+        self._even: Cloud | None = None
+
     def draw(self) -> float:
         """Draw what has changed; returns the share of a core that this may take."""
-        scans = self._scans.value if self._scans else self._file.scans
-        if scans != self._chosen:
-            self._choose(scans)
+        if self._even is None:
+            self._facts.content = self._told()
+            self._even = self._file.choose(self._most)[0]
         pictured = self._pictured
         if pictured is not None:
             faces = len(pictured.scene.faces)
@@ -90,22 +84,18 @@ class ResultView:
             if pictured.plan is not None:
                 self._view.draw_path(pictured.plan.path, pictured.planning)
         self._view.draw_time()
-        self._view.draw_cloud(self._cloud, scans)
+        self._view.draw_cloud(self._even, 0)
+        self._facts.content = self._told()
         return BUSY_SHARE
 
-    def _choose(self, scans: tuple[int, int]) -> None:
-        self._chosen = scans
-        self._cloud, count = self._file.choose(self._most, scans)
-        shown = "all shown" if len(self._cloud) == count else f"{len(self._cloud):,} shown"
-        lines = [f"{count:,} of {len(self._file):,} points, {shown}"]
+    def _told(self) -> str:
+        lines = self._view.cloud.facts
         if self._origin.any():
             away = ", ".join(f"{metres:.0f}" for metres in self._origin)
             lines.append(f"relative to {away} m")
         lines += [described(self._sensors)] if self._sensors else []
         lines += [escape(self._note)] if self._note else []
-        self._facts.content = (
-            f'<div style="padding:0 0.8em 0.6em;font-size:0.85em">{"<br>".join(lines)}</div>'
-        )
+        return f'<div style="padding:0 0.8em 0.6em;font-size:0.85em">{"<br>".join(lines)}</div>'
 
 
 def _around(file: CloudFile) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

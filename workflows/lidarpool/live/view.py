@@ -13,16 +13,17 @@ import trimesh
 from numpy.typing import NDArray
 
 from ..columns.cloud import Cloud
-from ..columns.table import AXES, Column, Z
+from ..columns.table import Column
 from ..plan import Planning
 from ..render.closeup import CUT, around_ways
-from ..render.colouring import colours_of
 from ..render.theme import CLAY, object_colours, rgb
 from ..run.picture_file import SensorWay, ways_of
 from ..scene.scene import Scene
 from ..sensor.trajectory import quaternions_of
-from .colouring import as_bytes, legend_of
-from .page import LivePage
+from .cloud_view import HIDDEN, CloudView
+from .colouring import as_bytes
+from .looking import Filter
+from .page import LivePage, place_eye
 from .surface import MeshNode, Surface, below, colours_for
 
 MOST_POSES = 1000  # that have a ball
@@ -31,12 +32,9 @@ MOST_RAYS = 150  # more of them hide what they hit
 
 _RED, _PALE = (224, 24, 45), (232, 140, 150)
 _PATH, _DISC = (20, 150, 90), (120, 130, 150)
-# As shares of the scene's diagonal. Points can be seen where there are few, and told apart where
-# there are many.
+# As shares of the scene's diagonal.
 _BALL, _POSE, _END = 0.009, 0.0054, 0.008
 _MOVES = 0.4  # of that: what moves through a large scene is looked at from near
-_POINT, _POINT_OF_MANY = 0.0035, 0.6
-HIDDEN = "not shown"
 Hits = tuple[NDArray[Any], Cloud | None]  # of each triangle (f,), and points evenly chosen
 _PLAY_S = (6.0, 60.0)  # that a survey takes which is played, however short or long it is
 
@@ -87,15 +85,20 @@ class View:
         from_near = near is not None
         near = bounds if near is None else near
         self._size_m = float(np.linalg.norm(near[1] - near[0])) or 1.0
-        self._columns = {c.name: c for c in (Z, *(c for c in table if c not in AXES))}
+        self._columns = {column.name for column in table}
+        names = {} if scene is None else {"object": scene.all_names}
+        names["sensor"] = tuple(way.name for way in sensors)
+        self.cloud = CloudView(page, table, names, origin, self._size_m)
         self._drawn: dict[str, Hashable] = {}  # {name: what it depended on when it was drawn}
         self._surface: Surface | None = None
         self._mesh = MeshNode(page, "/scene")
-        self._cloud: Any = None  # viser shows no cloud without points
         self._lines: dict[str, Any] = {}  # {name: node}; nor no lines
         self._markers: list[Any] = []  # of the sensors, once it is told when it is
         self._bodies: list[Any] = []  # of the actors
         self._time: Any = None  # slider, where anything moves
+        self._follow: Any = None  # checkbox, where a sensor moves
+        self._trail: Any = None  # slider, where points have a time
+        self._followed: NDArray[np.float64] | None = None  # where the carrier was
         self._playing = False
         self._moved_at = 0.0  # when the time was last moved on by playing
         self._ends_ns = duration_ns
@@ -114,26 +117,39 @@ class View:
             round(step * math.floor(low / step), 6),
             round(step * (math.floor(high / step) + 1), 6),
         )
-        self._cut: Any = gui.add_slider("cut above, m", first, self._top, step, self._top)
         if duration_s > 0 and (self._actors or any(way.moves for way in self._sensors)):
-            step = 10.0 ** math.floor(math.log10(duration_s / 200))
-            end = round(
-                step * math.ceil(duration_s / step), 9
-            )  # digits are shown as many as it has
-            self._time = gui.add_slider("time, s", 0.0, end, step, 0.0)
-            self._play = gui.add_button("Play")
-            self._play.on_click(lambda _: self._start_or_stop())
-        with gui.add_folder("cloud"):
-            self._show_cloud = gui.add_checkbox("show", initial_value=True)
-            self._colour = gui.add_dropdown("colour", tuple(self._columns))
-            self._point_size = gui.add_slider("point size", 0.1, 4.0, 0.1, 1.0)
-            self._cloud_legend = gui.add_html("")
+            self._add_time(duration_s)
+        self.cloud.add_controls()
         if self._scene is not None:
-            with gui.add_folder("scene"):
-                colours = colours_for(self._scene, self._reflectance)
-                self._scene_colour = gui.add_dropdown("scene colour", (*colours, HIDDEN))
+            colours = colours_for(self._scene, self._reflectance)
+            self._scene_colour = gui.add_dropdown("scene colour", (*colours, HIDDEN))
+            self._scene_legend = gui.add_html("")
+        self.cloud.add_picked()
+        self.cloud.add_filter()
+        with gui.add_folder("view", expand_by_default=False):
+            sides = (*self._page.SIDES, *(("sensor",) if self._sensors else ()))
+            gui.add_button_group("look", sides).on_click(self._look)
+            self._cut: Any = gui.add_slider("cut above, m", first, self._top, step, self._top)
+            self.cloud.add_point_size()
+            if self._scene is not None:
                 self._show_rays = gui.add_checkbox("rays", initial_value=True)
-                self._scene_legend = gui.add_html("")
+            save = gui.add_button("Save picture")
+            save.on_click(self._save)
+
+    def _add_time(self, duration_s: float) -> None:
+        gui, step = self._page.gui, 10.0 ** math.floor(math.log10(duration_s / 200))
+        end = round(step * math.ceil(duration_s / step), 9)  # as many digits are shown as it has
+        self._time = gui.add_slider("time, s", 0.0, end, step, 0.0)
+        self._play = gui.add_button("Play")
+        self._play.on_click(lambda _: self._start_or_stop())
+        if any(way.moves for way in self._sensors):
+            self._follow = gui.add_checkbox(
+                "follow", initial_value=False, hint="the carrier, with the camera"
+            )
+        if "time" in self._columns:
+            self._trail = gui.add_slider(
+                "last, s", 0.0, end, step, 0.0, hint="of the points, up to the time; 0: all"
+            )
 
     @property
     def cut(self) -> float | None:
@@ -148,60 +164,13 @@ class View:
         return changed
 
     def draw_cloud(self, cloud: Cloud, version: Hashable) -> None:
-        """Show these points.
-
-        Parameters
-        ----------
-        cloud
-            The points, world coordinates.
-        version
-            Another value where they are others than before.
-        """
-        cut, shown = self.cut, self._show_cloud.value
-        colour, size = self._colour.value, self._point_size.value
-        if not self._changed("cloud", version, cut, shown, colour, size):
-            return
-        if not shown or not len(cloud):
-            self._cloud_legend.content = ""
-            if self._cloud is not None:
-                self._cloud.visible = False
-            return
-        column = self._columns[colour]
-        values = cloud.positions[:, 2] if column is Z else cloud[column.name]
-        names: tuple[str, ...] = ()
-        if column.name == "object" and self._scene is not None:
-            names = self._scene.all_names
-        elif column.name == "sensor":
-            names = tuple(way.name for way in self._sensors)
-        coloured = colours_of(values, column, names)
-        colours, self._cloud_legend.content = as_bytes(coloured.colours), legend_of(coloured)
-        positions = (cloud.positions - self._origin).astype(np.float32)
-        if cut is not None:
-            below = positions[:, 2] <= cut
-            positions, colours = positions[below], colours[below]
-        share = min(_POINT, _POINT_OF_MANY / len(cloud) ** 0.5)
-        self._draw_points(positions, colours, share * self._size_m * size)
-
-    def _draw_points(
-        self, positions: NDArray[np.float32], colours: NDArray[np.uint8], size_m: float
-    ) -> None:
-        if self._cloud is None and len(positions):
-            self._cloud = self._page.scene.add_point_cloud(
-                "/cloud",
-                positions,
-                colours,
-                point_size=size_m,
-                point_shape="circle",
-                point_shading="flat",
-                precision="float32",
-            )
-        elif self._cloud is not None:
-            with self._page.atomic():  # else there would be points without colours for a moment
-                self._cloud.visible = len(positions) > 0
-                if len(positions):
-                    self._cloud.points = positions
-                    self._cloud.colors = colours
-                    self._cloud.point_size = size_m
+        """Show these points, an even choice of all, world coordinates; see `CloudView.show`."""
+        self.cloud.show(cloud, version)
+        if self._trail is not None:
+            length, at = self._trail.value, self._time.value
+            limits = ((at - length) * 1e9, at * 1e9) if length > 0 else None
+            self.cloud.trail = Filter().with_limits("time", limits)
+        self.cloud.draw(self.cut, self._playing)
 
     def draw_scene(self, hits: Callable[[], Hits], version: Hashable) -> None:
         """Show the scene; another version has other hits."""
@@ -306,6 +275,7 @@ class View:
             elif not number:  # those of one carrier are near each other
                 names = ", ".join(way.name for way in self._sensors if way.name) or "sensor"
                 scene.add_label(f"{name}/label", names, anchor="bottom-left")
+        self._follow_carrier(time_ns)
         with self._page.atomic():
             for marker, way in zip(self._markers, self._sensors, strict=True):
                 marker.position = way.at(time_ns)
@@ -314,6 +284,41 @@ class View:
                 body.position = positions[0]
                 if rotations is not None:
                     body.wxyz = np.roll(quaternions_of(rotations)[0], 1)
+
+    def _follow_carrier(self, time_ns: float) -> None:
+        """Move all cameras as the carrier has moved."""
+        if self._follow is None:
+            return
+        at, before = self._carrier(time_ns), self._followed
+        self._followed = at
+        if self._follow.value and before is not None and (at != before).any():
+            for client in self._page.get_clients().values():
+                client.camera.position = client.camera.position + at - before  # looks along
+
+    def _carrier(self, time_ns: float) -> NDArray[np.float64]:
+        """Where the first sensor that moves is, or the first of all, (3,)."""
+        way = next((way for way in self._sensors if way.moves), self._sensors[0])
+        return way.at(time_ns)
+
+    def _look(self, event: Any) -> None:
+        """Move the camera of a browser to a side, or to the sensor."""
+        if event.client is None:
+            return
+        if event.target.value != "sensor":
+            self._page.look_from(event.client, event.target.value)
+            return
+        time_ns = 0.0 if self._time is None else self._time.value * 1e9
+        at = self._carrier(time_ns)
+        way = self._carrier(time_ns + 0.02 * self._ends_ns) - self._carrier(
+            time_ns - 0.02 * self._ends_ns
+        )
+        length = float(np.linalg.norm(way[:2]))
+        ahead = np.array([*way[:2] / length, 0.0]) if length > 1e-6 else np.array([1.0, 0.0, 0.0])
+        place_eye(event.client, at, at + 0.1 * self._size_m * ahead)
+
+    def _save(self, event: Any) -> None:
+        if event.client is not None:
+            self._page.save_picture(event.client)
 
     def _add_actors(self) -> None:
         for number, actor in enumerate(self._actors):

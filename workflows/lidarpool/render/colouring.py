@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -38,6 +38,8 @@ class Colouring:
         Whether the scale is.
     labels
         (name, colour): labels there are, those of most points first where they are many.
+    paint
+        Gives other values (m,) of the column their colours (m, 3) on the same scale.
     """
 
     colours: NDArray[np.float64]
@@ -47,6 +49,9 @@ class Colouring:
     limits: tuple[float, float] | None = None
     logarithmic: bool = False
     labels: tuple[tuple[str, NDArray[np.float64]], ...] = ()
+    paint: Callable[[NDArray[Any]], NDArray[np.float64]] = field(
+        default=lambda values: np.full((len(values), 3), _GREY), repr=False
+    )
 
 
 def colours_of(values: NDArray[Any], column: Column, names: Sequence[str] = ()) -> Colouring:
@@ -75,24 +80,36 @@ def colours_of(values: NDArray[Any], column: Column, names: Sequence[str] = ()) 
                 for value in found.tolist()
             ]
             labels = tuple(zip(words, palette[found % len(palette)], strict=True))
-            colours = palette[values % len(palette)]
-            return Colouring(colours, column.name, "", column.meaning, labels=labels)
+
+            def label(values: NDArray[Any]) -> NDArray[np.float64]:
+                return np.asarray(palette[values.astype(np.int64) % len(palette)])
+
+            return Colouring(
+                label(values), column.name, "", column.meaning, labels=labels, paint=label
+            )
         spread = (0, 100)
-    known, numbers, unit = np.isfinite(values), values.astype(np.float64), column.unit
+    known, unit, size = np.isfinite(values), column.unit, 1.0
     middle, low, high = 0.5, 0.0, 1.0
     if known.any():
-        low, middle, high = np.percentile(numbers[known], [spread[0], 50, spread[1]])
+        numbers = values[known].astype(np.float64)
+        low, middle, high = np.percentile(numbers, [spread[0], 50, spread[1]])
     if unit == "ns":
         span = high - low
         unit, size = next((entry for entry in _TIMES if span >= 0.1 * entry[1]), ("ns", 1.0))
-        numbers = numbers / size
         low, middle, high = low / size, middle / size, high / size
     logarithmic = bool(low > 0 and middle - low < _SKEWED * (high - low))
-    if logarithmic:
-        numbers = np.log(np.clip(numbers, low, high))
     ends = np.log([low, high]) if logarithmic else (low, high)
-    scaled = (numbers - ends[0]) * (255 / (ends[1] - ends[0] if high > low else 1.0))
-    colours = TURBO[np.clip(np.where(known, scaled, 0), 0, 255).astype(np.uint8)]
-    colours[~known] = _GREY
+
+    def shade(values: NDArray[Any]) -> NDArray[np.float64]:
+        known, numbers = np.isfinite(values), values.astype(np.float64) / size
+        if logarithmic:
+            numbers = np.log(np.clip(numbers, low, high))
+        scaled = (numbers - ends[0]) * (255 / (ends[1] - ends[0] if high > low else 1.0))
+        colours = TURBO[np.clip(np.where(known, scaled, 0), 0, 255).astype(np.uint8)]
+        colours[~known] = _GREY
+        return colours
+
     limits = float(low), float(high)
-    return Colouring(colours, column.name, unit, column.meaning, limits, logarithmic)
+    return Colouring(
+        shade(values), column.name, unit, column.meaning, limits, logarithmic, paint=shade
+    )

@@ -1,0 +1,91 @@
+"""Points of a file that are looked for: all that a filter keeps, or those before a camera."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..columns.cloud import Cloud
+from ..export.cloud_file import CloudFile
+from .looking import Eye, Filter
+
+BLOCK = 1 << 15  # rows that are read at a time
+Search = Generator[float, None, tuple[Cloud, int]]
+
+
+class Blocks:
+    """A file in blocks of rows, of which the boxes are known that were read once.
+
+    Parameters
+    ----------
+    file
+        The file.
+    origin
+        World position of the local origin, (3,), metres.
+    most
+        Points that are shown of all, and as many of what is seen from near.
+    """
+
+    def __init__(self, file: CloudFile, origin: NDArray[np.float64], most: int) -> None:
+        self.file, self._origin, self.most = file, origin, most
+        # NaN where a block was not read yet; 48 bytes each, 150 kB for a hundred million points.
+        self._boxes = np.full((-(-len(file) // BLOCK), 2, 3), np.nan)
+
+    def search(
+        self,
+        wanted: Filter,
+        most: int,
+        eye: Eye | None = None,
+        shares: NDArray[np.float64] | None = None,
+    ) -> Search:
+        """Look for points, block by block; gives the share of them that was looked at.
+
+        Parameters
+        ----------
+        wanted
+            What they are like.
+        most
+            How many are kept at most: an even choice of all that there are.
+        eye, shares
+            Only what is in a picture, and of each of its parts (t,) this share.
+
+        Returns
+        -------
+        cloud
+            The points, in order.
+        count
+            How many are like that.
+        """
+        random, kept, thin, found, held = np.random.default_rng(0), [], 1.0, 0, 0
+        low, high = self.file.rows_of(wanted.of("scan") or self.file.scans)
+        numbers = range(low // BLOCK, -(-high // BLOCK))
+        empty = self.file.piece(0, 0)
+        for number in numbers:
+            if eye is not None and not self._may_be_seen(number, eye):
+                continue
+            start = number * BLOCK
+            piece = self.file.piece(max(low, start), min(high, start + BLOCK))
+            if low <= start and high >= min(start + BLOCK, len(self.file)) and len(piece):
+                self._boxes[number] = piece.bounds - self._origin
+            rows = np.flatnonzero(wanted.keeps(piece))
+            share = np.full(len(rows), thin)
+            if eye is not None and shares is not None:
+                tiles = eye.tiles(piece.positions[rows] - self._origin)
+                share *= np.where(tiles >= 0, shares[tiles], 0.0)
+            found += len(rows)
+            rows = rows[random.random(len(rows)) < share]
+            kept.append(piece.part(rows))
+            held += len(rows)
+            while held > most:
+                thin /= 2
+                cloud = Cloud.joined(kept)
+                kept = [cloud.part(np.flatnonzero(random.random(len(cloud)) < 0.5))]
+                held = len(kept[0])
+            yield (number + 1 - numbers.start) / len(numbers)
+        return Cloud.joined(kept or [empty]), found
+
+    def _may_be_seen(self, number: int, eye: Eye) -> bool:
+        box = self._boxes[number]
+        return bool(np.isnan(box[0, 0])) or eye.may_see(box)

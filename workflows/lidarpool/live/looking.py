@@ -1,0 +1,165 @@
+"""What one looks at: a camera, the points that a filter keeps, and the one under the mouse."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+from viser.transforms import SO3
+
+from ..columns.cloud import Cloud
+
+Floats = NDArray[np.floating]
+
+COORDINATES = ("x", "y", "z")
+_ACROSS, _DOWN = 48, 27
+TILES = _ACROSS * _DOWN  # parts of a picture
+_NEAR = 1e-6  # metres ahead of a camera: what is behind is not seen
+_UNDER = 6.0  # pixels around the mouse in which a point is picked
+_BEHIND = 1.03  # times as far away as the nearest of those: on another surface
+
+
+def values_of(cloud: Cloud, name: str) -> NDArray[Any]:
+    """Values (n,) of a column; x, y and z are the positions, world coordinates."""
+    if name in COORDINATES:
+        return np.asarray(cloud.positions[:, COORDINATES.index(name)])
+    return cloud[name]
+
+
+@dataclass(frozen=True)
+class Filter:
+    """The points whose columns are within limits.
+
+    Parameters
+    ----------
+    limits
+        (column, lowest, highest): both ends belong to it; a label has its value at both.
+    """
+
+    limits: tuple[tuple[str, float, float], ...] = ()
+
+    def of(self, column: str) -> tuple[float, float] | None:
+        """Limits of a column, if it has some."""
+        return next(((low, high) for name, low, high in self.limits if name == column), None)
+
+    def with_limits(self, column: str, limits: tuple[float, float] | None) -> Filter:
+        """Return one with these limits of a column, or without."""
+        rest = tuple(entry for entry in self.limits if entry[0] != column)
+        return Filter(rest if limits is None else (*rest, (column, *limits)))
+
+    def keeps(self, cloud: Cloud) -> NDArray[np.bool_]:
+        """Which points (n,) are within all limits; what is NaN is not."""
+        kept = np.ones(len(cloud), np.bool_)
+        for name, low, high in self.limits:
+            values = values_of(cloud, name)
+            kept &= (values >= low) & (values <= high)
+        return kept
+
+
+@dataclass(frozen=True)
+class Eye:
+    """Where a browser's camera is, and what it sees.
+
+    Parameters
+    ----------
+    position
+        Metres, local coordinates.
+    wxyz
+        Rotation from its axes (x to the right, y down, z ahead) to the scene's.
+    fov
+        Angle from the upper to the lower edge, radians.
+    aspect
+        Width of the picture by its height.
+    """
+
+    position: tuple[float, float, float]
+    wxyz: tuple[float, float, float, float]
+    fov: float
+    aspect: float
+
+    @classmethod
+    def of(cls, camera: viser.CameraHandle) -> Eye:
+        """Return that of a browser."""
+        position, turn = camera.position.tolist(), camera.wxyz.tolist()
+        return cls(tuple(position), tuple(turn), camera.fov, camera.aspect)
+
+    def seen(self, places: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+        """Where places (n, 3) are in the picture, (n, 2) in -1 to 1, and which (n,) are in it."""
+        axes = SO3(np.array(self.wxyz)).as_matrix()
+        x, y, z = ((places - np.array(self.position)) @ axes).astype(np.float32).T
+        depth = np.maximum(z, _NEAR)
+        tangent = np.tan(self.fov / 2)
+        at = np.stack([x / depth / (tangent * self.aspect), y / depth / tangent], axis=1)
+        return at, (np.abs(at) < 1).all(axis=1) & (z > _NEAR)
+
+    def tiles(self, places: Floats) -> NDArray[np.int64]:
+        """In which part of the picture each place (n, 3) is, (n,); -1 outside."""
+        at, inside = self.seen(places)
+        column, row = ((np.clip(at, -1, 0.9999).T + 1) / 2 * np.array([[_ACROSS], [_DOWN]])).astype(
+            np.int64
+        )
+        return np.where(inside, row * _ACROSS + column, -1)
+
+    def may_see(self, box: Floats) -> bool:
+        """Whether some of a box (2, 3) may be in the picture."""
+        low, high = box
+        corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
+        axes = SO3(np.array(self.wxyz)).as_matrix()
+        x, y, z = ((corners - np.array(self.position)) @ axes).T
+        tall = z * np.tan(self.fov / 2)
+        wide = tall * self.aspect
+        outside = (z < 0, x > wide, x < -wide, y > tall, y < -tall)
+        return not any(bool(beyond.all()) for beyond in outside)
+
+
+def even_shares(counts: NDArray[Any], most: int) -> NDArray[np.float64]:
+    """Shares (t,) of the points of each part of a picture, so that as many of each are shown.
+
+    A part with fewer points than that has all of them shown.
+
+    Parameters
+    ----------
+    counts
+        (t,): points of each.
+    most
+        Points that are shown in all.
+    """
+    each, few = np.inf, np.zeros(len(counts), np.bool_)
+    for _ in range(len(counts)):
+        rest = int((~few & (counts > 0)).sum())
+        each = max(most - float(counts[few].sum()), 0.0) / rest if rest else np.inf
+        fewer = counts <= each
+        if (fewer == few).all():
+            break
+        few = fewer
+    return np.minimum(each / np.maximum(counts, 1e-9), 1.0)
+
+
+def picked(
+    places: Floats, origin: Sequence[float], direction: Sequence[float], pixel: float
+) -> int | None:
+    """Which of the places (n, 3) a ray means, if any.
+
+    That is the nearest to the ray of those on the first surface that it meets.
+
+    Parameters
+    ----------
+    origin, direction
+        Of the ray, from the camera through the mouse.
+    pixel
+        Angle between two rows of the picture, radians.
+    """
+    ahead = np.array(direction) / np.linalg.norm(direction)
+    away = places - np.array(origin)
+    depth = away @ ahead
+    aside = np.linalg.norm(away - depth[:, None] * ahead, axis=1)
+    angle = np.where(depth > 0, aside / np.maximum(depth, 1e-12), np.inf)
+    near = np.flatnonzero(angle <= _UNDER * pixel)
+    if not len(near):
+        return None
+    first = near[depth[near] <= _BEHIND * depth[near].min()]
+    return int(first[angle[first].argmin()])
