@@ -399,7 +399,7 @@ def test_one_subray_without_noise_is_the_plain_ray():
         (lambda: Material("*", float("nan")), "reflectance is nan"),
         (lambda: Material([]), "objects is"),
         (lambda: Material("*", semantic_class=65_536), "semantic_class is 65536"),
-        (lambda: Material("*", transparent="yes"), "none, pass or mirror"),
+        (lambda: Material("*", transparent="yes"), "one of none, pass, mirror"),
         (lambda: Returns(mode="best"), "mode is 'best'"),
         (lambda: Returns(subrays=8), "it must be one of 1, 7, 19, 37"),
         (lambda: Returns(pulse_ns=-1), "pulse_ns is -1"),

@@ -65,7 +65,7 @@ def test_rotation_is_yaw_then_pitch_then_roll():
     [
         ({"poses": []}, "at least one pose"),
         ({"poses": [(0, 0)]}, "three finite"),
-        ({"poses": [5]}, "three coordinates"),
+        ({"poses": [5]}, "list of Pose, or of x, y"),
         ({"poses": [(0, 0, float("nan"))]}, "three finite"),
         ({"steps": 0}, "steps"),
         ({"keep_every": 0}, "keep_every"),

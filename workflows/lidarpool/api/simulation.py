@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from distributed import Client
 
+from ..base.arguments import checked
 from ..base.vocabulary import PATIENCE_S, WAIT_S
 from ..plan import Planning
 from ..run.bars import bars_here
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 
+@checked
 def simulate(
     scene: Scene,
     survey: Survey,

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from raybeam.open3d_module import load_open3d
 
+from ..base.arguments import as_array, checked_fields
 from ..base.errors import LidarpoolError
 from .table import TABLE, Column
 
@@ -81,6 +82,7 @@ class Savable:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
+@checked_fields
 class Cloud(Savable):
     """Points of a survey, ordered by scan and ray.
 
@@ -111,7 +113,7 @@ class Cloud(Savable):
     def __post_init__(self) -> None:
         positions = np.asarray(self.positions)
         if positions.dtype not in (np.float32, np.float64):
-            positions = positions.astype(np.float64)
+            positions = as_array("positions", self.positions)
         if positions.ndim != 2 or positions.shape[1:] != (3,):
             raise LidarpoolError(f"A cloud needs positions of (n, 3), not {positions.shape}.")
         if not np.isfinite(positions).all():

@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.arguments import checked_fields
 from ..base.errors import LidarpoolError
 from ..base.words import did_you_mean
 
@@ -23,6 +24,7 @@ _OPEN3D = ("positions", "normals", "colors")  # which writes the files
 
 
 @dataclass(frozen=True)
+@checked_fields
 class Column:
     """One quantity that every point of a cloud has.
 

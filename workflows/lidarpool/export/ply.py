@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from raybeam.open3d_module import load_open3d
 
+from ..base.arguments import checked
 from ..base.errors import LidarpoolError
 from ..base.interrupts import deferred_interrupts
 from ..columns.cloud import Cloud, CloudLike
@@ -28,6 +29,7 @@ from .sweeps import SWEEPS_FILE, Sweeps
 _ROUNDING_SHARE = 0.05
 
 
+@checked
 def save_cloud(path: str | Path, cloud: CloudLike, *, precision_m: float = 0.01) -> int:
     """Write a cloud, in memory or on disk, to a binary PLY file through Open3D.
 
@@ -75,6 +77,7 @@ def save_cloud(path: str | Path, cloud: CloudLike, *, precision_m: float = 0.01)
     return size
 
 
+@checked
 def read_cloud(path: str | Path) -> Cloud:
     """Read a point cloud that a run or `Cloud.save` wrote as .ply, with all its columns.
 

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.arguments import checked
 from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud
 from ..columns.parts import SUFFIX, StoredCloud, read_part, read_tally
@@ -301,6 +302,7 @@ def _storage(folder: Path, place: str, *, durable: bool = True) -> Storage:
     return Storage.at(place or folder / PARTS, durable=durable)
 
 
+@checked
 def remove_run(folder: str | Path) -> None:
     """Remove what a run has kept in a folder, and its parts, wherever they are; nothing else.
 

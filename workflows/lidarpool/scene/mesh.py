@@ -7,10 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..base.arguments import as_array, checked_fields
 from ..base.errors import LidarpoolError
 
 
 @dataclass(frozen=True, eq=False)
+@checked_fields
 class Mesh:
     """Triangles of one object, in world coordinates.
 
@@ -65,7 +67,7 @@ def points_array(name: str, points: ArrayLike) -> NDArray[np.float64]:
     LidarpoolError
         If it is not that; the message starts with `name`.
     """
-    array = np.ascontiguousarray(points, dtype=np.float64)
+    array = np.ascontiguousarray(as_array(f"vertices of {name!r}", points))
     if array.ndim != 2 or array.shape[1] != 3:
         raise LidarpoolError(f"The vertices of {name!r} have shape {array.shape}; expected (v, 3).")
     bad = ~np.isfinite(array).all(axis=1)

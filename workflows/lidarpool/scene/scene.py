@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.arguments import as_array, checked, checked_fields, shown
 from ..base.errors import LidarpoolError
 from .actors import Actor
 from .mesh import Mesh, points_array
@@ -22,6 +23,7 @@ FAR_FROM_ZERO_M = 10_000.0
 
 
 @dataclass(frozen=True, eq=False)
+@checked_fields
 class Scene:
     """Triangles to be scanned, and which object each belongs to.
 
@@ -59,9 +61,11 @@ class Scene:
 
     def __post_init__(self) -> None:
         vertices = points_array("the scene", self.vertices)
-        faces = np.ascontiguousarray(self.faces, dtype=np.int32)
-        owners = np.ascontiguousarray(self.face_object, dtype=np.int32)
-        origin = points_array("the scene's origin", np.reshape(self.origin, (1, -1)))[0]
+        faces = np.ascontiguousarray(as_array("faces", self.faces, np.int32))
+        owners = np.ascontiguousarray(as_array("face_object", self.face_object, np.int32))
+        origin = points_array("the scene's origin", as_array("origin", self.origin).reshape(1, -1))[
+            0
+        ]
         if faces.ndim != 2 or faces.shape[1:] != (3,) or not len(faces):
             raise LidarpoolError(f"A scene needs triangles, faces of (f, 3), not {faces.shape}.")
         if faces.min() < 0 or faces.max() >= len(vertices):
@@ -95,6 +99,7 @@ class Scene:
         return cls.from_meshes(seed_objects())
 
     @classmethod
+    @checked
     def load(
         cls,
         path: str | Path,
@@ -127,6 +132,7 @@ class Scene:
         return cls.from_meshes(load_meshes(path, unit=unit, up_axis=up_axis, transform=transform))
 
     @classmethod
+    @checked
     def from_meshes(cls, meshes: Iterable[Mesh]) -> Scene:
         """Put objects together, each mesh one object.
 
@@ -141,6 +147,11 @@ class Scene:
             If there are none, or more vertices or triangles than 32 bits can count.
         """
         parts = list(meshes)
+        for part in parts:
+            if not isinstance(part, Mesh):
+                raise LidarpoolError(
+                    f"meshes holds {shown(part)}; each must be a Mesh(name, vertices, faces)."
+                )
         if not parts:
             raise LidarpoolError("A scene needs at least one object with triangles.")
         vertex_counts = [len(mesh.vertices) for mesh in parts]

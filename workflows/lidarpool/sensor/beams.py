@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..base.arguments import as_array, checked, checked_fields
 from ..base.errors import LidarpoolError
 
 CHANNELS_MOST = 65_535  # the type of the column
@@ -45,7 +46,7 @@ class Beams:
     origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
 
     def __post_init__(self) -> None:
-        count = np.size(self.elevation)
+        count = as_array("Beams.elevation", self.elevation).size
         if not 1 <= count <= CHANNELS_MOST:
             raise LidarpoolError(f"A sensor has 1 to {CHANNELS_MOST} beams, not {count}.")
         for name, shape in (
@@ -60,6 +61,7 @@ class Beams:
         return len(self.elevation)
 
     @classmethod
+    @checked
     def even(cls, layers: int, vertical_fov_deg: float) -> Beams:
         """Beams evenly spaced over a vertical field of view, both ends included.
 
@@ -112,6 +114,7 @@ class Head(Protocol):
 
 
 @dataclass(frozen=True)
+@checked_fields
 class Spin:
     """A head that spins.
 
@@ -248,7 +251,7 @@ class Mirror(Spin):
 
 def _table(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
     """Read-only float64 array of a shape; zeros where none were given."""
-    array = np.array(values, np.float64)
+    array = as_array(f"Beams.{name}", values).copy()
     if not array.size:
         array = np.zeros(shape)
     if array.shape != shape or not np.isfinite(array).all():

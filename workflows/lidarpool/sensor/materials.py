@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.arguments import checked_fields
 from ..base.errors import LidarpoolError
 from ..base.words import did_you_mean
 from .optics import check_numbers
@@ -25,6 +26,7 @@ Transparent = Literal["none", "pass", "mirror"]
 
 
 @dataclass(frozen=True)
+@checked_fields
 class Material:
     """What the surfaces of some objects are made of.
 
@@ -57,16 +59,10 @@ class Material:
 
     def __post_init__(self) -> None:
         names = (self.objects,) if isinstance(self.objects, str) else tuple(self.objects)
-        if not names or not all(isinstance(name, str) and name for name in names):
+        if not names or not all(names):
             raise LidarpoolError(f"objects is {self.objects!r}; it must be names of objects.")
         object.__setattr__(self, "objects", names)
-        if self.transparent not in ("none", "pass", "mirror"):
-            raise LidarpoolError(
-                f"transparent is {self.transparent!r}; it must be none, pass or mirror."
-            )
         check_numbers(self, {"reflectance": (0, 1), "semantic_class": (0, 65_535)})
-        if int(self.semantic_class) != self.semantic_class:
-            raise LidarpoolError(f"class is {self.semantic_class}; it must be a whole number.")
 
     def named(self, name: str) -> bool:
         """Whether an object is made of it."""

@@ -14,6 +14,7 @@ import yaml
 from numpy.typing import NDArray
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
+from ..base.arguments import checked
 from ..base.errors import LidarpoolError
 from ..base.words import did_you_mean
 from .beams import Beams, Mirror, Spin
@@ -191,6 +192,7 @@ def _read(path: Path | Traversable) -> SensorModel:
         raise LidarpoolError(f"{path} is no model that can be used: {said(error)}") from error
 
 
+@checked
 def load_sensor(
     model: str | Path | None = None,
     *,

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.arguments import checked_fields
 from ..base.counted import normal, uniform
 from .materials import at_right_angles
 from .optics import check_numbers
@@ -23,6 +24,7 @@ Real = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
+@checked_fields
 class Noise:
     """Noise; without arguments there is none.
 

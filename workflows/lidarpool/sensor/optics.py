@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.arguments import checked_fields
 from ..base.errors import LidarpoolError
 
 LIGHT_M_NS = 0.299792458  # in vacuum; in air it is slower by 0.03 %
@@ -31,6 +32,7 @@ def check_numbers(thing: object, limits: Mapping[str, tuple[float, float]]) -> N
 
 
 @dataclass(frozen=True)
+@checked_fields
 class Optics:
     """The light of a sensor, and how finely it reports.
 
@@ -57,6 +59,7 @@ class Optics:
 
 
 @dataclass(frozen=True)
+@checked_fields
 class Returns:
     """How many rays make up a beam, and which of what comes back is reported.
 
@@ -84,8 +87,6 @@ class Returns:
     pulse_ns: float | None = None
 
     def __post_init__(self) -> None:
-        if self.mode not in MODES:
-            raise LidarpoolError(f"mode is {self.mode!r}; there are {', '.join(MODES)}.")
         if self.subrays not in SUBRAYS:
             known = ", ".join(map(str, SUBRAYS))
             raise LidarpoolError(f"subrays is {self.subrays}; it must be one of {known}.")

@@ -9,12 +9,14 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.arguments import checked, checked_fields
 from ..base.errors import LidarpoolError
 from .beams import CHANNELS_MOST, Beams, Head, Spin
 from .optics import Optics
 
 
 @dataclass(frozen=True, eq=False)
+@checked_fields
 class Sensor:
     """Beams that a head moves. In each firing all beams are fired once.
 
@@ -73,6 +75,7 @@ class Sensor:
         return self.name or f"{type(self).__name__} with {self.channels} channels"
 
     @classmethod
+    @checked
     def grid(
         cls,
         rays_per_revolution: int = 1000,

@@ -7,9 +7,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from itertools import accumulate
+from typing import Any
 
 import numpy as np
 
+from ..base.arguments import checked_fields, shown
 from ..base.errors import LidarpoolError
 from ..columns.table import COORDINATES, Column, chosen, stored
 from .materials import Material, extinction
@@ -24,6 +26,7 @@ SENSORS_MOST = 255  # the type of the column
 
 
 @dataclass(frozen=True)
+@checked_fields
 class Mounted:
     """A sensor on a carrier.
 
@@ -79,6 +82,7 @@ class ScanSpec:
 
 
 @dataclass(frozen=True)
+@checked_fields
 class Survey:
     """All scans of a carrier's sensors.
 
@@ -133,7 +137,7 @@ class Survey:
     """
 
     sensor: Sensor = field(default_factory=Sensor.grid)
-    poses: Sequence[Pose] = ()
+    poses: Sequence[Any] = ()
     steps: int | None = None
     keep_every: int = 5
     precision_m: float = None  # type: ignore[assignment]  # filled in below
@@ -147,7 +151,7 @@ class Survey:
     visibility_km: float | None = None
 
     def __post_init__(self) -> None:
-        poses = tuple(p if isinstance(p, Pose) else _pose(p) for p in self.poses)
+        poses = _poses(self.poses)
         object.__setattr__(self, "poses", poses)
         object.__setattr__(self, "sensors", tuple(self.sensors))
         if self.trajectory is None:
@@ -302,11 +306,12 @@ def _end_ns(sensor: Sensor, steps: int) -> float:
     return _begin_ns(sensor, sensor.firings(steps - 1)[1] - 1) + sensor.lead_ns
 
 
-def _pose(given: object) -> Pose:
+def _poses(given: Sequence[Any]) -> tuple[Pose, ...]:
     try:
-        return Pose(tuple(given))  # type: ignore[arg-type]
-    except TypeError:
+        poses = [p if isinstance(p, Pose) else tuple(map(float, p)) for p in given]
+    except (TypeError, ValueError) as error:
         raise LidarpoolError(
-            f"A pose is a Pose or three coordinates x, y, z in metres, not {given!r}: give poses "
-            "as a list of them, such as [(0, 0, 1)]."
-        ) from None
+            f"poses is {shown(given)}; it must be a list of Pose, or of x, y and z in metres, such "
+            "as [(0, 0, 1)]."
+        ) from error
+    return tuple(p if isinstance(p, Pose) else Pose(p) for p in poses)  # type: ignore[arg-type]

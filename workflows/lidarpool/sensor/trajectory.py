@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..base.arguments import as_array, checked_fields
 from ..base.errors import LidarpoolError
 
 QUATERNION_SLACK = 1e-3  # of a quaternion's length, which files round
@@ -18,6 +19,7 @@ _CLOCK_S, _FIRING_S = 1e-6, 1e-3
 
 
 @dataclass(frozen=True)
+@checked_fields
 class Pose:
     """Where a sensor stands and how it is turned.
 
@@ -35,7 +37,7 @@ class Pose:
     roll_deg: float = 0.0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "position", tuple(float(x) for x in self.position))
+        object.__setattr__(self, "position", tuple(map(float, self.position)))
         numbers = (*self.position, self.yaw_deg, self.pitch_deg, self.roll_deg)
         if len(self.position) != 3 or not np.isfinite(numbers).all():
             raise LidarpoolError(f"A pose needs three finite coordinates and angles, not {self}.")
@@ -148,6 +150,7 @@ class Stations:
 
 
 @dataclass(frozen=True, eq=False)
+@checked_fields
 class Track:
     """Poses at times, and between them a straight or a smooth way: one station.
 
@@ -190,8 +193,8 @@ class Track:
     duration_s: float | None = None
 
     def __post_init__(self) -> None:
-        times = np.array(self.times_s, np.float64)
-        places = np.array(self.positions, np.float64)
+        times = as_array("times_s", self.times_s).copy()
+        places = as_array("positions", self.positions).copy()
         if times.ndim != 1 or len(times) < 2 or places.shape != (len(times), 3):
             raise LidarpoolError(
                 f"A trajectory needs two poses at least, with x, y and z each; there are "
@@ -205,7 +208,12 @@ class Track:
         if self.quaternions is None:
             turns = _along(times, places)
         else:
-            turns = np.array(self.quaternions, np.float64).reshape(len(times), 4)
+            turns = as_array("quaternions", self.quaternions).copy()
+            if turns.shape != (len(times), 4):
+                raise LidarpoolError(
+                    f"quaternions are x, y, z and w of each of the {len(times)} poses, not "
+                    f"{turns.shape}."
+                )
         lengths = np.linalg.norm(turns, axis=1)
         # Written so that NaN is refused.
         bad = ~(np.abs(lengths - 1) <= QUATERNION_SLACK)

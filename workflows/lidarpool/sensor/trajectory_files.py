@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.arguments import checked
 from ..base.errors import LidarpoolError
 from .calibrations import said
 from .trajectory import Pose, Track, quaternions_of
@@ -20,6 +21,7 @@ _TURNS = (("qx", "qy", "qz", "qw"), ("yaw_deg", "pitch_deg", "roll_deg"))
 _CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
+@checked
 def load_trajectory(
     path: str | Path,
     *,

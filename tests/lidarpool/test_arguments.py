@@ -1,0 +1,164 @@
+"""Arguments of the wrong kind: each is told of in a line or two that says what to do."""
+
+from __future__ import annotations
+
+import inspect
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lidarpool
+from lidarpool import (
+    Beams,
+    Cloud,
+    Column,
+    LidarpoolError,
+    Material,
+    Mesh,
+    Mounted,
+    Noise,
+    Optics,
+    Planning,
+    Pose,
+    Returns,
+    Scene,
+    Sensor,
+    Spin,
+    Survey,
+    Track,
+    load_sensor,
+    load_trajectory,
+    read_cloud,
+    remove_run,
+    save_cloud,
+    simulate,
+)
+
+POINTS, FACES, OWNERS = np.eye(3), np.array([[0, 1, 2]]), np.zeros(1, int)
+AT = [(0, 0, 1)]
+GRID = Sensor.grid()
+
+# Of everything public that takes arguments, calls that cannot be meant, and what is answered.
+WRONG = {
+    Beams: [
+        ("x", "array of numbers"),
+        ([0.1], [0.0], "a", "Beams.time_ns is 'a'"),
+        ([[1], [2, 3]], "[[1"),
+    ],
+    Beams.even: [("4", 60, "layers is '4'"), (4, "60", "a number"), (4.5, 60, "whole")],
+    Cloud: [("x", {}, "positions"), (POINTS, [1], "a dict"), ([["a", 0, 0]], {}, "numbers")],
+    Column: [
+        (1, "u1", "", "", "name"),
+        ("a", None, "", "", "dtype"),
+        ("a", "u1", "", "", 3, "source is 3"),
+    ],
+    Material: [
+        (3, "list of text"),
+        ("a", "0.5", "reflectance"),
+        ("a", None, "tree", "whole number"),
+    ],
+    Mesh: [
+        (3, POINTS, FACES, "name is 3"),
+        ("a", "x", FACES, "vertices"),
+        ("a", POINTS, "x", "integers"),
+    ],
+    Mounted: [
+        (GRID, "rear", "a Pose, such as Pose(("),
+        ("vlp16", "load_sensor("),
+        (GRID, (0, 0, 1), "mount"),
+    ],
+    Noise: [("0.1", "range_m is '0.1'"), ([1], "a number"), (0, 0, 0, 0, None, 1.5, "seed is 1.5")],
+    Optics: [
+        ("red", "wavelength_nm"),
+        (905.0, "x", "number or None"),
+        (905, None, None, "pulse_ns"),
+    ],
+    Planning: [
+        ("a", "two finite"),
+        ((0, 0),
+        (1, 1), [(1, 2, 3)], "(m, 2)"),
+        ((0, 0), 5, "target is 5"),
+    ],
+    Pose: [(1, "list of numbers"), ("abc", "'abc'"), ((0, 0, 1), "90", "yaw_deg is '90'")],
+    Returns: [
+        ("strong", "one of strongest, first"),
+        ("all", "7", "subrays is '7'"),
+        ("all", 7, "wide", "number"),
+    ],
+    Scene: [
+        (POINTS, FACES, ["x"], ("a",), POINTS[0], "face_object"),
+        (POINTS, FACES, OWNERS, 3, POINTS[0], "names is 3"),
+        (POINTS, FACES, OWNERS, ("a",), "o", "origin is 'o'"),
+    ],
+    Scene.from_meshes: [("a.glb", "[Mesh('"), ([POINTS], "an array; each"), (GRID, "a Sensor")],
+    Scene.load: [(3, "path is 3"), (["a.glb"], "text or a path"), (None, "None; it must")],
+    Sensor: [
+        ("vlp16", "beams"),
+        (Beams([0]), 3, "head is 3; it must be a Head"),
+        (Beams([0]), Spin(), "1", "min"),
+    ],
+    Sensor.grid: [
+        ("1000", "whole"),
+        (1000, 2.5, "layers"),
+        (1000, 40, 60, None, "step_deg is None"),
+    ],
+    Spin: [("1000", "a number"), (1000, "x", "step_deg"), (1000, 10, 10, "no", "True or False")],
+    Survey: [
+        (GRID, [1, 2, 3], "such as [(0, 0, 1)]"),
+        ("velodyne/vlp16", AT, "load_sensor('velodyne/vlp16')"),
+        (GRID, AT, "36", "whole number or None"),
+        (GRID, AT, 36, 1, 0.01, "time", "columns is 'time'; it must be a list of text or a Column"),
+        (GRID, (), 36, 1, 0.01, (), "drive.tum", "load_trajectory('drive.tum')"),
+        (GRID, AT, 36, 1, 0.01, (), None, [GRID], "[Mounted("),
+        (GRID, AT, 36, 1, 0.01, (), None, (), "world", ["glass"], "[Material("),
+    ],
+    Track: [
+        ("a", "b", "times_s is 'a'"),
+        ([0, 1], [[0, 0], [1]], "positions"),
+        ([0, 1], POINTS[:2], [[1]], "(1, 1)"),
+    ],
+    load_sensor: [(3, "model is 3"), (None, "needs a model"), ([1], "text or a path")],
+    load_trajectory: [(3, "path is 3"), (None, "a path"), ([AT], "text or a path")],
+    read_cloud: [(3, "path is 3"), (None, "a path"), (["a.ply"], "text or a path")],
+    remove_run: [(3, "folder is 3"), (None, "a path"), ([], "text or a path")],
+    save_cloud: [
+        (3, None, "path is 3"),
+        ("a.ply", POINTS, "an array; it must be a CloudLike"),
+        ("a", 3, "is 3"),
+    ],
+    simulate: [
+        ("hall.glb", Survey(poses=AT), "Scene.load('hall.glb')"),
+        (Scene.seed(), GRID, "survey is a Sensor; it must be a Survey, such as"),
+        (Scene.seed(), Survey(poses=AT), (25, 25), "Planning(("),
+    ],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("call", "arguments", "says"),
+    [(call, given[:-1], given[-1]) for call, all_given in WRONG.items() for given in all_given],
+    ids=lambda value: getattr(value, "__qualname__", ""),
+)
+def test_it_is_told_what_is_expected(call, arguments, says):
+    with pytest.raises(LidarpoolError) as raised:
+        call(*arguments)
+    assert says in str(raised.value)
+    assert len(str(raised.value).splitlines()) <= 2 and len(str(raised.value)) < 320
+
+
+def test_nothing_public_is_left_out():
+    """But for what only runs make."""
+    made = {"Frame", "Plan", "Result", "ScanSpec", "LidarpoolError", "__version__"}
+    public = {getattr(lidarpool, name) for name in {*lidarpool.__all__} - made}
+    assert public <= {*WRONG}
+    assert all(len(calls) >= 3 for calls in WRONG.values())
+
+
+def test_what_is_like_it_will_do():
+    survey = Survey(poses=np.array([[0, 0, 1.0]]), steps=np.int64(3), keep_every=np.uint8(2))
+    assert survey.scan_count == 3
+    assert Noise(np.float32(0.5), dropout=1).dropout == 1
+    assert isinstance(inspect.signature(simulate).parameters["wait_s"].default, float)
+    with pytest.raises(LidarpoolError, match="does not exist"):
+        Scene.load(Path("nothing.glb"))

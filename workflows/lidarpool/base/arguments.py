@@ -1,0 +1,177 @@
+"""Arguments of the wrong kind, told of as a scenario's are: what was given and what is allowed."""
+
+from __future__ import annotations
+
+import inspect
+import os
+import reprlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cache, wraps
+from numbers import Integral, Real
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from .errors import LidarpoolError
+
+P = ParamSpec("P")
+R = TypeVar("R")
+C = TypeVar("C", bound=type)
+
+# {annotation: what a value has to be, in words}
+_KINDS: dict[Any, tuple[tuple[type, ...], str]] = {
+    int: ((Integral,), "a whole number"),
+    float: ((Real,), "a number"),
+    bool: ((bool, np.bool_), "True or False"),
+    str: ((str,), "text"),
+    Path: ((os.PathLike,), "a path"),
+    NoneType: ((NoneType,), "None"),
+}
+# {class: how one comes by it}
+_EXAMPLES = {
+    "Beams": "Beams.even(32, 40)",
+    "Material": "Material('Window*', reflectance=0.1)",
+    "Mesh": "Mesh('hall', vertices, faces)",
+    "Mounted": "Mounted(sensor, Pose((1, 0, 2)), 'roof')",
+    "Noise": "Noise(range_m=0.01)",
+    "Planning": "Planning((0, 0), (10, 0), centres=[(5, 0)], radii=2)",
+    "Pose": "Pose((0, 0, 1), yaw_deg=90)",
+    "Returns": "Returns('dual')",
+    "Scene": "Scene.load('hall.glb')",
+    "Sensor": "load_sensor('velodyne/vlp16')",
+    "Survey": "Survey(poses=[(0, 0, 1)])",
+    "Trajectory": "load_trajectory('drive.tum')",
+}
+_PLAIN = (*(kind for kind in _KINDS if kind is not Path), list, tuple, dict, bytes)
+
+
+def checked(function: Callable[P, R]) -> Callable[P, R]:
+    """Have a function refuse arguments that are not of the annotated kinds.
+
+    Raises
+    ------
+    LidarpoolError
+        From the function: which argument, what was given, and what it must be.
+    """
+    signature = inspect.signature(function)
+
+    @wraps(function)
+    def refusing(*args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            given = signature.bind(*args, **kwargs).arguments
+        except TypeError:
+            return function(*args, **kwargs)  # Python tells of too many, too few and unknown ones
+        hints = _hints(function)
+        for name, value in given.items():
+            if name in hints and value is not signature.parameters[name].default:
+                _check(name, value, hints[name])
+        return function(*args, **kwargs)
+
+    return refusing
+
+
+def checked_fields(cls: C) -> C:
+    """Have a dataclass refuse values that are not of the annotated kinds, in subclasses as well.
+
+    It stands below `dataclass`, which calls `__post_init__` only of a class that has one.
+    """
+    after: Callable[[Any], None] = getattr(cls, "__post_init__", lambda self: None)
+
+    def __post_init__(self: Any) -> None:  # noqa: N807
+        for name, hint in _hints(cls).items():
+            value = getattr(self, name)
+            # Most are of the very type, or what the field is if nobody says otherwise.
+            if type(value) is not hint and value is not getattr(cls, name, inspect.Parameter.empty):
+                _check(name, value, hint)
+        after(self)
+
+    cls.__post_init__ = __post_init__  # type: ignore[attr-defined]
+    return cls
+
+
+def as_array(name: str, values: ArrayLike, dtype: DTypeLike = np.float64) -> NDArray[Any]:
+    """Return values as an array of numbers; LidarpoolError if they are none."""
+    try:
+        return np.asarray(values, dtype)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise LidarpoolError(
+            f"{name} is {shown(values)}; it must be an array of numbers, or lists of them."
+        ) from error
+
+
+def shown(value: object) -> str:
+    """Show what was given: plain values as they are, cut to a readable length; else its type."""
+    if isinstance(value, _PLAIN):
+        short = reprlib.Repr()
+        short.maxstring = short.maxother = 60
+        return short.repr(value)[:160]
+    return "an array" if isinstance(value, np.ndarray) else _with_article(type(value).__name__)
+
+
+def _with_article(name: str) -> str:
+    return f"{'an' if name[0].lower() in 'aeio' else 'a'} {name}"
+
+
+@cache
+def _hints(thing: Any) -> dict[str, Any]:
+    """Annotations of what can be checked."""
+    if isinstance(thing, type):
+        names = {name for name, field in thing.__dict__["__dataclass_fields__"].items()}
+        hints = {name: hint for name, hint in get_type_hints(thing).items() if name in names}
+    else:
+        hints = {name: hint for name, hint in get_type_hints(thing).items() if name != "return"}
+    return {name: hint for name, hint in hints.items() if _words(hint)}
+
+
+def _check(name: str, value: object, hint: Any) -> None:
+    if not _fits(value, hint):
+        words = _words(hint)
+        such = [example for of, example in _EXAMPLES.items() if of in words.split()]
+        example = f"[{such[0]}]" if such and words.startswith("a list") else "".join(such[:1])
+        words += f", such as {example}" if example else ""
+        raise LidarpoolError(f"{name} is {shown(value)}; it must be {words}.")
+
+
+def _fits(value: object, hint: Any) -> bool:
+    origin, args = get_origin(hint), get_args(hint)
+    if origin in (Union, UnionType):
+        return any(_fits(value, one) for one in args)
+    if origin is Literal:
+        return any(value is one or value == one for one in args)
+    if origin in (Sequence, Iterable, tuple):
+        if isinstance(value, (str, bytes, Mapping)) or not isinstance(value, Iterable):
+            return False
+        # What can be read only once is for the function to look at.
+        return origin is Iterable or all(_fits(one, args[0]) for one in value)
+    if origin is Callable:
+        return callable(value)
+    if origin is Mapping:
+        return isinstance(value, Mapping)
+    if hint in _KINDS:
+        return isinstance(value, _KINDS[hint][0]) and (hint is bool or not isinstance(value, bool))
+    if getattr(hint, "_is_protocol", False):
+        return all(hasattr(value, name) for name in vars(hint) if not name.startswith("_"))
+    return not isinstance(hint, type) or isinstance(value, hint)
+
+
+def _words(hint: Any) -> str:
+    """Say what a value must be; empty for what is not checked here, such as arrays."""
+    origin, args = get_origin(hint), get_args(hint)
+    if origin in (Union, UnionType):
+        words = [_words(one) for one in args]
+        return " or ".join(words) if all(words) else ""
+    if origin is Literal:
+        return f"one of {', '.join(args)}"
+    if origin in (Sequence, Iterable, tuple):
+        of = _words(args[0]).removeprefix("a ").replace("number", "numbers")
+        return f"a list of {of}" if of else ""
+    if origin is Callable:
+        return "a function"
+    if origin is Mapping:
+        return "a dict"
+    if hint in _KINDS:
+        return _KINDS[hint][1]
+    return _with_article(hint.__name__) if isinstance(hint, type) and hint is not Any else ""
