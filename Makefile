@@ -12,9 +12,12 @@ help:  ## list the targets
 dev:
 	@VENV=$(VENV) sh .ci/setup dev
 
-demo:  ## run the default survey on a local cluster; results in $(OUT)/
+demo:  ## the default survey, then a drive through a city; results in $(OUT)/ and $(OUT)/drive/
 	@VENV=$(VENV) sh .ci/setup run
 	$(BIN)/lidarpool demo --out $(OUT)
+	@mkdir -p $(OUT)/drive && cp examples/drive.yaml $(OUT)/drive
+	$(BIN)/lidarpool scene city $(OUT)/drive/city.glb --overwrite
+	$(BIN)/lidarpool run $(OUT)/drive/drive.yaml --out $(OUT)/drive
 
 # Whole runs wait for processes and timers: three processes keep two cores busy. The tests of a
 # file stay together, for they share clusters; files come in the order of testpaths.
