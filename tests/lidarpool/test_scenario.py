@@ -9,6 +9,7 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from trimesh.exchange.gltf import export_glb
 
 from lidarpool.base.errors import LidarpoolError
 from lidarpool.base.fingerprint import fingerprint
@@ -360,3 +361,49 @@ def test_materials_returns_noise_and_weather_become_those_of_the_survey():
     assert table.semantic_class.tolist() == [7, 0, 0, 9], "an actor's own class"
     assert table.reflectance.tolist() == [0.3, 0, 0, 0], "with the rest of its material"
     assert table.passes.tolist() == [False, True, True, True]
+
+
+def mesh_file(path, size, height, **asset):
+    """A glTF of trimesh's with a box, as if something else had written it; or an .stl."""
+    box = trimesh.creation.box(size)
+    box.apply_translation([0, 0, height])
+    if path.suffix == ".glb":
+        path.write_bytes(
+            export_glb(trimesh.Scene(box), tree_postprocessor=lambda tree: tree.update(asset=asset))
+        )
+    else:
+        box.export(path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("height", "expected"), [(2.4, [0.6, 1.2, 1.8]), (3.1, [0.775, 1.55, 2.325]), (6, [1, 2, 3])]
+)
+def test_a_mesh_alone_is_scanned_below_its_ceiling_and_whole(tmp_path, height, expected):
+    made = Scenario.load(mesh_file(tmp_path / "hall.stl", (8, 6, height), height / 2))
+    scene = made.build_scene()
+    survey = made.survey(scene)
+    assert [pose.position[2] for pose in survey.poses] == pytest.approx(expected)
+    assert (survey.keep_every, survey.precision_m) == (1, 0.001)
+    default = Scenario().survey(Scenario().build_scene())
+    assert (default.keep_every, default.precision_m) == (5, 0.01)
+
+
+@pytest.mark.parametrize(
+    ("size", "generator", "entry", "says"),
+    [
+        ((8, 3, 6), "Blender", "hall.glb", "hall.glb was turned from Y-up to Z-up, as glTF asks"),
+        ((8, 6, 2), "Blender", "hall.glb", "8 m wide, 6 m high and 2 m thick now"),
+        ((8, 3, 6), "https://github.com/mikedh/trimesh", "hall.glb", "trimesh wrote it"),
+        ((8, 6, 2), "trimesh", {"file": "hall.glb", "up_axis": "y"}, ""),
+        ((8, 6, 2), "trimesh", {"file": "hall.glb", "up_axis": "z"}, ""),
+    ],
+)
+def test_it_is_told_that_gltf_was_turned_and_what_to_say(tmp_path, size, generator, entry, says):
+    width, height, depth = size[0], size[1], size[2]
+    mesh_file(tmp_path / "hall.glb", (width, height, depth), 0, generator=generator, version="2.0")
+    made = Scenario.from_data({"scene": {"files": [entry]}}, folder=tmp_path)
+    told = made.advice(made.build_scene())
+    assert len(told) == bool(says)
+    if says:
+        assert says in told[0] and "give it up_axis: z" in told[0]

@@ -48,7 +48,8 @@ def test_init_with_meshes_names_them_as_seen_from_the_scenario(tmp_path, lidarpo
         ("../../#1: é.glb", "mm"),
     ]
     assert len(made.build_scene().names) == 2
-    rest = {"scene": {"files", "preset"}}
+    assert (made.cloud.keep_every, made.cloud.precision_m) == (1, 0.001)
+    rest = {"scene": {"files", "preset"}, "cloud": True}
     assert made.model_dump(exclude=rest) == Scenario().model_dump(exclude=rest)
 
 

@@ -143,7 +143,7 @@ def demo(out: Path, **shown: Any) -> None:
 def run(scenario: Path, **given: Any) -> None:
     """Run the survey of a scenario or mesh file.
 
-    A mesh file alone is scanned from its middle.
+    A mesh file alone is scanned from its middle, below the ceiling; every hit is kept, to 1 mm.
 
     \b
     Examples:

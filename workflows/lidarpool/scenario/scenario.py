@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -16,9 +17,9 @@ from ..base.errors import LidarpoolError
 from ..base.words import did_you_mean
 from ..plan import Planning
 from ..scene.actors import Actor, box, one_mesh
-from ..scene.floor import floor_under
+from ..scene.floor import room_at
 from ..scene.mesh import Mesh
-from ..scene.meshfile import SUFFIXES, UNITLESS, load_meshes
+from ..scene.meshfile import SUFFIXES, UNITLESS, Y_UP, load_meshes
 from ..scene.scene import Scene
 from ..scene.shapes import seed_objects
 from ..sensor import Material, Mounted, Noise, Pose, Returns, Survey
@@ -54,7 +55,11 @@ LARGE_M, SMALL_M = 500.0, 0.2
 
 SEED_START = (25.0, 25.0)
 SEED_TARGET = (-30.0, -20.0)
-_HEIGHTS_M = (1.0, 2.0, 3.0)  # of the sensor, where no poses are given
+# Of the sensor, where no poses are given; and how far it stays from the ceiling at least.
+_HEIGHTS_M, _BELOW_M = (1.0, 2.0, 3.0), 0.2
+
+# Of a mesh file that comes without a scenario: all there is of it.
+WHOLE_CLOUD = {"keep_every": 1, "precision_m": 0.001}
 
 
 class Scenario(Section):
@@ -69,7 +74,8 @@ class Scenario(Section):
     poses
         Where the sensor scans from, in world coordinates. Where none are given it stands at
         the origin (default objects) or in the middle of the scene (mesh files), 1, 2 and 3
-        metres above the ground or floor there; see `floor_under`.
+        metres above the ground or floor there, or at a quarter, half and three quarters of the
+        height of a room that is lower; see `room_at`.
     steps
         Time steps from each pose.
 
@@ -88,7 +94,8 @@ class Scenario(Section):
             min_length=1,
             max_length=1_000_000,
             description="where the sensor stands, world metres, Z-up; by default 1, 2 and 3 m "
-            "above the origin (default objects) or the middle of the floor (files)",
+            "above the origin (default objects) or the middle of the floor (files), below the "
+            "ceiling",
             examples=[[[0, 0, 1], [0, 0, 2], {"position": [0, 0, 3], "yaw_deg": 90}]],
         ),
     ] = None
@@ -157,6 +164,7 @@ class Scenario(Section):
     _folder: Path = PrivateAttr(default=Path())  # that relative file names start from
     _source: str = PrivateAttr(default="the default survey")  # for messages
     _notes: list[str] = PrivateAttr(default_factory=list)  # of what was left out of the scene
+    _turned: list[str] = PrivateAttr(default_factory=list)  # files that seem to be Y-up, as is due
 
     @model_validator(mode="after")
     def _both_ends(self) -> Scenario:
@@ -184,7 +192,7 @@ class Scenario(Section):
         """
         path = Path(path)
         if path.suffix.lower() in SUFFIXES:
-            data = {"scene": {"files": [path.name]}}
+            data = {"scene": {"files": [path.name]}, "cloud": WHOLE_CLOUD}
             return cls.from_data(data, source=str(path), folder=path.parent)
         return cls.from_data(read_yaml(path), source=str(path), folder=path.parent)
 
@@ -224,9 +232,16 @@ class Scenario(Section):
     def advice(self, scene: Scene) -> list[str]:
         """Return notes on what looks like a mistake: a size that speaks of another unit.
 
-        Also on objects that `build_scene` left out.
+        Also on objects that `build_scene` left out, and on files that it turned to Z-up.
         """
         notes = list(self._notes)
+        if self._turned:
+            more = f" and {len(self._turned) - 1:,} more were" if self._turned[1:] else " was"
+            notes.append(
+                f"{self._turned[0]}{more} turned from Y-up to Z-up, as glTF asks: if it lies on "
+                "its side now, give it up_axis: z in scene.files, else y "
+                f"(lidarpool init DIR --mesh {shlex.quote(self._turned[0])} --up-axis z)"
+            )
         unitless = [
             entry.file
             for entry in self.scene.files
@@ -250,6 +265,7 @@ class Scenario(Section):
             If a mesh file cannot be read.
         """
         self._notes.clear()
+        self._turned.clear()
         meshes: list[Mesh] = list(seed_objects()) if self.scene.has_seed else []
         for entry in self.scene.files:
             meshes += self._read(entry)
@@ -370,13 +386,17 @@ class Scenario(Section):
             except RuntimeError as error:  # of a user who is not known
                 raise LidarpoolError(f"the file {entry.file!r} has no place: {error}") from error
             transform = entry.transform()
-        return load_meshes(
+        told = len(self._notes)
+        meshes = load_meshes(
             path,
             unit=entry.unit,
             up_axis=entry.up_axis,
             transform=transform,
             tell=self._notes.append,
         )
+        if entry.up_axis is None and path.suffix.lower() in Y_UP and len(self._notes) == told:
+            self._turned.append(entry.file)
+        return meshes
 
     def _world_poses(
         self, scene: Scene
@@ -386,12 +406,14 @@ class Scenario(Section):
             for pose in self.poses:
                 yield pose.position, pose.yaw_deg, pose.pitch_deg, pose.roll_deg
             return
-        x, y, floor = 0.0, 0.0, 0.0
+        x, y, floor, heights = 0.0, 0.0, 0.0, [*_HEIGHTS_M]
         if not self.scene.has_seed:
             low, high = scene.bounds + scene.origin
             x, y = (low[:2] + high[:2]) / 2
-            floor = floor_under(scene, x, y)
-        for height in _HEIGHTS_M:
+            floor, ceiling = room_at(scene, x, y)
+            if floor + heights[-1] > ceiling - _BELOW_M:
+                heights = [(ceiling - floor) * share for share in (0.25, 0.5, 0.75)]
+        for height in heights:
             yield (float(x), float(y), float(floor + height)), 0.0, 0.0, 0.0
 
     def _discs(self, scene: Scene) -> tuple[np.ndarray[Any, np.dtype[np.float64]], list[str]]:

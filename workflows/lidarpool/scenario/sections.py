@@ -274,7 +274,8 @@ class CloudSection(Section):
     """What is kept of the hits."""
 
     keep_every: Annotated[
-        int, Field(ge=1, le=1_000_000, description="of the hits of each scan, every n-th")
+        int,
+        Field(ge=1, le=1_000_000, description="of the hits of a scan, every n-th; by default 5"),
     ] = 5
     precision_m: Annotated[
         Annotated[float, Field(ge=1e-6, le=1000)] | None,

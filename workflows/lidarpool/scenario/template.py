@@ -10,7 +10,7 @@ import yaml
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from .scenario import Scenario
+from .scenario import WHOLE_CLOUD, Scenario
 from .schema import SCHEMA_FILE
 
 SCENARIO_FILE = "scenario.yaml"
@@ -38,9 +38,11 @@ def scenario_template(files: Sequence[dict[str, str]] = ()) -> str:
         Mesh files to begin with, as in `scene.files`.
     """
     lines = [_HEAD]
+    given: dict[str, dict[str, Any]] = {}
+    if files:
+        given = {"scene": {"files": list(files)}, "cloud": WHOLE_CLOUD}
     for name, field in Scenario.model_fields.items():
-        given = {"files": list(files)} if name == "scene" and files else {}
-        lines += ["\n", *(f"{line}\n" for line in _top(name, field, given))]
+        lines += ["\n", *(f"{line}\n" for line in _top(name, field, given.get(name, {})))]
     return "".join(lines)
 
 

@@ -1,4 +1,4 @@
-"""What is below a place: the floor, on which a sensor stands."""
+"""What is below and above a place: the floor, on which a sensor stands, and the ceiling."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ from .scene import Scene
 
 # Thicker than floors are; what is thicker, such as a hall that is one box, one stands in.
 SLAB_M = 0.5
+FURNITURE_M = 1.5  # what is lower above the floor is no ceiling
 
 
-def floor_under(scene: Scene, x: float, y: float) -> float:
-    """Height of the ground or of a floor slab at a place.
+def room_at(scene: Scene, x: float, y: float) -> tuple[float, float]:
+    """Heights of the floor at a place, and of the ceiling over it.
 
     Parameters
     ----------
@@ -23,13 +24,18 @@ def floor_under(scene: Scene, x: float, y: float) -> float:
 
     Returns
     -------
-    z in world metres: of the lowest triangle there if it faces up, as ground does, or of the top
-    of a slab that is the lowest thing there; else of the lowest point of the whole scene.
+    floor
+        z in world metres: of the lowest triangle there if it faces up, as ground does, or of the
+        top of a slab that is the lowest thing there; else of the lowest point of the whole scene.
+    ceiling
+        z of the lowest triangle that is higher over it than furniture; infinite if there is none.
     """
     heights, up = _crossings(scene, np.array([x, y]) - scene.origin[:2])
+    floor = scene.bounds[0, 2]
     if up.any() and heights[up].min() <= heights.min() + SLAB_M:
-        return float(heights[up].min() + scene.origin[2])
-    return float(scene.bounds[0, 2] + scene.origin[2])
+        floor = heights[up].min()
+    ceiling = heights[heights > floor + FURNITURE_M].min(initial=np.inf)
+    return float(floor + scene.origin[2]), float(ceiling + scene.origin[2])
 
 
 def heights_at(scene: Scene, x: float, y: float) -> NDArray[np.float64]:

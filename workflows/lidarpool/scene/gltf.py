@@ -44,6 +44,7 @@ def read_gltf(data: bytes, path: Path) -> Content:
     reader = _Reader(header, body, path)
     content = instances(_roots(header), reader.node, path.stem)
     content.unit_m, content.up_axis = 1.0, "y"
+    content.generator = str(header.get("asset", {}).get("generator", ""))
     return content
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import codecs
 import logging
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +35,7 @@ _READERS: dict[str, Callable[[bytes, Path], Content]] = {
     ".3mf": read_3mf,
 }
 SUFFIXES = tuple(_READERS)
+Y_UP = (".glb", ".gltf")  # whose standard says so
 UNITLESS = (".obj", ".stl", ".ply", ".off")  # that cannot say in which unit their numbers are
 
 # Nothing on Earth is farther from the origin of its map; see also `sections.Coordinate`.
@@ -70,7 +71,8 @@ def load_meshes(
     transform
         Placement in the world, in metres, after unit and up axis.
     tell
-        Called with a line on what was left out; by default a warning of this module's logger.
+        Called with a line on what was left out, or seems to lie on its side; by default a warning
+        of this module's logger.
 
     Returns
     -------
@@ -99,7 +101,23 @@ def load_meshes(
     if content.skipped:
         names = ", ".join(content.skipped[:3]) + ", …" * (len(content.skipped) > 3)
         tell(f"{path} scales {names} to nothing: left out")
+    if up_axis is None and path.suffix.lower() in Y_UP and (why := _lies(content, meshes)):
+        tell(
+            f"{path} was turned from Y-up to Z-up, as glTF asks, and {why}: if it lies on its side "
+            "now, give it up_axis: z (in Python up_axis='z'), else y"
+        )
     return meshes
+
+
+def _lies(content: Content, meshes: Sequence[Mesh]) -> str:
+    """Say why a file that was turned from Y-up seems to have been Z-up; empty if it does not."""
+    if "trimesh" in content.generator:
+        return "trimesh wrote it, which keeps the axes that it is given"
+    low = np.min([mesh.vertices.min(axis=0) for mesh in meshes], axis=0)
+    x, y, z = np.max([mesh.vertices.max(axis=0) for mesh in meshes], axis=0) - low
+    if 2 * y < min(x, z):
+        return f"is {x:,.3g} m wide, {z:,.3g} m high and {y:,.3g} m thick now"
+    return ""
 
 
 def _read_whole(path: Path, data: bytes) -> Content:

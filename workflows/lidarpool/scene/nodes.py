@@ -31,6 +31,7 @@ class Content:
     meshes: list[Mesh]
     unit_m: float | None = None  # metres in its unit; None where it states none
     up_axis: str | None = None  # 'x', 'y' or 'z'; None where neither it nor its format states one
+    generator: str = ""  # what wrote it, where it says so
     skipped: list[str] = field(default_factory=list)  # names of what nodes scale to nothing
 
 

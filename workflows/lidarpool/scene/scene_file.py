@@ -80,9 +80,17 @@ def _encoded(suffix: str, scene: Scene) -> bytes:
         return bytes(export_ply(whole, vertex_normal=False))
     if suffix == ".glb":
         # UP_AXES["y"] turns Y-up to Z-up; its transpose turns back.
-        return bytes(export_glb(_objects(scene, UP_AXES["y"].T), include_normals=False))
+        objects = _objects(scene, UP_AXES["y"].T)
+        return bytes(
+            export_glb(objects, include_normals=False, tree_postprocessor=_name_the_writer)
+        )
     objects = _objects(scene, np.eye(3))
     return str(export_obj(objects, include_normals=False, include_texture=False)).encode()
+
+
+def _name_the_writer(tree: dict[str, Any]) -> None:
+    """Say in a glTF who wrote it: files of trimesh's own are mostly not Y-up, and this one is."""
+    tree["asset"]["generator"] = "lidarpool"
 
 
 def _objects(scene: Scene, turn: np.ndarray[Any, np.dtype[np.float64]]) -> trimesh.Scene:
