@@ -3,8 +3,10 @@
 import json
 import signal
 import sys
+import threading
 import types
 from dataclasses import replace
+from pathlib import Path
 
 import laspy
 import numpy as np
@@ -277,6 +279,21 @@ def test_bags_have_points_frames_and_a_clock(written, cloud, sweeps, name, layou
         np.testing.assert_array_equal(rows["range"], np.round(points.range * 1000))
 
 
+def test_the_reader_of_foxglove_takes_a_bag(written, cloud, sweeps):
+    decoder = pytest.importorskip("mcap_ros2.decoder").DecoderFactory()
+    with written("mcap").open("rb") as file:
+        reader = pytest.importorskip("mcap.reader").make_reader(file, decoder_factories=[decoder])
+        read = list(reader.iter_decoded_messages())
+    times = [message.log_time for _, _, message, _ in read]
+    assert times == sorted(times)
+    points = [cloud for _, channel, _, cloud in read if channel.topic.endswith("/points")]
+    assert sum(one.width for one in points) == len(cloud)
+    assert all(len(one.data) == one.width * one.point_step for one in points)
+    boxes = [markers for _, channel, _, markers in read if channel.topic == "/actors"]
+    assert {marker.text for one in boxes for marker in one.markers} == {"Car"}
+    assert len(boxes) == len(points) == len(sweeps)
+
+
 def test_e57_has_a_scan_with_its_pose_for_each_sweep(written, cloud):
     with pye57.E57(str(written("e57"))) as file:
         assert file.scan_count == 9  # of which none is empty
@@ -512,7 +529,7 @@ def test_a_cloud_is_saved_in_the_format_of_its_ending(cloud, sweeps, tmp_path):
     with pytest.raises(LidarpoolError, match="not in the order of their scans"):
         known.part(np.arange(len(cloud))[::-1]).save(tmp_path / "x.e57")
     shorter = replace(sweeps, scans=sweeps.scans[:6], begins_ns=sweeps.begins_ns[:5])
-    with pytest.raises(LidarpoolError, match="or not of the survey that the sweeps are of"):
+    with pytest.raises(LidarpoolError, match="or of another survey than the sweeps"):
         replace(cloud, sweeps=lambda: shorter).save(tmp_path / "x.mcap")
     assert sorted(tmp_path.rglob("*")) == before
 
@@ -538,6 +555,20 @@ def test_an_error_in_a_thread_ends_the_writing(sweeps, cloud, tmp_path, monkeypa
     with pytest.raises(LidarpoolError, match="kitti cannot be written: No space left on device"):
         Format("kitti").write(tmp_path / "kitti", cloud, sweeps)
     assert len(begun) <= 3
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_interrupt_leaves_nothing_of_what_threads_write(sweeps, cloud, tmp_path, monkeypatch):
+    write, main, once = Path.write_bytes, threading.main_thread().ident, threading.Lock()
+
+    def interrupted(path, data):
+        if once.acquire(blocking=False):
+            signal.pthread_kill(main, signal.SIGINT)
+        return write(path, data)
+
+    monkeypatch.setattr("pathlib.Path.write_bytes", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        Format("kitti").write(tmp_path / "kitti", cloud, sweeps)
     assert not list(tmp_path.iterdir())
 
 

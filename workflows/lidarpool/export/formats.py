@@ -166,7 +166,9 @@ class Format:
             try:
                 beside.mkdir()
                 getattr(writers, f"write_{self.name}")(staged, cloud, sweeps, **more)
-                remove(path)
+                flush(staged)
+                if path.is_dir() or staged.is_dir():  # files replace files at once
+                    remove(path)
                 staged.replace(path)
                 flush(path.parent)
             finally:

@@ -165,8 +165,8 @@ class Sweeps:
             sweep = np.searchsorted(self.scans, chunk["scan"], "right") - 1
             if sweep[0] < current or sweep[-1] >= len(self) or (np.diff(sweep) < 0).any():
                 raise LidarpoolError(
-                    "The points are not in the order of their scans, or not of the survey that "
-                    "the sweeps are of."
+                    "The points are not in the order of their scans, or of another survey than "
+                    f"the sweeps ({SWEEPS_FILE}): give both of one run, and keep the order."
                 )
             for first, end in pairwise([0, *(np.flatnonzero(np.diff(sweep)) + 1), len(sweep)]):
                 while current < sweep[first]:
