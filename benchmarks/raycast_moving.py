@@ -21,8 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from raybeam import Motion, Pattern, RayCaster, available_backends
-from raybeam.embree_backend import EmbreeBackend
-from raybeam.mesh import local_mesh
 
 from .cuda_scenes import city
 
@@ -64,15 +62,15 @@ def _bare(vertices: Float, faces: Any, directions: Float) -> Callable[[Float, Fl
     """Cast as one would with Open3D, for one pose; the fastest way to make its rays."""
     import open3d
 
-    mesh = local_mesh(vertices, faces)
-    scene, tensor = EmbreeBackend(mesh, 1)._scene, open3d.core.Tensor.from_numpy
+    scene, tensor = open3d.t.geometry.RaycastingScene(nthreads=1), open3d.core.Tensor
+    scene.add_triangles(tensor(vertices.astype(np.float32)), tensor(faces.astype(np.uint32)))
     single = directions.astype(np.float32)
     rows = np.empty((len(directions), 6), np.float32)
 
     def cast(position: Float, rotation: Float) -> Any:
-        rows[:, :3] = mesh.to_local(position[None])
+        rows[:, :3] = position
         np.matmul(single, rotation.T.astype(np.float32), out=rows[:, 3:])
-        return scene.cast_rays(tensor(rows), nthreads=1)
+        return scene.cast_rays(tensor.from_numpy(rows), nthreads=1)
 
     return cast
 

@@ -36,7 +36,15 @@ class EmbreeAlone(Engine):
         mesh = local_mesh(job.vertices, job.faces)
         engine = EmbreeBackend(mesh, self.threads)
         origins = [mesh.to_local(origin[None]) for origin in job.origins]
-        return _cast_rays(engine._scene, job, origins, engine.chunk, self.threads)
+        chunks = _chunks(job, origins, engine.chunk)
+        hits = sum(int((engine._trace(rows)[1] >= 0).sum()) for rows in chunks)
+
+        def cast() -> int:
+            for rows in chunks:
+                engine._trace(rows)
+            return hits  # counting them anew would be gathering
+
+        return cast
 
 
 class Open3D(Engine):
@@ -47,12 +55,27 @@ class Open3D(Engine):
 
     def missing(self) -> str:
         """See `Engine.missing`."""
-        return available_backends()["embree"]
+        return "" if importlib.util.find_spec("open3d") else "pip install open3d-cpu"
 
     def prepare(self, job: Job) -> Cast:
         """See `Engine.prepare`."""
+        import open3d
+
         scene = _open3d_scene(job, self.threads)
-        return _cast_rays(scene, job, job.origins[:, None], self.chunk, self.threads)
+        chunks = [
+            open3d.core.Tensor.from_numpy(rows)
+            for rows in _chunks(job, job.origins[:, None], self.chunk)
+        ]
+        hits = sum(
+            int((scene.cast_rays(part)["primitive_ids"].numpy() != _MISS).sum()) for part in chunks
+        )
+
+        def cast() -> int:
+            for part in chunks:
+                scene.cast_rays(part, nthreads=self.threads)
+            return hits
+
+        return cast
 
 
 class Open3DWhole(Open3D):
@@ -184,29 +207,15 @@ def _open3d_scene(job: Job, threads: int) -> Any:
     return scene
 
 
-def _cast_rays(scene: Any, job: Job, origins: Any, chunk: int, threads: int) -> Cast:
-    """Loop over chunks of rays that were made before."""
-    import open3d
-
+def _chunks(job: Job, origins: Any, chunk: int) -> list[NDArray[np.float32]]:
+    """Rays (n, 6) of all origins, made before they are cast."""
     directions = job.directions @ job.rotation.T
     chunks = []
     for origin in origins:
         rays = np.empty((len(directions), 6), np.float32)
         rays[:, :3], rays[:, 3:] = origin, directions
-        chunks += [
-            open3d.core.Tensor.from_numpy(rays[start : start + chunk])
-            for start in range(0, len(rays), chunk)
-        ]
-    hits = sum(
-        int((scene.cast_rays(part)["primitive_ids"].numpy() != _MISS).sum()) for part in chunks
-    )
-
-    def cast() -> int:
-        for part in chunks:
-            scene.cast_rays(part, nthreads=threads)
-        return hits  # counting them anew would be gathering
-
-    return cast
+        chunks += [rays[start : start + chunk] for start in range(0, len(rays), chunk)]
+    return chunks
 
 
 ENGINES: tuple[type[Engine], ...] = (

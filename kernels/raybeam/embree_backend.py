@@ -1,9 +1,10 @@
-"""Ray casting with Embree, as Open3D ships it."""
+"""Ray casting with Embree, as embreex ships it."""
 
 from __future__ import annotations
 
-import importlib.util
+import os
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -13,7 +14,6 @@ from numpy.typing import NDArray
 from .backend import Backend, Found
 from .hits import ScanReturns
 from .mesh import LocalMesh
-from .open3d_module import load_open3d
 from .rays import Rays
 from .refine import Refiner
 from .scan import Collector, Scan
@@ -35,6 +35,8 @@ _NEAR = 2.0
 # more only where the cosine between ray and normal is below some 1e-4; then a refined distance
 # beyond a limit is not believed.
 _CLEAR = 2.0**-8
+
+_SHARE = 1 << 13  # rays that a thread takes at a time, where there are several
 
 
 @dataclass(frozen=True)
@@ -71,19 +73,20 @@ class _Hits:
     t
         (n,): local distance of each ray's hit; where it does not count, anything.
     place
-        uint32 (n,): row of the mesh's corners; likewise.
+        int32 (n,): row of the mesh's corners; likewise.
     """
 
     counts: NDArray[np.bool_]
     t: NDArray[np.floating[Any]]
-    place: NDArray[np.uint32]
+    place: NDArray[np.int32]
 
 
 class EmbreeBackend(Backend):
-    """Open3D's RaycastingScene; the winner's distance is worked out again in float64.
+    """Embree's closest hits; the winner's distance is worked out again in float64.
 
     Embree decides in float32 which triangle is hit. Surfaces nearer to each other, or to the
-    ray's start, than about 1e-6 of the scene's size are not told apart.
+    ray's start, than about 1e-6 of the scene's size are not told apart. Casting takes as many
+    threads as it is given; Embree's tree is built by every core.
     """
 
     name: ClassVar[str] = "embree"
@@ -93,28 +96,24 @@ class EmbreeBackend(Backend):
     @classmethod
     def missing(cls) -> str:
         """See `Backend.missing`."""
-        if importlib.util.find_spec("open3d") is None:
-            return "Open3D is not installed: pip install open3d-cpu (Linux x86_64) or open3d"
         try:
-            load_open3d()
-        except (ImportError, OSError) as error:
-            return (
-                f"Open3D does not load ({error}); on Debian and Ubuntu it needs the packages "
-                "libegl1 libgl1 libgomp1 libusb-1.0-0"
-            )
+            import embreex.rtcore_scene  # noqa: F401
+        except ImportError as error:
+            return f"embreex does not load ({error}): pip install embreex"
         return ""
 
     def __init__(
         self, mesh: LocalMesh, threads: int | None = None, device: int | None = None
     ) -> None:
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+
         super().__init__(mesh, threads, device)
-        self._threads = threads or 0  # 0: Open3D takes every core
-        open3d = load_open3d()
-        self._tensor = open3d.core.Tensor.from_numpy
-        points = mesh.corners.reshape(-1, 3).astype(np.float32)
-        rows = np.arange(len(points), dtype=np.uint32).reshape(-1, 3)
-        self._scene = open3d.t.geometry.RaycastingScene(nthreads=self._threads)
-        self._scene.add_triangles(self._tensor(points), self._tensor(rows))
+        self._threads = ThreadPoolExecutor(threads or os.cpu_count(), "embree")
+        self._one = threads == 1
+        self._scene = EmbreeScene()  # robust: rays between two triangles hit one of them
+        TriangleMesh(self._scene, mesh.points, mesh.rows)
+        self._trace(np.empty((0, 6), np.float32))  # builds the tree, which threads may not
         self._refine = Refiner(mesh)
 
     def closest(self, rays: Rays) -> Found:
@@ -185,7 +184,7 @@ class EmbreeBackend(Backend):
         unit: Float,
         starts: Starts,
         limits: _Limits,
-    ) -> tuple[NDArray[np.intp], Float, NDArray[np.uint32]]:
+    ) -> tuple[NDArray[np.intp], Float, NDArray[np.int32]]:
         """Find the next hits, behind `t_min`, of rays that hit something before.
 
         Returns the rays that have one, in any order; refined distances; places.
@@ -208,7 +207,7 @@ class EmbreeBackend(Backend):
 
     def _cast(
         self, desk: Workspace, unit: Float, starts: Starts, begin: float
-    ) -> tuple[NDArray[np.floating[Any]], NDArray[np.uint32]]:
+    ) -> tuple[NDArray[np.floating[Any]], NDArray[np.int32]]:
         """Closest hits at or behind a distance `begin`, up to float32 rounding; see `_within`.
 
         Returns rough distances (n,), local, inf for a miss; and rows of the mesh's corners (n,).
@@ -222,16 +221,29 @@ class EmbreeBackend(Backend):
             ways = np.maximum(np.where(near, 0, entry), begin)
             # From so far away that float64 cannot place the start, it stays near the scene.
             starts = Starts(np.clip(points + ways[:, None] * unit.T, -_NEAR, _NEAR))
-        rows = desk.start(n, starts)
-        answer = self._scene.cast_rays(self._tensor(rows), nthreads=self._threads)
-        t: NDArray[np.floating[Any]] = answer["t_hit"].numpy()
-        return t if ways is None else t + ways, answer["primitive_ids"].numpy()
+        t, place = self._trace(desk.start(n, starts))
+        return t if ways is None else t + ways, place
+
+    def _trace(self, rows: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+        """Closest hits of rows (n, 6), origins and directions; distances are inf for a miss."""
+        t = np.full(len(rows), np.inf, np.float32)  # how far to look; embreex writes hits to it
+
+        def part(share: slice) -> NDArray[np.int32]:
+            origins, directions = rows[share, :3], rows[share, 3:]
+            found = self._scene.run(origins, directions, dists=t[share], output=True)
+            place: NDArray[np.int32] = found["primID"]
+            return place
+
+        if self._one or len(rows) <= _SHARE:
+            return t, part(slice(None))
+        shares = [slice(start, start + _SHARE) for start in range(0, len(rows), _SHARE)]
+        return t, np.concatenate(list(self._threads.map(part, shares)))
 
     def _refined(
         self,
         ray: NDArray[np.intp],
         rough: NDArray[np.floating[Any]],
-        place: NDArray[np.uint32],
+        place: NDArray[np.int32],
         unit: Float,
         starts: Starts,
     ) -> Float:

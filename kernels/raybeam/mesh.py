@@ -31,9 +31,11 @@ class LocalMesh:
         float64 (3,), metres: what was subtracted.
     scale
         Local units in one metre, a power of two.
+    points, rows
+        Vertices, float64 (v, 3), local; and int64 (k, 3), the rows of the three of each
+        triangle. Triangles without an area are left out.
     corners
-        float64 (k, 3, 3), local: triangle, corner, coordinate. Triangles without an area
-        are left out.
+        float64 (k, 3, 3), local: triangle, corner, coordinate.
     index
         int32 (k,): the row of `faces` that each triangle came from.
     face_count
@@ -42,6 +44,8 @@ class LocalMesh:
 
     centre: NDArray[np.float64]
     scale: float
+    points: NDArray[np.float64]
+    rows: NDArray[np.int64]
     corners: NDArray[np.float64]
     index: NDArray[np.int32]
     face_count: int
@@ -103,16 +107,18 @@ def local_mesh(vertices: ArrayLike, faces: ArrayLike) -> LocalMesh:
     centre = low / 2 + high / 2
     half = float(np.maximum(high - centre, centre - low).max())
     scale = math.ldexp(1.0, -math.frexp(half)[1]) if half > 0 else 1.0
-    corners = ((points - centre) * scale)[rows]
+    points = (points - centre) * scale
+    corners = points[rows]
     solid = np.concatenate(
         [_solid(corners[start : start + _BLOCK]) for start in range(0, len(corners), _BLOCK)]
     )
     index = np.flatnonzero(solid).astype(np.int32)
     if not len(index):
         raise ValueError("No triangle of the mesh has an area: there is nothing to hit.")
-    return LocalMesh(
-        centre, scale, corners if len(index) == len(rows) else corners[solid], index, len(rows)
-    )
+    face_count = len(rows)
+    if len(index) < face_count:
+        rows, corners = rows[solid], corners[solid]
+    return LocalMesh(centre, scale, points, rows, corners, index, face_count)
 
 
 def _solid(corners: NDArray[np.float64]) -> NDArray[np.bool_]:

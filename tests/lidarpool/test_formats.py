@@ -30,6 +30,7 @@ from lidarpool import (
     read_cloud,
     save_cloud,
 )
+from lidarpool.base.open3d_module import load_open3d
 from lidarpool.base.vocabulary import FORMATS
 from lidarpool.columns.table import TABLE
 from lidarpool.export import threads
@@ -38,7 +39,6 @@ from lidarpool.export.formats import Format
 from lidarpool.export.sweeps import Sweeps
 from lidarpool.scene.actors import Actor, box
 from lidarpool.sensor.trajectory import matrices
-from raybeam.open3d_module import load_open3d
 
 COLUMNS = ("time", "intensity", "reflectivity", "range", "azimuth", "elevation", "class",
            "return_number", "returns", "sensor")  # fmt: skip

@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
 from lidarpool.base.errors import LidarpoolError
+from lidarpool.base.open3d_module import load_open3d
 from lidarpool.columns.cloud import Cloud
 from lidarpool.columns.table import Column
 from lidarpool.export import ply
 from lidarpool.export.ply import read_cloud, save_cloud
-from raybeam.open3d_module import load_open3d
 
 
 def sample(count, *, offset=0.0, seed=1):

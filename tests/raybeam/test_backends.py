@@ -6,13 +6,14 @@ import os
 import re
 import subprocess
 import sys
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from raybeam import BackendUnavailable, Pattern, RayCaster, available_backends
+from raybeam import BackendUnavailable, RayCaster, available_backends
 from raybeam.cuda_backend import CudaBackend
 from raybeam.embree_backend import EmbreeBackend
 from raybeam.mesh import local_mesh
@@ -45,7 +46,8 @@ def test_what_cannot_be_had_says_why(monkeypatch):
         RayCaster(*MESH, backend="numpy", threads=0)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert "pip install cupy" in CudaBackend.missing()
-    with pytest.raises(BackendUnavailable, match="'embree' cannot be used here: Open3D is not"):
+    monkeypatch.setitem(sys.modules, "embreex.rtcore_scene", None)
+    with pytest.raises(BackendUnavailable, match=r"'embree' cannot be used here: .*: pip install"):
         RayCaster(*MESH, backend="embree")
 
 
@@ -56,28 +58,12 @@ def run_python(code):
 
 
 def test_import_needs_numpy_only():
-    """Neither Open3D nor CuPy is loaded by importing, nor by casting with numpy."""
+    """Neither Embree nor CuPy is loaded by importing, nor by casting with numpy."""
     code = (
         "import sys, raybeam; "
         "raybeam.RayCaster([[0,0,0],[1,0,0],[0,1,0]], [[0,1,2]], 'numpy').cast([0,0,1],[0,0,-1]); "
-        "heavy = {'open3d', 'cupy', 'dask', 'trimesh', 'scipy'} & set(sys.modules); "
+        "heavy = {'embreex', 'open3d', 'cupy', 'dask', 'trimesh'} & set(sys.modules); "
         "sys.exit(str(heavy) if heavy else 0)"
-    )
-    run_python(code)
-
-
-def test_open3d_comes_without_its_viewers_and_whole_to_whoever_imports_it():
-    """Dash and Plotly take longer to import than all that casting and writing need.
-
-    In a process of its own: pytest rewrites Dash, whose plugin it knows, and the many files of
-    that can fail in Python 3.11 ("AST constructor recursion depth mismatch").
-    """
-    if EmbreeBackend.missing():
-        pytest.skip("needs Open3D")
-    code = (
-        "import sys; from raybeam.open3d_module import load_open3d; o3d = load_open3d(); "
-        "assert not {'open3d', 'dash', 'plotly'} & set(sys.modules); "
-        "import open3d; assert open3d.t.geometry is o3d.t.geometry is load_open3d().t.geometry"
     )
     run_python(code)
 
@@ -129,23 +115,25 @@ def test_what_cuda_lacks(monkeypatch, devices, version, headers, words):
     assert re.search(words, CudaBackend.missing())
 
 
-def test_embree_is_told_how_many_threads(shapes):
-    """Every call of Open3D takes as many as were given: it would take every core otherwise."""
+def casting_threads():
+    return {thread for thread in threading.enumerate() if thread.name.startswith("embree")}
+
+
+def test_embree_takes_as_many_threads_as_are_given(shapes):
+    """Each of several gets its share of the rays, and the answer has the same bits."""
     if reason := available_backends()["embree"]:
         pytest.skip(f"embree: {reason}")
-    caster = RayCaster(*shapes["vase"](), "embree", threads=1)
-    scene, told = caster._engine._scene, []
-
-    class Recorder:
-        def __getattr__(self, name):
-            def call(rays, nthreads):
-                told.append((name, nthreads))
-                return getattr(scene, name)(rays, nthreads=nthreads)
-
-            return call
-
-    caster._engine._scene = Recorder()
     directions = np.random.default_rng(1).normal(size=(40_000, 3))
-    caster.cast([0.05, 0.1, 0.4], directions)
-    caster.scan(Pattern(directions), [0.05, 0.1, 0.4])
-    assert set(told) == {("cast_rays", 1)}
+    casters = {n: RayCaster(*shapes["vase"](), "embree", threads=n) for n in (1, 3)}
+    before = casting_threads()
+    one = casters[1].cast([0.05, 0.1, 0.4], directions)
+    assert casting_threads() <= before
+    more = casters[3].cast([0.05, 0.1, 0.4], directions)
+    started = casting_threads() - before
+    assert 1 <= len(started) <= 3
+    np.testing.assert_array_equal(one.distance, more.distance)
+    np.testing.assert_array_equal(one.triangle, more.triangle)
+    del casters[3]
+    for thread in started:  # which end with their caster
+        thread.join(120)
+        assert not thread.is_alive()

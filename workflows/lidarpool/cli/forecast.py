@@ -38,8 +38,8 @@ from ..scene.scene import Scene
 from ..sensor import Survey
 from .run_command import NO_HITS
 
-# Measured on Linux: a process of ours with Dask and Open3D loaded, and what a triangle takes at
-# most while a caster is built (Embree 300, NumPy 320, CUDA 330).
+# Measured on Linux: a process of ours with Dask loaded, and what a triangle takes at most while
+# a caster is built (Embree 300, NumPy 350, CUDA 360).
 PROCESS_BYTES = 200 << 20
 TRIANGLE_BYTES = 360
 SCENE_BYTES = 80  # of a triangle, in every process that knows the scene

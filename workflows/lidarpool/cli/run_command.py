@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from distributed import Client
 
+from ..base.open3d_module import load_open3d
 from ..base.vocabulary import PATIENCE_S, WAIT_S
 from ..base.words import counted
 from ..export.folder import result_folder
@@ -114,6 +115,7 @@ def _simulate(
     formats = formats_of(scenario)
     for one in formats:
         one.check_installed()
+    load_open3d()  # what writes the cloud in the end
     with result_folder(options.out):
         goes_on = options.resume and (options.out / RUN_FOLDER / FILE).exists()
         if not (options.overwrite or goes_on):

@@ -11,10 +11,9 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from raybeam.open3d_module import load_open3d
-
 from ..base.arguments import as_array, checked_fields
 from ..base.errors import LidarpoolError
+from ..base.open3d_module import load_open3d
 from .table import TABLE, Column
 
 CHUNK_POINTS = 1_000_000  # in memory at a time where a cloud is read in order

@@ -13,11 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from raybeam.open3d_module import load_open3d
-
 from ..base.arguments import checked
 from ..base.errors import LidarpoolError
-from ..base.interrupts import deferred_interrupts
+from ..base.open3d_module import load_open3d
 from ..columns.cloud import Cloud, CloudLike
 from ..columns.storage import flush
 from ..columns.table import AXES as POSITION
@@ -181,10 +179,7 @@ def _as_held(cloud: Cloud, real: np.dtype[np.floating]) -> _Held:
 
 def _write_open3d(path: Path, cloud: _Held) -> None:
     """Write `cloud` to `path`; whether it worked is for the reading back to say."""
-    # It takes a second, and read_cloud needs none of it. Interrupted in its extension module, it
-    # would pass for one that cannot be loaded, and cannot be loaded again.
-    with deferred_interrupts():
-        o3d = load_open3d()
+    o3d = load_open3d()  # here, for read_cloud has no use for it
     points = o3d.t.geometry.PointCloud()
     points.point.positions = o3d.core.Tensor(np.ascontiguousarray(cloud.positions))
     for name, values in cloud.columns.items():

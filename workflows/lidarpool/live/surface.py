@@ -10,8 +10,7 @@ import trimesh
 from numpy.typing import NDArray
 from trimesh.exchange.gltf import export_glb
 
-from raybeam.open3d_module import load_open3d
-
+from ..base.open3d_module import load_open3d
 from ..columns.table import OBJECT
 from ..render.closeup import floor_and_roof
 from ..render.colouring import TURBO, colours_of

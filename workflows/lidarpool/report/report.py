@@ -25,7 +25,7 @@ ELEVATION_RAYS = 20_000  # whose elevations are looked at
 _ORDER = (GENERATE, INTERSECT, SORT, COLLECT, TRIAL)  # in which stages are listed
 
 _PACKAGES = (
-    "numpy", "dask", "distributed", "trimesh", "open3d-cpu", "open3d", "matplotlib",
+    "numpy", "dask", "distributed", "trimesh", "embreex", "open3d-cpu", "open3d", "matplotlib",
     "cupy-cuda12x", "cupy-cuda13x",
 )  # fmt: skip
 # What `--json` prints of a report.

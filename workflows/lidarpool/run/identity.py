@@ -24,7 +24,7 @@ def identity_of(job: Job) -> dict[str, str]:
     return {
         "lidarpool": __version__,
         "numpy": version("numpy"),
-        "open3d": _open3d_version(),
+        "embreex": _embreex_version(),
         "scene": fingerprint(
             scene.vertices, scene.faces, scene.face_object, scene.origin, scene.names, scene.actors
         ),
@@ -55,11 +55,8 @@ def difference(here: Mapping[str, str], there: Mapping[str, str]) -> str:
     return ""
 
 
-def _open3d_version() -> str:
-    """Version of Open3D, by either of the names that it is distributed under."""
-    for name in ("open3d-cpu", "open3d"):
-        try:
-            return version(name)
-        except PackageNotFoundError:
-            continue
-    return "none"
+def _embreex_version() -> str:
+    try:
+        return version("embreex")
+    except PackageNotFoundError:
+        return "none"
