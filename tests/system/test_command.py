@@ -313,3 +313,21 @@ def test_the_pictures_of_a_run_are_drawn_again_to_the_bit(demo, lidarpool, tmp_p
     assert (again.code, again.err) == (0, "")
     for name in ("scene.png", "path.png"):
         assert (tmp_path / name).read_bytes() == (out / name).read_bytes()
+
+
+@pytest.mark.parametrize("words", [["--version"], ["--help"], ["run", "--help"], [None]])
+def test_help_and_completion_load_nothing_of_a_run(words):
+    """What a run needs takes a second to import."""
+    environment, python = {**os.environ}, [sys.executable, "-X", "importtime", *COMMAND[1:]]
+    if words == [None]:  # the Tab key
+        words = []
+        environment |= {
+            "_LIDARPOOL_COMPLETE": "bash_complete",
+            "COMP_WORDS": "lidarpool run --re",
+            "COMP_CWORD": "2",
+        }
+    done = subprocess.run([*python, *words], capture_output=True, text=True, env=environment)
+    assert done.returncode == 0 and done.stdout
+    loaded = {line.split("|")[-1].strip().split(".")[0] for line in done.stderr.splitlines()}
+    assert "click" in loaded
+    assert not {"numpy", "dask", "distributed", "pydantic", "rich", "trimesh"} & loaded
