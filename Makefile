@@ -27,6 +27,7 @@ test: dev  ## run the test suite
 	$(BIN)/python -m pytest $(PARALLEL)
 
 slow: dev  ## the tests that take minutes, which `test` leaves out
+	@VENV=$(VENV) sh .ci/setup slow
 	$(BIN)/python -m pytest -m slow
 
 sample: dev  ## of the slow tests, one of each kind

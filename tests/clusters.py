@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
+import pytest
 from distributed import Scheduler, SpecCluster, Worker
+
+
+def import_jobqueue() -> Any:
+    """Import dask-jobqueue, which takes Ctrl-C for itself; skip the test if it is missing."""
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        return pytest.importorskip("dask_jobqueue")
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 """Pool partitions and pipes for Dask clusters."""
 
+from .clusters import start_partitions
 from .devices import assign_devices, own_device
 from .errors import PipeClosed, PipeFailed, PoolError
 from .fetch import fetch_available, hold_for_driver, take_held
@@ -48,6 +49,7 @@ __all__ = [
     "placement_violations",
     "recorded",
     "rest",
+    "start_partitions",
     "take_held",
     "take_news",
     "telling_departure",

@@ -251,7 +251,7 @@ BAD = [
     ("scene: a.stl\nplanning: {enabled: true}", r"give planning\.start and planning\.target"),
     ("scene: a.stl\nplanning: {start: [9, 9]}", "give both planning.start and planning.target"),
     ("pool: {backend: opengl}", "should be 'auto', 'cuda', 'embree' or 'numpy'"),
-    ("", "is empty: lidarpool init"),
+    ("", "is empty; a scenario has sections"),
     ("hello", "holds only 'hello'"),
     ("a: b: c", "line 1: mapping values are not allowed here"),
     ("steps: 4\nsensor: {}\nsteps: 5", "line 3: 'steps' is given twice"),

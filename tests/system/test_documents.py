@@ -170,7 +170,7 @@ def look(words: list[str]) -> bool:
     match words:
         case ["lidarpool", *arguments]:
             parse(cli, "lidarpool", arguments)
-        case ["dask", kind, *arguments]:
+        case ["dask", kind, *arguments] if kind in DASK:
             parse(DASK[kind], kind, arguments)
         case ["make", target, *_]:
             assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text("utf-8"), re.M)
@@ -210,6 +210,8 @@ def test_yaml_is_what_it_is_for(block):
         for key in leaves(data):
             # KeyError where Dask has no such setting; variables of the environment have any name.
             dask.config.get(re.sub(r"(?<=\.pre-spawn-environ)\..*", "", key))
+    elif "cluster" in data:
+        assert (ROOT / block.title).read_text("utf-8").endswith(f"\n{block.code}")
     elif "beams" in data:
         SensorModel.model_validate(data)
     else:

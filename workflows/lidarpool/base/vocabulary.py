@@ -23,6 +23,7 @@ UNITS_M = {
 }
 
 WAIT_S = 10.0  # for partitions that are empty when a run begins
+QUEUE_S = 3600.0  # for either, where workers are jobs in a queue
 PATIENCE_S = 60.0  # for those that become empty; a nanny needs a few seconds
 
 # Formats that a cloud is exported to: the file or folder of each in that of a result, and the

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 @click.argument("scenario", type=click.Path(path_type=Path))
 @options.out
 @options.scheduler
+@options.cluster
 @options.backend
 @options.no_plan
 @click.option("--json", "as_json", is_flag=True, help="Print it as one JSON document.")
@@ -31,6 +32,7 @@ def check(
     out: Path,
     scheduler: str | None,
     files: TlsFiles,
+    cluster: Path | None,
     backend: str | None,
     no_plan: bool,
     as_json: bool,
@@ -47,6 +49,7 @@ def check(
       lidarpool check scenario.yaml
       lidarpool check hall.glb --no-plan --scheduler tcp://127.0.0.1:8786 --json
     """  # noqa: D301 - click wants the character, not its name
+    from ..run.cluster_file import ClusterFile
     from ..run.connection import connected
     from ..run.job import make_job
     from ..scenario.scenario import Scenario
@@ -54,11 +57,12 @@ def check(
     from .run_command import formats_of
     from .terminal import shown_status
 
+    file = None if cluster is None else ClusterFile.load(cluster)
     read = Scenario.load(scenario)
     job = make_job(read, backend, no_plan)
-    cluster = nullcontext() if scheduler is None else connected(scheduler, files)
-    with cluster as client, shown_status("casting some rays", as_json):
-        found = forecast(job, read.pool, out, client, formats_of(read))
+    running = nullcontext() if scheduler is None else connected(scheduler, files)
+    with running as client, shown_status("casting some rays", as_json):
+        found = forecast(job, read.pool, out, client, formats_of(read), file)
     found["notes"] += read.advice(job.scene)
     if as_json:
         click.echo(json.dumps(found, indent=1, allow_nan=False))
@@ -69,7 +73,12 @@ def check(
         raise LidarpoolError("it cannot run. " + " ".join(found["reasons"]))
     if not as_json:
         words = ["lidarpool", "run", str(scenario)]
-        for name, value in (("--out", out), ("--scheduler", scheduler), ("--backend", backend)):
+        for name, value in (
+            ("--out", out),
+            ("--scheduler", scheduler),
+            ("--cluster", cluster),
+            ("--backend", backend),
+        ):
             words += [name, str(value)] if value and str(value) != "lidarpool-out" else []
         click.echo(f"it can run: {shlex.join([*words, *['--no-plan'] * no_plan])}")
 

@@ -23,7 +23,7 @@ from ..base.interrupts import (
     deferred_interrupts,
     interrupt_on_signals,
 )
-from ..base.vocabulary import PATIENCE_S, WAIT_S
+from ..base.vocabulary import PATIENCE_S, QUEUE_S, WAIT_S
 from . import options
 from .check_command import check
 from .export_command import export
@@ -68,8 +68,10 @@ _SHOWN = (
 )
 
 
-def _seconds(_: click.Context, __: click.Parameter, text: str) -> float:
+def _seconds(_: click.Context, __: click.Parameter, text: str | None) -> float | None:
     """Take a time such as 90, 90s, 10m or 2h."""
+    if text is None:
+        return None
     unit = {"s": 1, "m": 60, "h": 3600}.get(text[-1:])
     try:
         return float(text[:-1]) * unit if unit else float(text)
@@ -112,6 +114,7 @@ def demo(out: Path, **shown: Any) -> None:
 @click.argument("scenario", type=click.Path(path_type=Path))
 @options.out
 @options.scheduler
+@options.cluster
 @options.backend
 @options.no_plan
 @click.option("--resume", is_flag=True, help="Go on with an unfinished run, if there is one.")
@@ -124,20 +127,18 @@ def demo(out: Path, **shown: Any) -> None:
 @click.option(
     "--wait",
     "wait_s",
-    default=f"{WAIT_S:g}s",
     callback=_seconds,
-    show_default=True,
     metavar="TIME",
-    help="Wait so long for partitions that are still empty, 90s or 10m.",
+    help=f"Wait so long for partitions that are still empty, 90s or 10m; by default {WAIT_S:g}s, "
+    f"with --cluster {QUEUE_S / 3600:g}h.",
 )
 @click.option(
     "--patience",
     "patience_s",
-    default=f"{PATIENCE_S:g}s",
     callback=_seconds,
-    show_default=True,
     metavar="TIME",
-    help="Wait so long for partitions that become empty.",
+    help=f"Wait so long for partitions that become empty; by default {PATIENCE_S:g}s, with "
+    f"--cluster {QUEUE_S / 3600:g}h.",
 )
 @_shown
 def run(scenario: Path, **given: Any) -> None:
@@ -149,7 +150,17 @@ def run(scenario: Path, **given: Any) -> None:
     Examples:
       lidarpool run examples/seed.yaml --out seed
       lidarpool run hall.glb --no-plan --resume --scheduler tcp://127.0.0.1:8786
+      lidarpool run examples/seed.yaml --cluster examples/clusters/slurm.yaml
     """  # noqa: D301 - click wants the character, not its name
+    queued = given["cluster"] is not None
+    for name, default in (("wait_s", WAIT_S), ("patience_s", PATIENCE_S)):
+        if given[name] is None:
+            given[name] = QUEUE_S if queued else default
+    if given["tls"] and queued:
+        raise click.UsageError(
+            "--tls is for a cluster of this machine; that of --cluster is encrypted if its file "
+            "says so."
+        )
     if given["tls"] and given["scheduler"] is not None:
         raise click.UsageError(
             "--tls is for a cluster of this machine; that of --scheduler is encrypted if its "
@@ -164,12 +175,15 @@ def _run(path: Path | None, **given: Any) -> None:
     from ..base.fork_server import keep_freed_memory, start_fork_server, stop_fork_server
 
     keep_freed_memory()
-    if not given.get("scheduler"):
+    if not given.get("scheduler") and not given.get("cluster"):
         start_fork_server()  # which imports what workers need meanwhile
     try:
         with deferred_interrupts():  # an extension module whose import is broken off is lost
+            from ..run.cluster_file import ClusterFile
             from ..scenario.scenario import Scenario
             from .run_command import RunOptions, run_scenario
+        if given.get("cluster") is not None:
+            given["cluster"] = ClusterFile.load(given["cluster"])
         run_scenario(Scenario.load(path) if path else Scenario(), RunOptions(**given))
     finally:
         stop_fork_server()

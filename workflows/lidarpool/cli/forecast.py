@@ -24,6 +24,7 @@ from ..columns.cloud import CHUNK_POINTS
 from ..export.formats import Format
 from ..report.output import ROOM_BYTES, refuse_to_replace
 from ..run.checks import check_backend_here, find_workers, slots_needed
+from ..run.cluster_file import ClusterFile
 from ..run.identity import identity_of
 from ..run.job import Job
 from ..run.local import default_workers, usable_cores
@@ -78,6 +79,7 @@ def forecast(
     out: Path,
     client: Client | None = None,
     formats: Sequence[Format] = (),
+    file: ClusterFile | None = None,
 ) -> dict[str, Any]:
     """Find out what a run would do and take, and whether it can.
 
@@ -91,6 +93,8 @@ def forecast(
         Client of the cluster to run on instead.
     formats
         That the cloud is exported to.
+    file
+        Of a cluster to start for it, which is not started.
 
     Returns
     -------
@@ -108,10 +112,13 @@ def forecast(
             one.check_installed()
         except LidarpoolError as error:
             reasons.append(str(error))
-    slots = _slots(job, pool, client)
+    slots = _slots(job, pool, client, file)
     backend, memory = None, MEMORY_LIMIT
     try:
-        if client is None:
+        if file is not None:
+            memory = 0  # of machines that are not there yet
+            file.require({name: one["needed"] for name, one in slots.items()})
+        elif client is None:
             backend = _backend_here(job.backend)
         else:
             planning = job.planning is not None
@@ -129,7 +136,7 @@ def forecast(
             notes.append(NO_HITS)
     # Without a sample every ray may hit.
     points = sample.points if sample else job.survey.ray_count // job.survey.keep_every
-    needed = _worker_bytes(job) if client else _machine_bytes(job, points, slots)
+    needed = _worker_bytes(job) if client or file else _machine_bytes(job, points, slots)
     parts, result = _disk_bytes(job, points, len(formats))
     free = shutil.disk_usage(_existing(out)).free
     if free < parts + result:
@@ -206,17 +213,21 @@ def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> Sample
     return Sample(rays, round(hits * share), round(points * share))
 
 
-def _slots(job: Job, pool: PoolSection, client: Client | None) -> dict[str, dict[str, int]]:
-    """Slots of each partition: those needed, and those that there are or would be here."""
+def _slots(
+    job: Job, pool: PoolSection, client: Client | None, file: ClusterFile | None
+) -> dict[str, dict[str, int]]:
+    """Slots of each partition: those needed, and those that there are or would be."""
     needed = slots_needed(job.collectors, job.planning is not None)
-    if client is not None:
+    if file is not None:
+        there = file.slots
+    elif client is not None:
         everybody = Pool.from_client(client)
         there = {n: int(sum(w.resources.get(n, 0) for w in everybody)) for n in needed}
     else:
         workers = default_workers(usable_cores(), len(visible_gpus()))
         there = {GPU: pool.gpu or workers[GPU], OTHER: pool.other or workers[OTHER]}
         there[LIDAR] = needed[LIDAR]  # one worker with as many threads
-    return {name: {"needed": needed[name], "there": there[name]} for name in needed}
+    return {name: {"needed": needed[name], "there": there.get(name, 0)} for name in needed}
 
 
 def _backend_here(wanted: str) -> str:

@@ -26,6 +26,12 @@ backend = click.option(
     help="Ray caster of stage 2; by default the scenario's, else the fastest there is.",
 )
 no_plan = click.option("--no-plan", is_flag=True, help="Leave the path planning out.")
+cluster = click.option(
+    "--cluster",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="Start this cluster for the run: Slurm, PBS, SSH; see docs/how-to/queues.md.",
+)
 
 
 def scheduler(command: Command) -> Command:
@@ -35,6 +41,10 @@ def scheduler(command: Command) -> Command:
     def with_files(*arguments: Any, **given: Any) -> None:
         from ..run.connection import TlsFiles
 
+        if given.get("cluster") is not None and given["scheduler"] is not None:
+            raise click.UsageError(
+                "--cluster starts a cluster, --scheduler is for one that runs: give one of them."
+            )
         files = TlsFiles(*(given.pop(f"tls_{part}") for part in ("ca", "cert", "key")))
         if any(files) and given["scheduler"] is None:
             raise click.UsageError(

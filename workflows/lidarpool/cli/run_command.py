@@ -20,8 +20,9 @@ from ..export.folder import result_folder
 from ..export.formats import Format
 from ..report.output import refuse_to_replace, write_result
 from ..report.report import summary
-from ..run.checks import check_backend_here
-from ..run.connection import TlsFiles, connected, local_client
+from ..run.checks import check_backend_here, slots_needed
+from ..run.cluster_file import ClusterFile
+from ..run.connection import TlsFiles, connected, local_client, started_client
 from ..run.identity import identity_of
 from ..run.job import Job, make_job
 from ..run.result import RunResult
@@ -51,6 +52,7 @@ class RunOptions:
 
     out: Path
     scheduler: str | None = None
+    cluster: ClusterFile | None = None
     files: TlsFiles | None = None
     tls: bool = False
     backend: str | None = None
@@ -69,6 +71,11 @@ class RunOptions:
     wait_s: float = WAIT_S
     patience_s: float = PATIENCE_S
 
+    @property
+    def here(self) -> bool:
+        """Whether it is to be run on a cluster of this machine, made for it."""
+        return self.scheduler is None and self.cluster is None
+
 
 def run_scenario(scenario: Scenario, options: RunOptions) -> None:
     """Run a scenario, write the result and tell of it.
@@ -79,7 +86,7 @@ def run_scenario(scenario: Scenario, options: RunOptions) -> None:
         If something is wrong or fails; notes of the error say what was kept.
     """
     set_logs(options.verbose)
-    if options.scheduler is None:  # before the scene is read, which may take long
+    if options.here:  # before the scene is read, which may take long
         check_backend_here(options.backend or scenario.pool.backend)
     job = make_job(
         scenario,
@@ -88,6 +95,8 @@ def run_scenario(scenario: Scenario, options: RunOptions) -> None:
         wait_s=options.wait_s,
         patience_s=options.patience_s,
     )
+    if options.cluster is not None:
+        options.cluster.require(slots_needed(job.collectors, job.planning is not None))
     if not options.quiet:
         for note in scenario.advice(job.scene):
             _note(note)
@@ -192,19 +201,32 @@ def _drive(
     scenario: Scenario, store: RunStore, options: RunOptions, live: LiveRun | None
 ) -> RunResult:
     """Run on a cluster, on one of this machine if none is given."""
-    if options.scheduler is None:
+    if options.cluster is not None:
+        cluster = _started_client(options.cluster, options)
+    elif options.scheduler is not None:
+        cluster = connected(options.scheduler, options.files)
+    else:
         check_backend_here(store.backend or store.job.backend, store.advice)
         cluster = _local_client(scenario, options, store.job.planning is not None)
-    else:
-        cluster = connected(options.scheduler, options.files)
     with cluster as client, shown_progress(options.quiet) as show:
         tell = (lambda words: None) if options.quiet else _note
         run = Run(client, store, tell)
         # The cluster of one run has no dashboard.
-        with run.partitions_page() if options.scheduler else nullcontext():
+        with nullcontext() if options.here else run.partitions_page():
             if live is None:
                 return run.drive(None, show)
             return run.drive(live.on_frame, live.with_progress(show, run.partitions))
+
+
+@contextmanager
+def _started_client(file: ClusterFile, options: RunOptions) -> Iterator[Client]:
+    """Client of the cluster of a file."""
+    with ExitStack() as stack:
+        with shown_status(f"starting {file}", options.quiet):
+            client = stack.enter_context(started_client(file))
+        if not options.quiet:
+            _note(f"started {file}")
+        yield client
 
 
 def _note(words: str) -> None:

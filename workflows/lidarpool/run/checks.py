@@ -22,7 +22,7 @@ from ..sensor import Survey
 
 AUTO_TAKES = "Backend 'auto' takes what works."
 LOOK_EVERY_S = 0.2
-TELL_EVERY_S = 5.0
+TELL_EVERY_S = 5.0  # and less often in a long wait
 
 
 class TooFewWorkersError(LidarpoolError):
@@ -105,9 +105,10 @@ def find_workers(
             now = time.monotonic()
             if now > began + wait_s:
                 raise
-            if now - told >= TELL_EVERY_S:
+            if now - told >= max(TELL_EVERY_S, (now - began) / 10):
                 told = now
-                tell(f"waiting for workers, for another {began + wait_s - now:.0f} s: {error}")
+                lacking = str(error).partition(": start ")[0]  # who waits has started them
+                tell(f"waiting for workers, for another {began + wait_s - now:.0f} s: {lacking}")
         time.sleep(LOOK_EVERY_S)
 
 

@@ -17,6 +17,7 @@ from poolpart.internals import forked_workers
 from ..base.errors import LidarpoolError
 from ..base.fork_server import start_fork_server
 from ..base.interrupts import children_spared, deferred_interrupts
+from .cluster_file import ClusterFile
 from .local import local_cluster
 
 CONNECT_TIMEOUT_S = 10
@@ -82,6 +83,28 @@ def local_client(
                 dashboard_port=None,  # nobody is told of it, and Bokeh takes half a second
             )
             stack.callback(cluster.close)
+            client = stack.enter_context(Client(cluster, set_as_default=False))
+        yield client
+    finally:
+        with deferred_interrupts():
+            stack.close()
+
+
+@contextmanager
+def started_client(file: ClusterFile) -> Iterator[Client]:
+    """Client of a cluster that is started for it and lasts as long as the body.
+
+    An interrupt waits until all jobs are in the queue, and until they have been cancelled.
+
+    Raises
+    ------
+    LidarpoolError
+        If it does not start.
+    """
+    stack = ExitStack()
+    try:
+        with deferred_interrupts(), children_spared():
+            cluster = stack.enter_context(file.started())
             client = stack.enter_context(Client(cluster, set_as_default=False))
         yield client
     finally:

@@ -13,7 +13,7 @@ from ..base.errors import LidarpoolError
 from ..base.vocabulary import PATIENCE_S
 
 WATCH_EVERY_S = 1.0
-TELL_EVERY_S = 5.0  # what is waited for
+TELL_EVERY_S = 5.0  # what is waited for; less often in a long wait
 
 
 class Watch:
@@ -75,7 +75,7 @@ class Watch:
     def _say(self, now: float) -> None:
         """Tell what is waited for."""
         waiting = {name: seen for name, seen in self._seen.items() if now - seen > TELL_EVERY_S}
-        if waiting and now - self._told >= TELL_EVERY_S:
+        if waiting and now - self._told >= max(TELL_EVERY_S, (now - min(waiting.values())) / 10):
             self._told = now
             for name, seen in waiting.items():
                 left = max(0.0, self.patience_s - (now - seen))

@@ -34,8 +34,10 @@ _Loader.add_implicit_resolver(
 )
 
 
-def read_yaml(path: Path) -> dict[str, Any]:
-    """Read a YAML file that holds one mapping.
+def read_yaml(
+    path: Path, form: str = "a scenario has sections (scene:, sensor:, poses:, …)"
+) -> dict[str, Any]:
+    """Read a YAML file that holds one mapping; `form` says in errors what that looks like.
 
     Raises
     ------
@@ -59,10 +61,8 @@ def read_yaml(path: Path) -> dict[str, Any]:
         reason = " ".join(str(error).partition(";")[0].split())[:200]
         raise LidarpoolError(f"{path} is not valid YAML: {reason}.") from error
     if content is None:
-        raise LidarpoolError(f"{path} is empty: lidarpool init writes a scenario to begin with.")
+        raise LidarpoolError(f"{path} is empty; {form}.")
     if not isinstance(content, dict):
         kind = "a list" if isinstance(content, list) else f"only {str(content)[:40]!r}"
-        raise LidarpoolError(
-            f"{path} holds {kind}; a scenario has sections (scene:, sensor:, poses:, …)."
-        )
+        raise LidarpoolError(f"{path} holds {kind}; {form}.")
     return content

@@ -1,0 +1,158 @@
+"""Partitions whose workers are jobs of a queue, or processes that SSH starts."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import dask
+from distributed import SpecCluster, Status
+from distributed.deploy import ssh
+from tornado.ioloop import PeriodicCallback
+
+from .errors import PoolError
+from .local import check_count
+from .rules import check_name
+
+logger = logging.getLogger(__name__)
+
+_LOOK_EVERY_S = 5.0  # for workers that are gone
+
+
+def start_partitions(cluster: SpecCluster, partitions: Mapping[str, Mapping[str, Any]]) -> None:
+    """Start the workers of partitions on a cluster of dask-jobqueue, or on an `SSHCluster`.
+
+    They declare their partition from the start, and are named after it: ``GPU-0``, ``GPU-1``.
+    This returns when all jobs are in the queue, or all hosts have been reached; workers join when
+    the queue has started them. As long as the cluster is open, a job that has ended is submitted
+    again. They go away with the cluster.
+
+    Parameters
+    ----------
+    cluster
+        One without workers: ``SLURMCluster(cores=1, memory="8GB")``, ``SSHCluster(["head"])``.
+    partitions
+        {name: options}. ``workers`` is their number, 1 by default, and ``slots`` the tasks that
+        each takes at a time, 1 by default. All other options are those of the cluster's class,
+        where this partition differs: ``job_extra_directives``, ``queue``, ``memory``. An
+        SSHCluster takes ``connect_options``, ``remote_python``, ``worker_class``,
+        ``worker_options``, and ``hosts``, which workers are dealt out to in turn; by default there
+        is one for each.
+
+    Raises
+    ------
+    PoolError
+        If the cluster is another, has workers, or does not take an option.
+    RuntimeError
+        Or what else the cluster raises where a job is refused, or a host does not answer.
+
+    Examples
+    --------
+    >>> with SLURMCluster(cores=1, memory="8GB") as cluster:           # doctest: +SKIP
+    ...     start_partitions(
+    ...         cluster,
+    ...         {
+    ...             "GPU": {"workers": 2, "job_extra_directives": ["--gres=gpu:1"]},
+    ...             "IO": {"slots": 8},
+    ...         },
+    ...     )
+    """
+    jobqueue = sys.modules.get("dask_jobqueue")
+    if jobqueue and isinstance(cluster, jobqueue.JobQueueCluster):
+        describe = _jobs
+    elif getattr(cluster, "scheduler_spec", {}).get("cls") is ssh.Scheduler:
+        describe = _processes
+    else:
+        raise PoolError(
+            f"A {type(cluster).__name__} has workers of one kind: start them, and divide them with "
+            "Pool.from_client(client).divide(…). Clusters of dask-jobqueue and SSHCluster can "
+            "start them by partition."
+        )
+    if cluster.worker_spec:
+        raise PoolError(
+            f"The cluster has {len(cluster.worker_spec)} workers, or jobs for some, already: make "
+            "one without (no n_workers; of an SSHCluster's hosts only the scheduler's)."
+        )
+    workers: dict[str, Any] = {}
+    for name, options in partitions.items():
+        check_name(name)
+        own = dict(options)
+        slots = own.pop("slots", 1)
+        check_count(f"The number of slots of partition {name!r}", slots)
+        try:
+            count = own.pop("workers", len(own.get("hosts", ".")))
+            check_count(f"The number of workers of partition {name!r}", count, least=0)
+            for number in range(count):
+                worker = f"{name}-{number}"
+                workers[worker] = describe(cluster, worker, number, {name: slots}, own)
+        except (TypeError, ValueError) as error:
+            raise PoolError(f"Partition {name!r} cannot be started: {error}") from error
+
+    cluster.worker_spec.update(workers)
+    cluster.sync(_start, cluster)
+
+    async def start_again() -> None:
+        # A SpecCluster lets go of a worker that is lost, and starts another when it is asked to.
+        if cluster.status == Status.running:
+            try:
+                await _start(cluster)
+            except Exception as error:
+                logger.warning("A worker was lost, and cannot be started again: %s", error)
+
+    def watch() -> None:
+        again = PeriodicCallback(start_again, 1000 * _LOOK_EVERY_S)
+        cluster.periodic_callbacks["partitions"] = again
+        again.start()
+
+    cluster.loop.add_callback(watch)
+
+
+async def _start(cluster: SpecCluster) -> None:
+    """Start what the cluster lacks of the workers that it is to have."""
+    try:
+        await cluster
+    except Exception:
+        for name, worker in list(cluster.workers.items()):
+            if worker.status == Status.created:  # it is tried again
+                del cluster.workers[name]
+            # While it knows of jobs that were not submitted, a cluster refuses to close.
+            worker.status = Status.failed
+        raise
+
+
+def _jobs(
+    cluster: Any, name: str, number: int, resources: Mapping[str, int], own: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Describe a job as a cluster of dask-jobqueue does."""
+    options = {**cluster.new_spec["options"], **own}
+    for option, default in (("processes", 1), ("worker_extra_args", [])):
+        if options.get(option) is None:
+            key = f"jobqueue.{options['config_name']}.{option}"
+            options[option] = dask.config.get(key, None) or default
+    declared = [f"{partition}={slots}" for partition, slots in resources.items()]
+    options["worker_extra_args"] = [*options["worker_extra_args"], "--resources", *declared]
+    cluster.job_cls(cluster.scheduler_address, name=name, **options)  # that it takes them
+    processes = options["processes"]
+    group = {"group": [f"-{process}" for process in range(processes)]} if processes > 1 else {}
+    return {**cluster.new_spec, **group, "options": options}
+
+
+def _processes(
+    cluster: Any, name: str, number: int, resources: Mapping[str, int], own: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Describe a worker as an SSHCluster does."""
+    options = {
+        key: cluster.scheduler_spec["options"][key] for key in ("connect_options", "remote_python")
+    }
+    options |= own
+    hosts: Sequence[str] = options.pop("hosts", ())
+    if isinstance(hosts, str) or not hosts:
+        raise ValueError('it needs "hosts", a list of those that its workers are to be on.')
+    threads = max(resources.values())
+    kwargs = {"name": name, "nthreads": threads, "resources": dict(resources)}
+    options["kwargs"] = kwargs | options.pop("worker_options", {})
+    options["address"] = hosts[number % len(hosts)]
+    ssh.Worker(cluster.scheduler_address, **options)  # that it takes them
+    return {"cls": ssh.Worker, "options": options}

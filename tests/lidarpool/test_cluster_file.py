@@ -1,0 +1,139 @@
+"""Cluster files: what they say, and what is wrong with them. Nothing is started."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from jsonschema import Draft7Validator
+from tests.clusters import import_jobqueue
+
+from lidarpool import LidarpoolError
+from lidarpool.run.cluster_file import ClusterFile
+
+EXAMPLES = Path(__file__).parents[2] / "examples" / "clusters"
+GOOD = """
+cluster: distributed.SSHCluster
+arguments: {hosts: [head]}
+partitions:
+  GPU: {hosts: [a, b], slots: 2}
+  LIDAR: {hosts: [head], slots: 4}
+  OTHER: {hosts: [a, b], workers: 5}
+"""
+
+
+def load(folder: Path, text: str) -> ClusterFile:
+    (folder / "c.yaml").write_text(text)
+    return ClusterFile.load(folder / "c.yaml")
+
+
+def test_slots_and_workers_of_a_file(tmp_path):
+    file = load(tmp_path, GOOD)
+    assert file.slots == {"GPU": 4, "LIDAR": 4, "OTHER": 5}
+    assert str(file) == "SSHCluster: 8 workers, GPU 2, LIDAR 1, OTHER 5"
+    file.require({"GPU": 1, "LIDAR": 4})
+    with pytest.raises(LidarpoolError, match=r"c.yaml: partition LIDAR has 4 of the 5 slots"):
+        file.require({"LIDAR": 5})
+
+
+WRONG = {
+    "empty": ("", "is empty; a cluster file has"),
+    "a list": ("[1]", "holds a list; a cluster file has"),
+    "a misspelt field": (
+        GOOD.replace("arguments", "argument"),
+        "argument is not a field. Did you mean 'arguments'?",
+    ),
+    "no partitions": ("cluster: distributed.SSHCluster", "partitions is missing"),
+    "a partition of others": (GOOD.replace("GPU", "GPUS"), "none of a survey's.*mean 'GPU'"),
+    "workers": (GOOD.replace("workers: 5", "workers: many"), "partitions.OTHER.workers is 'many'"),
+    "no host": (GOOD.replace("[a, b], slots: 2", "[]"), "partitions.GPU.hosts is"),
+    "no such package": (
+        GOOD.replace("distributed.", "dask_jobqueues."),
+        r"is not installed.*lidarpool\[clusters\]",
+    ),
+    "no such class": (GOOD.replace("SSHCluster", "SHCluster"), "is no cluster that can be started"),
+    "another class": (
+        GOOD.replace("distributed.SSHCluster", "subprocess.Popen"),
+        "is no cluster that can be started",
+    ),
+    "no module": (GOOD.replace("distributed.", ""), "is no cluster that can be started"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_what_is_wrong_with_a_file(tmp_path, case):
+    text, says = WRONG[case]
+    with pytest.raises(LidarpoolError, match=f"c.yaml.*{says}"):
+        load(tmp_path, text)
+
+
+def test_a_cluster_that_does_not_start(tmp_path):
+    file = load(tmp_path, GOOD.replace("hosts: [head]}", "host: head}", 1))
+    with (
+        pytest.raises(LidarpoolError, match=r"c.yaml: distributed.SSHCluster was not started \(.*"),
+        file.started(),
+    ):
+        pass
+
+
+@pytest.mark.parametrize("name", ["slurm.yaml", "ssh.yaml"])
+def test_examples_are_enough_for_a_survey(name):
+    if name == "slurm.yaml":
+        import_jobqueue()
+    ClusterFile.load(EXAMPLES / name).require({"GPU": 1, "LIDAR": 4, "OTHER": 1})
+
+
+def test_a_file_leaves_interrupts_to_the_program():
+    import_jobqueue()
+    script = """
+import signal
+from pathlib import Path
+from lidarpool.run.cluster_file import ClusterFile
+ClusterFile.load(Path("slurm.yaml"))
+assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+"""
+    subprocess.run(
+        [sys.executable, "-c", script],
+        cwd=EXAMPLES,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        check=True,
+    )
+
+
+def test_the_manifest_is_what_the_operator_takes():
+    found = importlib.util.find_spec("dask_kubernetes")
+    if found is None:
+        pytest.skip("needs dask-kubernetes, for the schemas of its operator")
+    folder = next(Path(found.origin).parent.rglob("crds"))
+    schemas = {}
+    for file in folder.glob("*.yaml"):
+        definition = yaml.safe_load(file.read_text())
+        (version,) = definition["spec"]["versions"]
+        schemas[definition["spec"]["names"]["kind"]] = version["schema"]["openAPIV3Schema"]
+    documents = list(yaml.safe_load_all((EXAMPLES / "kubernetes.yaml").read_text()))
+    assert [document["kind"] for document in documents] == [
+        "DaskCluster",
+        "DaskWorkerGroup",
+        "DaskWorkerGroup",
+    ]
+    for document in documents:
+        schema = schemas[document["kind"]]
+        schema["properties"] |= dict.fromkeys(("apiVersion", "kind", "metadata"), True)
+        Draft7Validator(_strict(schema)).validate(document)
+
+
+def _strict(schema: object) -> object:
+    """Refuse fields that a schema does not have, which Kubernetes would drop."""
+    if isinstance(schema, list):
+        return [_strict(one) for one in schema]
+    if not isinstance(schema, dict):
+        return schema
+    strict = {key: _strict(value) for key, value in schema.items()}
+    if isinstance(strict.get("properties"), dict) and strict.get("type") == "object":
+        strict.setdefault("additionalProperties", False)
+    return strict

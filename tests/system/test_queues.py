@@ -1,0 +1,259 @@
+"""Runs whose workers are jobs of a real Slurm, or processes that a real SSH server starts."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import dask
+import pytest
+import yaml
+from distributed import Client, SpecCluster, SSHCluster
+from tests.clusters import import_jobqueue
+from tests.daemons import LOOPBACK, Slurm, needs_slurm, needs_sshd, slurm, ssh_server, wait_until
+from tests.system.default_survey import DEFAULT_CLOUD_SHA256
+
+from lidarpool import Result, Scene, save_cloud, simulate
+from lidarpool.scenario.scenario import Scenario
+from poolpart import placement_violations, start_partitions
+
+pytestmark = pytest.mark.slow
+
+SCHEDULER = {"host": LOOPBACK, "port": 0, "dashboard_address": f"{LOOPBACK}:0"}
+FEWER = {"planning": {"trials": 10}}  # beside the default survey
+LONG = {"steps": 100_000, "planning": {"trials": 100_000}}  # hours of work
+
+
+@pytest.fixture(scope="module")
+def queue(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Slurm]:
+    with slurm(tmp_path_factory.mktemp("slurm")) as queue:
+        yield queue
+
+
+@pytest.fixture(scope="module")
+def ssh(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, object]]:
+    with ssh_server(tmp_path_factory.mktemp("ssh")) as connect_options:
+        yield connect_options
+
+
+@pytest.fixture
+def empty_queue(queue: Slurm, monkeypatch: pytest.MonkeyPatch) -> Iterator[Slurm]:
+    """Give a queue, for this process too, that has no jobs before the test and after it."""
+    for name, value in queue.environment.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, sys.path)))
+    yield queue
+    queue.ask("scancel", "--state=PENDING", "--me")
+    queue.ask("scancel", "--me")
+    wait_until(lambda: not queue.jobs())
+
+
+def job_arguments(folder: Path) -> dict[str, Any]:
+    return {
+        "cores": 1,
+        "memory": "1GB",
+        "local_directory": str(folder),
+        "log_directory": str(folder),
+        "scheduler_options": SCHEDULER,
+        "worker_extra_args": ["--host", LOOPBACK, "--no-dashboard"],
+    }
+
+
+JOBS: dict[str, dict[str, Any]] = {
+    "GPU": {"workers": 2, "job_name": "gpu", "job_extra_directives": ["--gres=gpu:1"]},
+    "LIDAR": {"slots": 4, "job_name": "lidar"},
+    "OTHER": {"job_name": "other"},
+}
+HOSTS: dict[str, dict[str, Any]] = {
+    "GPU": {"hosts": [LOOPBACK, LOOPBACK]},
+    "LIDAR": {"hosts": [LOOPBACK], "slots": 4},
+    "OTHER": {"hosts": [LOOPBACK]},
+}
+
+
+class Command:
+    """The command with a cluster file, in a process group of its own, as a shell starts it."""
+
+    def __init__(
+        self, folder: Path, cluster: dict[str, Any], scenario: dict[str, Any] = FEWER
+    ) -> None:
+        (folder / "s.yaml").write_text(yaml.safe_dump(scenario))
+        (folder / "cluster.yaml").write_text(yaml.safe_dump(cluster))
+        self.out, self.log = folder / "out", folder / "said"
+        with self.log.open("wb") as log:
+            self.process = subprocess.Popen(
+                [
+                    *(sys.executable, "-m", "lidarpool", "run", "s.yaml"),
+                    *("--cluster", "cluster.yaml", "--out", "out", "--only", "cloud"),
+                ],
+                cwd=folder,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+                env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            )
+
+    def wait_for(self, pattern: str) -> None:
+        """Wait until it says something."""
+        wait_until(lambda: bool(re.search(pattern, self.said)) or self.process.poll() is not None)
+        assert re.search(pattern, self.said), self.said
+
+    @property
+    def said(self) -> str:
+        return self.log.read_text()
+
+    def assert_default_result(self) -> None:
+        """Wait for the end, and check that the result is that of the default survey."""
+        assert self.process.wait(300) == 0, self.said
+        assert sha256((self.out / "cloud.ply").read_bytes()).hexdigest() == DEFAULT_CLOUD_SHA256
+        report = json.loads((self.out / "report.json").read_text())
+        assert report["placement_violations"] == 0
+        assert report["tasks"]["GPU"].keys() == {"intersect"}
+        assert report["tasks"]["LIDAR"].keys() == {"generate", "sort", "collect"}
+        assert report["tasks"]["OTHER"] == {"trial": 10}
+        (where,) = report["stages"]["generate"]["workers"]
+        assert where == "LIDAR-0"
+
+
+def slurm_file(folder: Path, **gpu: Any) -> dict[str, Any]:
+    return {
+        "cluster": "dask_jobqueue.SLURMCluster",
+        "arguments": job_arguments(folder),
+        "partitions": JOBS | {"GPU": JOBS["GPU"] | gpu},
+    }
+
+
+@needs_slurm
+def test_a_run_waits_for_its_jobs_and_takes_them_with_it(empty_queue, tmp_path):
+    held = [*JOBS["GPU"]["job_extra_directives"], "--hold"]
+    run = Command(tmp_path, slurm_file(tmp_path, job_extra_directives=held))
+    run.wait_for(r"waiting for workers, for another 35\d\d s: Partition 'GPU' has 0 of the 1 slots")
+    states = {state for _, state in empty_queue.jobs().values()}
+    assert states == {"PENDING", "RUNNING"}
+    assert empty_queue.jobs()["gpu"][1] == "PENDING"
+    empty_queue.ask("scontrol", "release", "jobname=gpu")
+    run.assert_default_result()
+    assert empty_queue.jobs() == {}
+
+
+@needs_slurm
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_jobs_of_a_run_that_is_stopped_go_away(empty_queue, tmp_path, number):
+    run = Command(tmp_path, slurm_file(tmp_path), LONG)
+    run.wait_for(r"survey +[1-9]")
+    os.killpg(run.process.pid, number)
+    assert run.process.wait(300) == (130 if number != signal.SIGKILL else -signal.SIGKILL)
+    if number == signal.SIGKILL:  # workers notice that their scheduler is gone
+        wait_until(lambda: not empty_queue.jobs())
+    assert empty_queue.jobs() == {}
+
+
+@needs_slurm
+def test_a_job_that_the_queue_refuses_takes_the_others_with_it(empty_queue, tmp_path):
+    run = Command(tmp_path, slurm_file(tmp_path, queue="nowhere"))
+    assert run.process.wait(300) == 2
+    assert "cluster.yaml: dask_jobqueue.SLURMCluster was not started" in run.said
+    assert "invalid partition specified: nowhere" in run.said
+    assert "Traceback" not in run.said
+    assert empty_queue.jobs() == {}
+
+
+def run_disturbed(cluster: SpecCluster, disturb: Callable[[Client], None]) -> Result:
+    """Run the default survey, disturbed once half way."""
+    scenario = Scenario()
+    scene: Scene = scenario.build_scene()
+    half = scenario.survey(scene).scan_count // 2
+    with Client(cluster, set_as_default=False) as client:
+        return simulate(
+            scene,
+            scenario.survey(scene),
+            client=client,
+            on_frame=lambda frame: disturb(client) if frame.scan == half else None,
+            wait_s=120,
+            patience_s=120,
+        )
+
+
+def assert_default_cloud(result: Result, folder: Path) -> None:
+    save_cloud(folder / "cloud.ply", result.cloud)
+    assert sha256((folder / "cloud.ply").read_bytes()).hexdigest() == DEFAULT_CLOUD_SHA256
+    assert placement_violations(result.records) == []
+
+
+@needs_slurm
+@pytest.mark.parametrize("victim", ["gpu", "lidar"])
+def test_a_job_that_is_cancelled_half_way(empty_queue, tmp_path, small_batches, victim):
+    # How long a SpecCluster waits for a worker to come back before it starts another.
+    with (
+        dask.config.set({"distributed.deploy.lost-worker-timeout": "1s"}),
+        import_jobqueue().SLURMCluster(**job_arguments(tmp_path)) as cluster,
+    ):
+        start_partitions(cluster, JOBS)
+        number, _ = empty_queue.jobs()[victim]
+
+        def cancel(client: Client) -> None:
+            empty_queue.ask("scancel", number)
+            wait_until(lambda: number not in empty_queue.ask("squeue", "--noheader", "--format=%i"))
+
+        result = run_disturbed(cluster, cancel)
+        wait_until(lambda: len(cluster.scheduler_info["workers"]) == 4)  # another was submitted
+        again, state = empty_queue.jobs()[victim]
+        assert state == "RUNNING"
+        assert int(again) != int(number) or victim == "gpu"  # of which there are two
+    assert_default_cloud(result, tmp_path)
+    wait_until(lambda: not empty_queue.jobs())
+
+
+@needs_sshd
+def test_a_run_on_hosts_that_ssh_reaches(ssh, tmp_path):
+    file = {
+        "cluster": "distributed.SSHCluster",
+        "arguments": {
+            "hosts": [LOOPBACK],
+            "connect_options": ssh,
+            "scheduler_options": SCHEDULER,
+            "worker_options": {"host": LOOPBACK, "local_directory": str(tmp_path)},
+        },
+        "partitions": HOSTS,
+    }
+    run = Command(tmp_path, file)
+    run.assert_default_result()
+    wait_until(lambda: not processes_in(tmp_path))
+
+
+@needs_sshd
+@pytest.mark.parametrize("victim", ["GPU-0", "LIDAR-0"])
+def test_a_worker_that_is_killed_half_way(ssh, tmp_path, small_batches, victim):
+    options = {"worker_options": {"host": LOOPBACK, "local_directory": str(tmp_path)}}
+    with SSHCluster([LOOPBACK], connect_options=ssh, scheduler_options=SCHEDULER) as cluster:
+        start_partitions(cluster, {name: own | options for name, own in HOSTS.items()})
+
+        def kill(client: Client) -> None:
+            workers = client.scheduler_info(n_workers=-1)["workers"]
+            (address,) = (a for a, w in workers.items() if w["name"] == victim)
+            os.kill(client.run(os.getpid, workers=[address])[address], signal.SIGKILL)
+
+        result = run_disturbed(cluster, kill)
+    assert_default_cloud(result, tmp_path)
+    wait_until(lambda: not processes_in(tmp_path))
+
+
+def processes_in(folder: Path) -> list[str]:
+    """List the processes whose command line names a folder."""
+    found = []
+    for entry in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            words = entry.read_bytes().decode(errors="replace")
+        except OSError:
+            continue  # it has ended
+        if str(folder) in words:
+            found.append(words)
+    return found

@@ -1,0 +1,173 @@
+"""A YAML file that says which cluster to start for a run, and with which workers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from distributed import SpecCluster, SSHCluster
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError
+
+from poolpart import start_partitions
+
+from ..base.errors import LidarpoolError
+from ..base.interrupts import deferred_interrupts
+from ..base.words import counted, did_you_mean
+from ..scan import GPU, LIDAR, OTHER
+from ..scenario.validation_errors import validation_error
+from ..scenario.yamlfile import read_yaml
+
+# A scheduler that SSH has started outlives a driver that was killed: it ends when it has been
+# without tasks for so long. And a host that does not answer is given up after so long.
+_IDLE, _CONNECT = "1h", "30s"
+
+
+class Workers(BaseModel):
+    """Workers of a partition; other fields are arguments of the cluster that differ for it."""
+
+    model_config = ConfigDict(extra="allow", frozen=True, strict=True)
+
+    workers: int = Field(1, ge=0)
+    slots: int = Field(1, ge=1)
+    hosts: list[str] | None = Field(None, min_length=1)
+
+
+class ClusterFile(BaseModel):
+    """What to start; see docs/how-to/queues.md.
+
+    Parameters
+    ----------
+    cluster
+        Class, such as ``dask_jobqueue.SLURMCluster`` or ``distributed.SSHCluster``.
+    arguments
+        Its arguments.
+    partitions
+        Workers by partition.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    cluster: str
+    arguments: dict[str, Any] = {}
+    partitions: dict[str, Workers]
+    _source: str = PrivateAttr("cluster file")
+
+    @classmethod
+    def load(cls, path: Path) -> ClusterFile:
+        """Read a file and import what it names; nothing is started.
+
+        Raises
+        ------
+        LidarpoolError
+            If it cannot be read, a field is wrong, a package is missing, or the class is none
+            of clusters.
+        """
+        content = read_yaml(path, "a cluster file has cluster:, arguments: and partitions:")
+        try:
+            file = cls.model_validate(content)
+        except ValidationError as error:
+            names = [*cls.model_fields, *Workers.model_fields]
+            raise LidarpoolError(validation_error(error, names, str(path))) from error
+        file._source = str(path)
+        for name in file.partitions:
+            if name not in (GPU, LIDAR, OTHER):
+                raise LidarpoolError(
+                    f"{path}: partitions.{name} is none of a survey's, which are GPU, LIDAR and "
+                    f"OTHER.{did_you_mean(name, (GPU, LIDAR, OTHER))}"
+                )
+        file._factory()
+        return file
+
+    @property
+    def slots(self) -> dict[str, int]:
+        """Slots of each partition."""
+        return {name: self._count(name) * one.slots for name, one in self.partitions.items()}
+
+    def require(self, needed: Mapping[str, int]) -> None:
+        """Check that the partitions have so many slots; LidarpoolError if not."""
+        for name, least in needed.items():
+            if (there := self.slots.get(name, 0)) < least:
+                raise LidarpoolError(
+                    f"{self._source}: partition {name} has {there} of the {least} slots needed: "
+                    f"give it more slots or workers, such as {{slots: {least}}}."
+                )
+
+    def __str__(self) -> str:
+        parts = ", ".join(f"{name} {self._count(name)}" for name in self.partitions)
+        total = counted(sum(map(self._count, self.partitions)), "worker")
+        return f"{self.cluster.rpartition('.')[2]}: {total}, {parts}"
+
+    @contextmanager
+    def started(self) -> Iterator[SpecCluster]:
+        """Cluster with these workers, which are there or in a queue, as long as the body runs.
+
+        Raises
+        ------
+        LidarpoolError
+            If it does not start, or does not take an argument.
+        """
+        arguments = dict(self.arguments)
+        partitions = {
+            name: {"workers": self._count(name)} | one.model_dump(exclude_unset=True)
+            for name, one in self.partitions.items()
+        }
+        factory = self._factory()
+        try:
+            if factory is SSHCluster:
+                common = {
+                    option: arguments.pop(option)
+                    for option in ("worker_options", "worker_class")
+                    if option in arguments
+                }
+                partitions = {name: common | own for name, own in partitions.items()}
+                for option, key, value in (
+                    ("scheduler_options", "idle_timeout", _IDLE),
+                    ("connect_options", "connect_timeout", _CONNECT),
+                ):
+                    arguments[option] = {key: value} | arguments.get(option, {})
+            cluster = factory(**arguments)
+            try:
+                start_partitions(cluster, partitions)
+            except BaseException:
+                cluster.close()
+                raise
+        except Exception as error:  # of sbatch, of SSH, of a constructor: any
+            told = str(error).partition(" Very likely")[0]  # jobqueue goes on with all arguments
+            reason = " ".join(f"{type(error).__name__}: {told}".split())[:400]
+            raise LidarpoolError(
+                f"{self._source}: {self.cluster} was not started ({reason})."
+            ) from error
+        with cluster:
+            yield cluster
+
+    def _count(self, name: str) -> int:
+        one = self.partitions[name]
+        return (
+            len(one.hosts) if one.hosts and "workers" not in one.model_fields_set else one.workers
+        )
+
+    def _factory(self) -> Any:
+        """Import the class; only clusters are taken."""
+        package, _, name = self.cluster.rpartition(".")
+        try:
+            with deferred_interrupts():  # and their handlers kept: dask-jobqueue brings its own
+                found = getattr(import_module(package), name, None)
+        except ModuleNotFoundError as error:
+            raise LidarpoolError(
+                f"{self._source}: {self.cluster} is not installed ({error}): pip install "
+                "'lidarpool[clusters]' has dask-jobqueue and what SSHCluster needs."
+            ) from error
+        except ValueError:  # no dot
+            found = None
+        if found is not SSHCluster and not (
+            isinstance(found, type) and issubclass(found, SpecCluster)
+        ):
+            raise LidarpoolError(
+                f"{self._source}: {self.cluster} is no cluster that can be started by partition: "
+                "give dask_jobqueue.SLURMCluster, another of dask_jobqueue, or "
+                "distributed.SSHCluster. Start others yourself, and use --scheduler."
+            )
+        return found
