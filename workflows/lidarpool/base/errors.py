@@ -1,5 +1,12 @@
 """The one exception that users are meant to read."""
 
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+MISTAKES_TOLD = 20
+
 
 class LidarpoolError(Exception):
     """Something the user can put right: bad input, a missing partition, a full disk.
@@ -7,3 +14,26 @@ class LidarpoolError(Exception):
     The message is one or two lines that say what was given, what was expected and what to
     do. The command prints it without a traceback and exits with code 2.
     """
+
+
+class Mistakes:
+    """What is wrong with something, to be told of at once and not one after the other."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    @contextmanager
+    def noted(self) -> Iterator[None]:
+        """Note a LidarpoolError of the body, and go on behind it."""
+        try:
+            yield
+        except LidarpoolError as error:
+            self.lines.append(str(error))
+
+    def tell(self) -> None:
+        """Raise LidarpoolError with a line for each, if anything was wrong."""
+        lines = list(dict.fromkeys(self.lines))
+        if len(lines) > MISTAKES_TOLD:
+            lines[MISTAKES_TOLD:] = [f"There are {len(lines) - MISTAKES_TOLD:,} more."]
+        if lines:
+            raise LidarpoolError("\n".join(lines))

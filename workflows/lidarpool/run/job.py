@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarpoolError, Mistakes
 from ..base.vocabulary import PATIENCE_S, WAIT_S
 from ..plan import Planning
 from ..scenario.scenario import Scenario
@@ -78,11 +78,19 @@ def make_job(
     LidarpoolError
         If a mesh file cannot be read, or fields do not fit together or the scene.
     """
-    scene = scenario.build_scene()
+    scene, survey, planning = scenario.build_scene(), None, None
+    mistakes = Mistakes()
+    with mistakes.noted():
+        survey = scenario.survey(scene)
+        MaterialTable.of(survey.materials, scene.all_names)
+    with mistakes.noted():
+        planning = None if no_plan else scenario.plan(scene)
+    mistakes.tell()
+    assert survey is not None, "a survey without mistakes"
     return Job(
         scene,
-        scenario.survey(scene),
-        None if no_plan else scenario.plan(scene),
+        survey,
+        planning,
         backend or scenario.pool.backend,
         scenario.pool.queue_capacity,
         scenario.pool.collectors,

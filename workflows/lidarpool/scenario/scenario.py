@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field, PrivateAttr, Strict, ValidationError, model_validator
+from pydantic import Field, PrivateAttr, Strict, ValidationError
 
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarpoolError, Mistakes
 from ..base.words import did_you_mean
 from ..plan import Planning
 from ..scene.actors import Actor, box, one_mesh
@@ -44,7 +44,7 @@ from .sections import (
     may_be_empty,
     scene_in_short,
 )
-from .validation_errors import validation_error
+from .validation_errors import validation_errors
 from .yamlfile import read_yaml
 
 # Of the objects, those lower than this are floors and markings, which a path may cross.
@@ -166,21 +166,6 @@ class Scenario(Section):
     _notes: list[str] = PrivateAttr(default_factory=list)  # of what was left out of the scene
     _turned: list[str] = PrivateAttr(default_factory=list)  # files that seem to be Y-up, as is due
 
-    @model_validator(mode="after")
-    def _both_ends(self) -> Scenario:
-        missing = [self.planning.start, self.planning.target].count(None)
-        if self.planning.enabled and not self.scene.has_seed and missing:
-            raise ValueError("planning is enabled: give planning.start and planning.target.")
-        if self.planning.enabled is None and not self.scene.has_seed and missing == 1:
-            raise ValueError(
-                "planning has one end: give both planning.start and planning.target, or neither."
-            )
-        if self.trajectory is not None and self.poses is not None:
-            raise ValueError("give either poses or a trajectory, not both.")
-        if self.sensors and (self.sensor.model or self.sensor.calibration or self.mount):
-            raise ValueError("give either sensor and mount, or sensors, each with a mount.")
-        return self
-
     @classmethod
     def load(cls, path: str | Path) -> Scenario:
         """Read a scenario file (YAML), or take a mesh file as a scenario of it alone.
@@ -216,18 +201,61 @@ class Scenario(Section):
         LidarpoolError
             As `load`.
         """
-        try:
-            scenario = cls.model_validate(data)
-        except ValidationError as error:
-            raise LidarpoolError(validation_error(error, _field_names(), source)) from error
+        mistakes, scenario = Mistakes(), None
+        while scenario is None:
+            try:
+                scenario = cls.model_validate(data)
+            except ValidationError as error:
+                told = validation_errors(error, _field_names())
+                mistakes.lines += [f"{source}: {line}" for line in told]
+                # What else is wrong is seen without the sections that are.
+                wrong = {str(detail["loc"][0]) for detail in error.errors() if detail["loc"]}
+                if not wrong:
+                    mistakes.tell()
+                data = {name: value for name, value in data.items() if str(name) not in wrong}
         scenario._folder, scenario._source = Path(folder), source
-        with scenario._named():
-            for section in scenario.sensors.values() or (scenario.sensor,):
-                if section.calibration is None:  # files are read when they are needed
-                    Returns(**scenario.returns.model_dump()).of(
-                        section.sensor(scenario._folder).optics
-                    )
+        scenario._check(mistakes)
+        mistakes.tell()
         return scenario
+
+    def _check(self, mistakes: Mistakes) -> None:
+        """Note what does not fit together; and files that are missing, if more is wrong.
+
+        If nothing else is wrong, files are told of when they are read.
+        """
+        ends = [self.planning.start, self.planning.target].count(None)
+        checks = (
+            (
+                self.planning.enabled and not self.scene.has_seed and ends,
+                "planning is enabled: give planning.start and planning.target.",
+            ),
+            (
+                self.planning.enabled is None and not self.scene.has_seed and ends == 1,
+                "planning has one end: give both planning.start and planning.target, or neither.",
+            ),
+            (
+                self.trajectory is not None and self.poses is not None,
+                "give either poses or a trajectory, not both.",
+            ),
+            (
+                self.sensors and (self.sensor.model or self.sensor.calibration or self.mount),
+                "give either sensor and mount, or sensors, each with a mount.",
+            ),
+        )
+        mistakes.lines += [f"{self._source}: {words}" for wrong, words in checks if wrong]
+        for section in self.sensors.values() or (self.sensor,):
+            if section.calibration is None:
+                with mistakes.noted(), self._named():
+                    sensor = section.sensor(self._folder)
+                    Returns(**self.returns.model_dump()).of(sensor.optics)
+        entries = [*self.scene.files, *(actor.file for actor in self.actors if actor.file)]
+        files = [entry.file for entry in entries]
+        files += [one for one in (self.trajectory and self.trajectory.file,) if one]
+        for file in files if mistakes.lines else ():
+            with suppress(RuntimeError):  # of a user who is not known
+                path = self._folder / Path(file).expanduser()
+                if not path.exists():
+                    mistakes.lines.append(f"{path} does not exist: check the name and the folder.")
 
     def advice(self, scene: Scene) -> list[str]:
         """Return notes on what looks like a mistake: a size that speaks of another unit.
@@ -267,8 +295,11 @@ class Scenario(Section):
         self._notes.clear()
         self._turned.clear()
         meshes: list[Mesh] = list(seed_objects()) if self.scene.has_seed else []
+        mistakes = Mistakes()
         for entry in self.scene.files:
-            meshes += self._read(entry)
+            with mistakes.noted():
+                meshes += self._read(entry)
+        mistakes.tell()
         scene = Scene.from_meshes(meshes)
         if self.scene.ground is not None:
             scene = Scene.from_meshes([*meshes, _ground(self.scene.ground, scene)])

@@ -1,22 +1,22 @@
-"""What pydantic finds wrong with a scenario, in a line for whoever wrote it."""
+"""What pydantic finds wrong with a scenario, in lines for whoever wrote it."""
 
 from __future__ import annotations
 
 import re
 import reprlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from ..base.words import did_you_mean
+from ..base.words import counted, did_you_mean
 
 _GIVEN_LETTERS = 160  # of what was given
 
 
-def validation_error(error: ValidationError, fields: Iterable[str], source: str) -> str:
-    """Return a line with the first fault: where, what was given, what is allowed.
+def validation_errors(error: ValidationError, fields: Iterable[str]) -> Iterator[str]:
+    """Give a line for each fault: where, what was given, what is allowed.
 
     Parameters
     ----------
@@ -24,12 +24,20 @@ def validation_error(error: ValidationError, fields: Iterable[str], source: str)
         What a model raised.
     fields
         Names of all fields that there are, for those that are misspelt.
-    source
-        What was validated, for the beginning of the line; a file's name.
     """
-    first, *others = error.errors()
-    more = f" ({len(others)} more to follow.)" if others else ""
-    return f"{source}: {_line(first, fields)}{more}"
+    fields = list(fields)
+    alike: dict[Any, list[ErrorDetails]] = {}  # {field and kind of mistake: where it was made}
+    places = [detail["loc"] for detail in error.errors()]
+    for detail in error.errors():
+        at = detail["loc"]
+        # Of a list in which all entries are wrong pydantic says that it has none.
+        if detail["type"] == "too_short" and any(p[: len(at)] == at != p for p in places):
+            continue
+        field = tuple(step for step in at if not isinstance(step, int))
+        alike.setdefault((field, detail["type"]), []).append(detail)
+    for first, *others in alike.values():
+        more = f" {counted(len(others), 'more entry', 'more entries')} like it." if others else ""
+        yield _line(first, fields) + more
 
 
 def _line(detail: ErrorDetails, fields: Iterable[str]) -> str:
