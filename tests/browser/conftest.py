@@ -111,6 +111,19 @@ class Tab:
         )
         assert found, f"there is no button {label!r}"
 
+    def press(self, x: float, y: float, *, shift: bool = False) -> None:
+        """Click at a place of the window, pixels."""
+        for kind in ("mousePressed", "mouseReleased"):
+            self.call(
+                "Input.dispatchMouseEvent",
+                type=kind,
+                x=x,
+                y=y,
+                button="left",
+                clickCount=1,
+                modifiers=8 if shift else 0,
+            )
+
     def picture(self, path: Path) -> np.ndarray:
         """Take a picture of the page, (height, width, 3), and keep it."""
         data = self.call("Page.captureScreenshot", format="png")["data"]

@@ -10,8 +10,8 @@ from lidarpool import Column, Scene, Track
 from lidarpool.columns.table import SCAN
 from lidarpool.export.cloud_file import CloudFile
 from lidarpool.export.ply_format import header, row_type
-from lidarpool.live.looking import Filter
-from lidarpool.live.page import live_page, redrawn
+from lidarpool.live.looking import Eye, Filter
+from lidarpool.live.page import live_page, place_eye, redrawn
 from lidarpool.live.result_page import ResultView
 from lidarpool.run.picture_file import Pictured, SensorWay
 from lidarpool.scene.actors import Actor, box
@@ -84,6 +84,34 @@ def test_time_is_chosen_and_played(cloud, new_tab, tmp_path):
             tab.picture(tmp_path / "b.png")
             assert van.position[0] == at
             assert tab.errors == []
+
+
+def test_points_are_clicked_at_measured_seen_from_near_and_linked_to(served, new_tab, tmp_path):
+    page, view = served
+    tab = new_tab(page.url)
+    tab.wait_for(lambda text: "20,000 shown" in text and "Click a point" in text)
+    tab.wait_for(lambda _: colourful(tab.picture(tmp_path / "a.png")) > 3000)
+    client = next(iter(page.get_clients().values()))
+    eye = Eye.of(client.camera)
+    wide, tall = client.camera.image_width, client.camera.image_height
+    (start, end), _ = eye.seen(view._even.positions[[10_000, 12_000]] - view._origin)
+    for shift, place, told in ((False, start, "wetness"), (True, end, "distance")):
+        x, y = (place + 1) / 2 * (wide, tall)
+        tab.press(x, y, shift=shift)
+        tab.wait_for(lambda text, told=told: re.search(rf"\b{told} \d", text))
+    # To the middle of the spiral, which has half of its points behind the camera then.
+    place_eye(client, client.camera.look_at, client.camera.look_at + np.array([0.0, 1.0, 0.0]))
+    tab.wait_for(lambda text: "more of them from near" in text)
+    view._view.cloud.set_filter(Filter((("scan", 100, 149),)))
+    tab.wait_for(lambda text: "5,000 of 30,000 points" in text)
+    link = page.link(client, view._view.choices)
+    view._view.cloud.set_filter(Filter())
+    tab.wait_for(lambda text: "20,000 shown" in text)
+    other = new_tab(link)
+    other.wait_for(lambda text: "5,000 of 30,000 points" in text)
+    newest = page.get_clients()[max(page.get_clients())].camera
+    other.wait_for(lambda _: np.allclose(newest.position, client.camera.position, atol=1e-3))
+    assert tab.errors == other.errors == []
 
 
 def colourful(picture):

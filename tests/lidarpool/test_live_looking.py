@@ -10,6 +10,7 @@ from lidarpool.export.cloud_file import CloudFile
 from lidarpool.export.ply_format import header, row_type
 from lidarpool.live import blocks
 from lidarpool.live.blocks import Blocks
+from lidarpool.live.labels import without_overlap
 from lidarpool.live.looking import TILES, Eye, Filter, even_shares, picked
 
 # Looks along y, with z up: its own axes are x to the right, y down, z ahead.
@@ -120,3 +121,12 @@ def test_from_near_more_is_found_and_blocks_outside_the_picture_are_not_read_aga
     again, _, steps = searched(look.search(Filter(), 20_000, eye, np.full(TILES, 0.5)))
     assert len(steps) < 12
     assert len(again) == pytest.approx(len(cloud) / 2, rel=0.1)
+
+
+def test_of_labels_that_would_overlap_the_first_is_shown():
+    """Pictures are 1,000 pixels high; a metre is 50 of them ten metres away."""
+    texts = ["sensor", "Van", "Pedestrian", "Behind"]
+    places = np.array([[0, 10, 0], [0.5, 10, 0.2], [0.5, 10, -1], [0, -10, 0.0]])
+    assert without_overlap(texts, places, EYE, 1000).tolist() == [True, False, True, False]
+    assert without_overlap(texts[1:], places[1:], EYE, 1000).tolist() == [True, True, False]
+    assert len(without_overlap([], np.zeros((0, 3)), EYE, 1000)) == 0

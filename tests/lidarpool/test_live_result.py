@@ -3,11 +3,15 @@
 import io
 import time
 from dataclasses import replace
+from importlib.metadata import version
 from types import SimpleNamespace
+from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 import pytest
 import trimesh
+from benchmarks.live import looking
+from websockets.sync.client import connect
 
 from lidarpool import LidarpoolError, Planning, Scene, Track
 from lidarpool.columns.table import CHANNEL, OBJECT, SCAN
@@ -391,3 +395,30 @@ def test_a_point_that_is_clicked_at_is_told_and_measured_from(cloud, pictured, p
     assert page.scene.get_handle_by_name("/picked/way") is not None
     shown.picked.take(None, False, eye)
     assert page.scene.get_handle_by_name("/picked/0") is None
+
+
+def test_a_link_brings_back_what_was_chosen(cloud, pictured, page):
+    view = ResultView(page, CloudFile(cloud), pictured)
+    view.draw()
+    shown = view._view
+    shown.cloud.colour.value, shown._scene_colour.value = "object", "hits"
+    shown._cut.value = 1.5
+    wanted = Filter((("scan", 10.0, 20.0), ("z", 0.25, 1.0)))
+    shown.cloud.set_filter(wanted)
+    view.draw()
+    choices = shown.choices
+    with looking(page.url):
+        while not page.get_clients():
+            time.sleep(0.01)
+        link = page.link(next(iter(page.get_clients().values())), choices)
+    query = parse_qs(urlsplit(link).query)
+    assert query["initialCameraPosition"] == ["40,-40,30"]
+    shown.cloud.colour.value, shown._scene_colour.value = "z", "grey"
+    shown._cut.value = shown._cut.max
+    shown.cloud.set_filter(Filter())
+    view.draw()
+    with connect(query["websocket"][0], subprotocols=[f"viser-v{version('viser')}"]):
+        drawn_until(view, lambda: shown.cloud.filter == wanted)
+    assert shown.choices == choices
+    shown.choose([("colour", "nothing"), ("cut", "high"), ("only", "z,1"), ("only", "w,1,2")])
+    assert shown.choices == [entry for entry in choices if entry[0] != "only"]

@@ -79,8 +79,9 @@ class CloudView:
         self._page, self._names, self._origin, self._size_m = page, names, origin, size_m
         rest = {column.name: column for column in columns if column not in AXES}
         self._columns = {"z": Z, **rest}
-        self._filtered = {**({"scan": SCAN} if "scan" in rest else {}), "x": X, "y": Y, "z": Z}
-        self._filtered |= {name: column for name, column in rest.items() if name != "scan"}
+        # {column: what one can filter by}
+        self.filtered = {**({"scan": SCAN} if "scan" in rest else {}), "x": X, "y": Y, "z": Z}
+        self.filtered |= {name: column for name, column in rest.items() if name != "scan"}
         self.blocks: Blocks | None = None  # where more can be read
         self._even: Cloud | None = None  # of all points
         self._even_version: Hashable = None
@@ -121,7 +122,7 @@ class CloudView:
         gui = self._page.gui
         self._folder = gui.add_folder("filter", expand_by_default=False)
         with self._folder:
-            self._filter_by = gui.add_dropdown("column", tuple(self._filtered))
+            self._filter_by = gui.add_dropdown("column", tuple(self.filtered))
             self._filter_text = gui.add_html("", order=1e4)
             self._all = gui.add_button("Show all", order=1e5, visible=False)
         self._all.on_click(lambda _: self.set_filter(Filter()))
@@ -150,7 +151,7 @@ class CloudView:
         self._all.visible = bool(words)
 
     def _filter_input(self, name: str) -> Any:
-        gui, column, limits = self._page.gui, self._filtered[name], self.filter.of(name)
+        gui, column, limits = self._page.gui, self.filtered[name], self.filter.of(name)
         values = np.zeros(0) if self._even is None else values_of(self._even, name)
         values = values[np.isfinite(values)]
         if column.kind == "label" and (labels := self._labels(name, values)):
@@ -188,14 +189,14 @@ class CloudView:
         low, high = handle.value
         if low <= handle.min and high >= handle.max:
             return None
-        unit = _NS if self._filtered[name].unit == "ns" else 1.0
+        unit = _NS if self.filtered[name].unit == "ns" else 1.0
         return low * unit, high * unit
 
     def _in_words(self, name: str, low: float, high: float) -> str:
         names = self._names.get(name, ())
         if low == high and 0 <= low < len(names):
             return f"only {names[int(low)]}"
-        unit = self._filtered[name].unit
+        unit = self.filtered[name].unit
         low, high, unit = (low / _NS, high / _NS, "s") if unit == "ns" else (low, high, unit)
         span = f"{low:g}" if low == high else f"{low:g} to {high:g}"
         return f"{name} {span} {unit}".rstrip()

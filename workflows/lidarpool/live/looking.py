@@ -85,7 +85,8 @@ class Eye:
     def of(cls, camera: viser.CameraHandle) -> Eye:
         """Return that of a browser."""
         position, turn = camera.position.tolist(), camera.wxyz.tolist()
-        return cls(tuple(position), tuple(turn), camera.fov, camera.aspect)
+        aspect = camera.image_width / max(camera.image_height, 1)  # a window may have no height
+        return cls(tuple(position), tuple(turn), camera.fov, aspect or 1.0)
 
     def seen(self, places: Floats) -> tuple[Floats, NDArray[np.bool_]]:
         """Where places (n, 3) are in the picture, (n, 2) in -1 to 1, and which (n,) are in it."""

@@ -12,10 +12,11 @@ import sys
 import threading
 import time
 import webbrowser
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from html import escape
-from urllib.parse import urlsplit
+from queue import Empty, SimpleQueue
+from urllib.parse import quote, unquote, urlsplit
 
 import click
 import numpy as np
@@ -66,7 +67,8 @@ class LivePage(viser.ViserServer):
 
     def __init__(self, title: str, port: int) -> None:
         super().__init__(host=HOST, port=port, label=title, verbose=False)
-        refuse_strangers(self)
+        self._links: SimpleQueue[str] = SimpleQueue()  # paths
+        refuse_strangers(self, self._links.put)
         self._set_theme(dark=False)
         # It is the last of the panel.
         self._dark = self.gui.add_checkbox("dark", initial_value=False, order=1e6)
@@ -106,6 +108,33 @@ class LivePage(viser.ViserServer):
         data = io.BytesIO()
         image.save(data, "PNG")
         client.send_file_download(PICTURE, data.getvalue(), save_immediately=True)
+
+    def link(self, client: viser.ClientHandle, choices: Sequence[tuple[str, str]]) -> str:
+        """Address under which a browser shows what this one does, with these choices.
+
+        viser's page takes the camera from its address, and where to connect; choices are told
+        as the path of that.
+        """
+        own = f"{HOST}:{self.get_port()}"
+        request = self._websock_server._live_connections[client.client_id].request
+        if request is not None and (origin := request.headers.get("Origin")):
+            own = urlsplit(origin).netloc  # the port may be forwarded
+        path = ";".join(f"{name}={quote(value, safe=',')}" for name, value in choices)
+        camera = {"Position": client.camera.position, "LookAt": client.camera.look_at}
+        places = [
+            f"initialCamera{name}={','.join(f'{metres:.6g}' for metres in place)}"
+            for name, place in camera.items()
+        ]
+        return f"http://{own}/?{'&'.join(places)}&websocket={quote(f'ws://{own}/{path}', safe='')}"
+
+    def opened_link(self) -> list[tuple[str, str]] | None:
+        """Choices of the link that a browser has opened, the next one; None if there is none."""
+        try:
+            path = self._links.get_nowait()
+        except Empty:
+            return None
+        entries = (entry.partition("=") for entry in path.strip("/").split(";"))
+        return [(name, unquote(value)) for name, _, value in entries]
 
     def frame_scene(self, bounds: ArrayLike) -> None:
         """Put the camera where it sees all of a box, (2, 3) in metres, with Z up, and a grid below.
@@ -187,8 +216,12 @@ def _is_own(origin: str) -> bool:
         return False
 
 
-def refuse_strangers(server: viser.ViserServer) -> None:
+def refuse_strangers(
+    server: viser.ViserServer, admitted: Callable[[str], None] = lambda path: None
+) -> None:
     """Let no page from elsewhere see what a server shows, nor press its buttons.
+
+    `admitted` is called with the path to which a page of this machine connects, if it has one.
 
     viser itself lets everybody in. That its port is on the loopback interface does not help:
     the browser that opens the stranger's page is on this machine.
@@ -200,6 +233,8 @@ def refuse_strangers(server: viser.ViserServer) -> None:
         request = connection.request
         origins = request.headers.get_all("Origin") if request else []
         if may_connect(origins):
+            if request is not None and request.path.strip("/"):
+                admitted(request.path)
             return
         _LOGGER.warning("a page of %r wanted to connect to the live page: refused", origins)
         await connection.close(_POLICY_VIOLATION, "only pages of this machine may connect")

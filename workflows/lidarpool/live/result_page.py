@@ -85,6 +85,7 @@ class ResultView:
                 self._view.draw_path(pictured.plan.path, pictured.planning)
         self._view.draw_time()
         self._view.draw_cloud(self._even, 0)
+        self._view.draw_labels()
         self._facts.content = self._told()
         return BUSY_SHARE
 

@@ -67,6 +67,7 @@ class LiveRun:
             page, job.scene, sensors, columns, origin, bounds, lasts, table.reflectance
         )
         self._described = described(sensors)
+        self._starting = "starting"  # what is going on before there is any progress
         self._newest = ""  # sensor and time of the newest frame
         self._shown = -1  # the last scan of which the page was told when it was
         self._store: RunStore | None = None
@@ -90,6 +91,7 @@ class LiveRun:
             self._progress = store.progress()
         store.on_parts = points.add
         self._store, self._points = store, points
+        self._starting = "starting: workers, each with its own Python"
 
     def with_progress(self, show: Show, partitions: Mapping[str, Partition]) -> Show:
         """Return a function to call with the progress: it calls `show` and tells the page.
@@ -102,6 +104,7 @@ class LiveRun:
             Those whose slots are shown.
         """
         self._partitions = partitions
+        self._starting = "starting: workers read the scene and make their trees"
 
         def tell(progress: Progress) -> None:
             show(progress)
@@ -161,6 +164,7 @@ class LiveRun:
         points, view = self._points, self._view
         self._text.content = self._panel()
         view.draw_time()
+        view.draw_labels()
         if points is None:
             view.draw_scene(lambda: (np.zeros(len(self._job.scene.faces)), None), 0)
             return share
@@ -202,7 +206,7 @@ class LiveRun:
         """Write how far the run is."""
         progress, points = self._progress, self._points
         if progress is None:
-            return f"{_BOX}<b>starting</b></div>"
+            return f"{_BOX}<b>{self._starting}</b></div>"
         lines = [f"<b>{self._words(progress)}</b>, {progress.seconds:,.0f} s{self._pace(progress)}"]
         lines += [
             _bar(label, getattr(progress, count), getattr(progress, total))
@@ -226,7 +230,7 @@ class LiveRun:
             return "stopping"
         if progress.waits_for:
             return f"waiting for slots of {escape(progress.waits_for)}"
-        return "running" if self._first is not None else "starting"
+        return "running" if self._first is not None and progress.cast else self._starting
 
     def _pace(self, progress: Progress) -> str:
         """Tell scans a second, and how long the rest will take."""

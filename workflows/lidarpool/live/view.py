@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Hashable, Sequence
+from contextlib import suppress
 from html import escape
 from typing import Any
 
@@ -22,12 +23,12 @@ from ..scene.scene import Scene
 from ..sensor.trajectory import quaternions_of
 from .cloud_view import HIDDEN, CloudView
 from .colouring import as_bytes
+from .labels import Labels
 from .looking import Filter
 from .page import LivePage, place_eye
 from .surface import MeshNode, Surface, below, colours_for
 
 MOST_POSES = 1000  # that have a ball
-MOST_LABELS = 20  # of actors
 MOST_RAYS = 150  # more of them hide what they hit
 
 _RED, _PALE = (224, 24, 45), (232, 140, 150)
@@ -93,6 +94,7 @@ class View:
         self._surface: Surface | None = None
         self._mesh = MeshNode(page, "/scene")
         self._lines: dict[str, Any] = {}  # {name: node}; nor no lines
+        self._labels = Labels(page)
         self._markers: list[Any] = []  # of the sensors, once it is told when it is
         self._bodies: list[Any] = []  # of the actors
         self._time: Any = None  # slider, where anything moves
@@ -135,6 +137,9 @@ class View:
                 self._show_rays = gui.add_checkbox("rays", initial_value=True)
             save = gui.add_button("Save picture")
             save.on_click(self._save)
+            link = gui.add_button("Link to this view")
+            link.on_click(self._link)
+            self._link_text = gui.add_html("")
 
     def _add_time(self, duration_s: float) -> None:
         gui, step = self._page.gui, 10.0 ** math.floor(math.log10(duration_s / 200))
@@ -171,6 +176,10 @@ class View:
             limits = ((at - length) * 1e9, at * 1e9) if length > 0 else None
             self.cloud.trail = Filter().with_limits("time", limits)
         self.cloud.draw(self.cut, self._playing)
+
+    def draw_labels(self) -> None:
+        """Show names where there is room for them, after all else is drawn."""
+        self._labels.draw()
 
     def draw_scene(self, hits: Callable[[], Hits], version: Hashable) -> None:
         """Show the scene; another version has other hits."""
@@ -252,6 +261,8 @@ class View:
 
     def draw_time(self) -> None:
         """Show sensors and actors where they are at the time that is chosen or played."""
+        while (choices := self._page.opened_link()) is not None:
+            self.choose(choices)
         if self._time is None:
             return
         if self._playing:
@@ -270,12 +281,14 @@ class View:
             name = f"/sensors/{number}"
             radius = _BALL * self._size_m * (_MOVES if way.moves else 1.0)
             self._markers.append(scene.add_icosphere(name, radius, _RED, cast_shadow=False))
-            if not way.moves:
-                scene.add_label(f"{name}/label", way.name or "sensor", anchor="bottom-left")
-            elif not number:  # those of one carrier are near each other
-                names = ", ".join(way.name for way in self._sensors if way.name) or "sensor"
-                scene.add_label(f"{name}/label", names, anchor="bottom-left")
         self._follow_carrier(time_ns)
+        moving = [way for way in self._sensors if way.moves]
+        if moving:  # those of one carrier are near each other
+            names = ", ".join(way.name for way in moving if way.name) or "sensor"
+            self._labels.put(names, moving[0].at(time_ns))
+        for way in self._sensors:
+            if not way.moves:
+                self._labels.put(way.name or "sensor", way.at(time_ns))
         with self._page.atomic():
             for marker, way in zip(self._markers, self._sensors, strict=True):
                 marker.position = way.at(time_ns)
@@ -284,6 +297,8 @@ class View:
                 body.position = positions[0]
                 if rotations is not None:
                     body.wxyz = np.roll(quaternions_of(rotations)[0], 1)
+                top = float(actor.mesh.vertices[:, 2].max())
+                self._labels.put(actor.name, positions[0] + [0.0, 0.0, top])
 
     def _follow_carrier(self, time_ns: float) -> None:
         """Move all cameras as the carrier has moved."""
@@ -301,7 +316,7 @@ class View:
         return way.at(time_ns)
 
     def _look(self, event: Any) -> None:
-        """Move the camera of a browser to a side, or to the sensor."""
+        """Move the camera of a browser to a side, or behind the sensor."""
         if event.client is None:
             return
         if event.target.value != "sensor":
@@ -314,7 +329,50 @@ class View:
         )
         length = float(np.linalg.norm(way[:2]))
         ahead = np.array([*way[:2] / length, 0.0]) if length > 1e-6 else np.array([1.0, 0.0, 0.0])
-        place_eye(event.client, at, at + 0.1 * self._size_m * ahead)
+        back = 5 * _BALL * self._size_m  # and up: it would hide everything
+        eye = at - back * ahead + [0.0, 0.0, back / 2]
+        place_eye(event.client, eye, at + 0.1 * self._size_m * ahead)
+
+    def _link(self, event: Any) -> None:
+        """Tell a browser where all can be seen as it sees it now."""
+        if event.client is not None:
+            url = escape(self._page.link(event.client, self.choices))
+            self._link_text.content = (
+                '<div style="padding:0 0.8em;font-size:0.7em;word-break:break-all;'
+                f'user-select:all;max-height:6em;overflow-y:auto">{url}</div>'
+            )
+
+    @property
+    def choices(self) -> list[tuple[str, str]]:
+        """(name, value) of what one has chosen to see, as `choose` takes it."""
+        chosen = [("cut", f"{self._cut.value:g}"), ("colour", self.cloud.colour.value)]
+        if self._scene is not None:
+            chosen.append(("scene", self._scene_colour.value))
+        if self._time is not None:
+            chosen.append(("time", f"{self._time.value:g}"))
+        if self._trail is not None:
+            chosen.append(("last", f"{self._trail.value:g}"))
+        limits = self.cloud.filter.limits
+        return chosen + [("only", f"{name},{low!r},{high!r}") for name, low, high in limits]
+
+    def choose(self, choices: Sequence[tuple[str, str]]) -> None:
+        """Choose what a link tells; what it tells wrongly is left as it is."""
+        menus: dict[str, Any] = {"colour": self.cloud.colour}
+        sliders: dict[str, Any] = {"cut": self._cut, "time": self._time, "last": self._trail}
+        if self._scene is not None:
+            menus["scene"] = self._scene_colour
+        wanted = Filter()
+        for name, value in choices:
+            with suppress(ValueError):
+                if name in menus and value in menus[name].options:
+                    menus[name].value = value
+                elif (slider := sliders.get(name)) is not None:
+                    slider.value = float(np.clip(float(value), slider.min, slider.max))
+                elif name == "only":
+                    column, low, high = value.split(",")
+                    if column in self.cloud.filtered:
+                        wanted = wanted.with_limits(column, (float(low), float(high)))
+        self.cloud.set_filter(wanted)
 
     def _save(self, event: Any) -> None:
         if event.client is not None:
@@ -334,11 +392,6 @@ class View:
                     receive_shadow=False,
                 )
             )
-            if number < MOST_LABELS:
-                top = (0.0, 0.0, float(actor.mesh.vertices[:, 2].max()))
-                self._page.scene.add_label(
-                    f"{name}/label", actor.name, position=top, anchor="bottom-left"
-                )
 
     def _add_poses(self) -> None:
         """Show the ways of sensors that move as lines, and where the others stand as balls."""
@@ -381,7 +434,7 @@ class View:
         )
         for name, at in (("start", corners[0]), ("target", corners[-1])):
             scene.add_icosphere(f"/path/{name}", _END * size, _PATH, position=at, cast_shadow=False)
-            scene.add_label(f"/path/{name}/label", name, anchor="bottom-left")
+            self._labels.put(name, at)
         if planning is None:
             return
         height = 0.002 * size
