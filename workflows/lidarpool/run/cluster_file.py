@@ -17,7 +17,7 @@ from ..base.errors import LidarpoolError
 from ..base.interrupts import deferred_interrupts
 from ..base.words import counted, did_you_mean
 from ..scan import GPU, LIDAR, OTHER
-from ..scenario.validation_errors import validation_error
+from ..scenario.validation_errors import validation_errors
 from ..scenario.yamlfile import read_yaml
 
 # A scheduler that SSH has started outlives a driver that was killed: it ends when it has been
@@ -70,7 +70,8 @@ class ClusterFile(BaseModel):
             file = cls.model_validate(content)
         except ValidationError as error:
             names = [*cls.model_fields, *Workers.model_fields]
-            raise LidarpoolError(validation_error(error, names, str(path))) from error
+            told = [f"{path}: {line}" for line in validation_errors(error, names)]
+            raise LidarpoolError("\n".join(told)) from error
         file._source = str(path)
         for name in file.partitions:
             if name not in (GPU, LIDAR, OTHER):
