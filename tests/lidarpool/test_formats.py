@@ -496,12 +496,13 @@ def test_a_cloud_is_saved_twice_with_the_same_bytes(cloud, sweeps, tmp_path, nam
 def test_a_cloud_is_saved_in_the_format_of_its_ending(cloud, sweeps, tmp_path):
     bare, known = cloud, replace(cloud, sweeps=lambda: sweeps)
     (tmp_path / "a.laz").write_text("an earlier one")
-    bare.save(tmp_path / "a.laz")
+    assert bare.save(tmp_path / "a.laz") == []
     las = laspy.read(tmp_path / "a.laz")
     assert len(las) == len(cloud) and las.header.scales[0] == 0.001
     known.part(slice(9)).save(tmp_path / "b.las")
     assert laspy.read(tmp_path / "b.las").header.scales[0] == sweeps.precision_m
-    known.save(tmp_path / "c.mcap", layout="ouster")
+    left_out = known.save(tmp_path / "c.mcap", layout="ouster")
+    assert left_out[:2] == ["scan", "object"] and "range" not in left_out
     store = get_typestore(Stores.ROS2_HUMBLE)
     with AnyReader([tmp_path / "c.mcap"], default_typestore=store) as bag:
         assert {"/front/points", "/rear/points", "/tf", "/actors", "/clock"} == set(bag.topics)
@@ -518,6 +519,8 @@ def test_a_cloud_is_saved_in_the_format_of_its_ending(cloud, sweeps, tmp_path):
         ("There is no layout 'sick': use velodyne", "x.mcap", {"layout": "sick"}),
         ("is a folder: remove it, or give another path", "kitti", {"format": "kitti"}),
         ("is a folder", "result", {"format": "laz"}),
+        ("precision_m is -1; it must be a length in metres", "x.las", {"precision_m": -1}),
+        ("layout is 3; it must be text", "x.mcap", {"layout": 3}),
         ("cannot be written: No such file", "gone/x.laz", {}),
     ):
         with pytest.raises(LidarpoolError, match=told):

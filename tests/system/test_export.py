@@ -31,7 +31,11 @@ def test_a_run_writes_what_its_scenario_asks_for_and_a_result_is_exported(
     assert done.code == 0, done.err
     made = {"cloud.ply", "sweeps.npz", "cloud.laz", "cloud.mcap", "kitti", "report.json"}
     assert {path.name for path in out.iterdir()} == made
-    assert {*json.loads((out / "report.json").read_text())["files"]} == made
+    report = json.loads((out / "report.json").read_text())
+    assert {*report["files"]} == made
+    left = [note for note in report["notes"] if "does not hold" in note]
+    assert [note.split()[0] for note in left] == ["mcap", "kitti"]
+    assert left[1] in done.out and "channel" in left[1]
     cloud = read_cloud(out / "cloud.ply")
     assert {"intensity", "time", "range", "class", "reflectivity"} <= set(cloud.columns)
     np.testing.assert_allclose(laspy.read(out / "cloud.laz").xyz, cloud.positions, atol=1e-5)

@@ -67,8 +67,8 @@ def export(
             for one in wanted:
                 one.write(folder / one.file, cloud, sweeps, overwrite=overwrite)
                 written.append(click.format_filename(folder / one.file))
-                if left := one.left_out(cloud):
-                    click.echo(f"note: {one.name} does not hold {', '.join(left)}", err=True)
+                for note in one.notes(cloud):
+                    click.echo(f"note: {note}", err=True)
                 click.echo(written[-1])
         except (LidarpoolError, KeyboardInterrupt) as error:
             if written:

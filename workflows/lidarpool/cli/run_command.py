@@ -105,7 +105,7 @@ def run_scenario(scenario: Scenario, options: RunOptions) -> None:
         if options.as_json:
             click.echo(json.dumps(summary(options.out, report), indent=1, allow_nan=False))
         else:
-            _tell(options.out, result, job, report["files"])
+            _tell(options.out, result, job, report)
         if live is not None and options.stay:
             live.stay()
 
@@ -251,8 +251,8 @@ def _local_client(scenario: Scenario, options: RunOptions, planning: bool) -> It
         yield client
 
 
-def _tell(out: Path, result: RunResult, job: Job, files: list[str]) -> None:
-    for note in result.notes:
+def _tell(out: Path, result: RunResult, job: Job, report: dict[str, Any]) -> None:
+    for note in report["notes"]:
         click.echo(f"note: {note}")
     if not result.hits:
         click.echo(f"note: {NO_HITS}")
@@ -274,4 +274,4 @@ def _tell(out: Path, result: RunResult, job: Job, files: list[str]) -> None:
             else "none is possible, the obstacles leave no way"
         )
         click.echo(f"{found}; {possible} ({plan.trials} trials, {result.planning_seconds:.1f} s)")
-    click.echo(f"results in {click.format_filename(out)}: {', '.join(files)}")
+    click.echo(f"results in {click.format_filename(out)}: {', '.join(report['files'])}")

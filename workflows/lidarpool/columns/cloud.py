@@ -11,7 +11,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..base.arguments import as_array, checked_fields
+from ..base.arguments import as_array, checked, checked_fields
 from ..base.errors import LidarpoolError
 from ..base.open3d_module import load_open3d
 from .table import TABLE, Column
@@ -42,6 +42,7 @@ class Savable:
     # Gives the `lidarpool.export.sweeps.Sweeps` of the survey; None where nobody knows them.
     sweeps: Callable[[], Any] | None
 
+    @checked
     def save(
         self,
         path: str | Path,
@@ -49,7 +50,7 @@ class Savable:
         format: str | None = None,  # noqa: A002 - as scenarios and the command call it
         layout: str = "velodyne",
         precision_m: float | None = None,
-    ) -> None:
+    ) -> list[str]:
         """Write the points in the format that the path ends in, whole or not at all.
 
         The same points give the same bytes. About a million points are in memory at a time, or
@@ -68,6 +69,10 @@ class Savable:
         precision_m
             Metres that positions are kept to; by default as they were rounded, else 0.001.
 
+        Returns
+        -------
+        Names of the columns that the format cannot hold.
+
         Raises
         ------
         LidarpoolError
@@ -77,7 +82,8 @@ class Savable:
         # Formats are in a room above this one, which does not import it: it is found by name, as
         # they are.
         save = import_module("lidarpool.export.formats").save
-        save(Path(path), self, format, layout, precision_m)
+        left_out: list[str] = save(Path(path), self, format, layout, precision_m)
+        return left_out
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -169,6 +175,7 @@ class Cloud(Savable):
             return np.zeros((2, 3), self.positions.dtype)
         return np.stack([self.positions.min(axis=0), self.positions.max(axis=0)])
 
+    @checked
     def to_dataframe(self, library: Literal["pandas", "polars"] = "pandas") -> Any:
         """Return a DataFrame of pandas or polars with all columns, by their names in files."""
         columns = dict(zip("xyz", self.positions.T, strict=True))

@@ -10,6 +10,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..base.errors import LidarpoolError
 from ..base.vocabulary import FORMATS, LAYOUTS, columns_needed
 from ..columns.cloud import Cloud, CloudLike
@@ -110,6 +112,11 @@ class Format:
         held = _HELD.get(self.layout if self._laid_out else self.name, set(names))
         return [name for name in names if name not in held]
 
+    def notes(self, cloud: CloudLike) -> list[str]:
+        """Return what a user should know of the cloud in this format: a sentence, or none."""
+        left = ", ".join(self.left_out(cloud))
+        return [f"{self.name} does not hold {left}"] if left else []
+
     def check_installed(self) -> None:
         """Check that it can be written here; LidarpoolError if a package is missing."""
         extra = _MODULES[self.name][1]
@@ -179,20 +186,22 @@ class Format:
 
 def save(
     path: Path, cloud: Cloud | StoredCloud, name: str | None, layout: str, precision_m: float | None
-) -> None:
-    """Write a cloud by itself; see `Cloud.save`."""
+) -> list[str]:
+    """Write a cloud by itself, and name the columns that are left out; see `Cloud.save`."""
     if name is None:
         name = "ply" if path.suffix == ".ply" else _ENDINGS.get(path.suffix)
     if name is None:
         raise LidarpoolError(
             f"{path} ends as no format does: use .ply, {', '.join(_ENDINGS)}, or give a format."
         )
+    if precision_m is not None and not 0 < precision_m < np.inf:
+        raise LidarpoolError(f"precision_m is {precision_m}; it must be a length in metres.")
     one = None if name == "ply" else Format(name, layout)
     sweeps = Sweeps.unknown() if cloud.sweeps is None else cloud.sweeps()
     sweeps = replace(sweeps, precision_m=precision_m or sweeps.precision_m)
     if one is None:
         save_cloud(path, cloud, precision_m=sweeps.precision_m)
-        return
+        return []
     if path.is_dir():
         raise LidarpoolError(f"{path} is a folder: remove it, or give another path.")
     if cloud.sweeps is None and "scan" in one.needs:
@@ -201,6 +210,7 @@ def save(
             "Result, or one that was read from the folder of a result."
         )
     one.write(path, cloud, sweeps, overwrite=True)
+    return one.left_out(cloud)
 
 
 def remove(path: Path) -> None:

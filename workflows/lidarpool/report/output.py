@@ -113,6 +113,7 @@ def write_result(
         for one in formats:
             one.write(staged / one.file, result.points, sweeps)
         report = make_report(result, files, counted)
+        report["notes"] += [note for one in formats for note in one.notes(result.points)]
         if not only_cloud:
             drawn.append(beside.submit(makers[_OF_CLOUD], staged / _OF_CLOUD))
             for each in drawn:
