@@ -326,7 +326,7 @@ def test_what_cannot_be_written_is_one_line_and_leaves_nothing(
     with pytest.raises(LidarpoolError, match="mcap with the layout ouster needs intensity, time"):
         Format("mcap", "ouster").write(tmp_path / "cloud.mcap", bare, sweeps)
     (tmp_path / "cloud.laz").write_text("mine")
-    with pytest.raises(LidarpoolError, match=r"is there already: .* --overwrite"):
+    with pytest.raises(LidarpoolError, match=r"exists: .* --overwrite"):
         Format("laz").write(tmp_path / "cloud.laz", cloud, sweeps)
     assert (tmp_path / "cloud.laz").read_text() == "mine"
     Format("laz").write(tmp_path / "cloud.laz", cloud, sweeps, overwrite=True)

@@ -306,17 +306,17 @@ def test_what_is_not_taken_over_is_named(imported, survey, tmp_path):
         import_, [str(survey(device, inside, scene)), "-o", str(tmp_path / "out")]
     )
     assert result.exit_code == 0, result.output
-    told = [line for line in result.output.splitlines() if line.startswith("not taken over: ")]
+    told = [line for line in result.output.splitlines() if line.startswith("not supported: ")]
     assert told == [
-        "not taken over: noise of the platform: positionXNoise",
-        "not taken over: <deflectionError> of S/1: errors by a formula",
-        "not taken over: <dmotion> of part 0: it stands as it is at first",
-        "not taken over: part 1, xyzloader of p.xyz: no triangles, left out",
+        "not supported: noise of the platform: positionXNoise",
+        "not supported: <deflectionError> of S/1: errors by a formula",
+        "not supported: <dmotion> of part 0: it stands as it is at first",
+        "not supported: part 1, xyzloader of p.xyz: no triangles, left out",
     ]
     head = (tmp_path / "out" / "scenario.yaml").read_text().splitlines()
     assert head[1:5] == [f"# N{line[1:]}." for line in told]
     again = CliRunner().invoke(import_, [str(survey(device, inside)), "-o", str(tmp_path / "out")])
-    assert "is there already" in str(again.exception)
+    assert "exists: name another" in str(again.exception)
 
 
 LASER = scanner("conic", "", scanAngleMax_deg=20, scanFreqMax_Hz=10)

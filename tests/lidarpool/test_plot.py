@@ -201,7 +201,7 @@ def test_a_result_without_a_plan(unplanned, tmp_path):
 
 @pytest.mark.parametrize("size", ["big", "480", "480x", "0x0", "479x480", "9000x9000", "1000x480"])
 def test_sizes_that_cannot_be(size, result):
-    words = "is no size.*such as 1600x1000|cannot be .* pixels: .*such as 1600 x 1000"
+    words = "is not a picture size.*such as 1600x1000|cannot be .* pixels: .*such as 1600 x 1000"
     with pytest.raises((click.UsageError, LidarpoolError), match=words):
         plot(result, "--size", size)
 

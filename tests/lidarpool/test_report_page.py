@@ -173,7 +173,7 @@ def test_numbers_are_those_of_the_report(write):
     page = html.fromstring(text)
     pairs = {dt.text: dt.getnext().text for dt in page.xpath("//dl[@class='pairs']//dt")}
     assert pairs["batches offered again because a worker was lost"] == "3"
-    assert pairs["scans that came twice, and were dropped"] == "17"
+    assert pairs["duplicate scans that were dropped"] == "17"
     assert pairs["tasks outside their partition"] == "0"
     assert pairs["shortest possible"] == f"{report['planning']['shortest_possible']:.2f} m"
     lead = page.xpath("//p[@class='lead']")[0].text_content()
@@ -250,7 +250,7 @@ STRAY = TaskRecord(TRIAL, "OTHER", "GPU-0", ("GPU",), 0, 1)
         ({"plan": ENCLOSED}, "none, the obstacles leave no way"),
         ({"plan": Planning((0, 0), (10, 0), trials=1, particles=5, iterations=1)}, "there are non"),
         ({"tasks": [*records(), STRAY]}, "A task of trial ran on GPU-0, which is not in OTHER."),
-        ({}, "has left no record"),
+        ({}, "left no record"),
     ],
 )
 def test_what_is_unusual_is_told(write, changes, words):

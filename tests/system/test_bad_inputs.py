@@ -66,7 +66,7 @@ OPTIONS: dict[str, tuple[list[str], str]] = {
     "unknown option": (["demo", "--fast"], "--fast"),
     "option without value": (["run", "good.yaml", "--out"], "--out"),
     "unknown backend": (["run", "good.yaml", "--backend", "gpu"], "'gpu' is not one of 'auto'"),
-    "no time": (["run", "good.yaml", "--wait", "soon"], "'soon' is no time"),
+    "no time": (["run", "good.yaml", "--wait", "soon"], "'soon' is not a time"),
     "both": (["run", "good.yaml", "--resume", "--fresh"], "give one of them"),
     "certificates alone": (["info", "--tls-key", "a.stl"], "are for the cluster of --scheduler"),
     "certificate that is not there": (["info", "--tls-ca", "ca.pem"], "'ca.pem' does not exist"),
@@ -85,7 +85,7 @@ OPTIONS: dict[str, tuple[list[str], str]] = {
     "out cannot be made": (["run", "good.yaml", "--out", "/proc/o"], "Cannot write to the folder"),
     "malformed address": (["run", "good.yaml", "--scheduler", "tcp://::1:x"], "tcp://host:8786"),
     "no port": (["info", "--scheduler", "localhost"], "has no port"),
-    "scene that is there": (["scene", "city", "good.ply"], "is there already"),
+    "scene that is there": (["scene", "city", "good.ply"], "exists: give another"),
     "no scheduler": (["run", "good.yaml", "--scheduler", "tcp://127.0.0.1:1"], "No Dask scheduler"),
 }
 

@@ -139,7 +139,7 @@ def test_a_backend_that_is_not_here(check, monkeypatch):
 def test_a_survey_that_hits_nothing_is_told_of(check):
     outcome = check("--json", text=json.dumps(SHORT | {"poses": [[0, 0, 1000]]}))
     assert outcome.code == 0
-    assert "no ray that was cast hit anything" in json.loads(outcome.out)["notes"][0]
+    assert "no ray hit anything" in json.loads(outcome.out)["notes"][0]
 
 
 def test_an_unfinished_run_is_told_of(check, tmp_path):
@@ -147,7 +147,7 @@ def test_an_unfinished_run_is_told_of(check, tmp_path):
     (tmp_path / "out" / "run" / "run.db").write_bytes(b"")
     outcome = check()
     assert outcome.code == 0
-    assert "holds an unfinished run: --resume goes on with it" in outcome.out
+    assert "holds an unfinished run: --resume continues it" in outcome.out
 
 
 def test_a_cluster_that_can_do_it(check, cluster):

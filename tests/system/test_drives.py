@@ -74,7 +74,7 @@ def town(tmp_path):
 def test_what_check_says_of_a_drive(town, lidarpool):
     told = lidarpool("check", town / "drive.yaml", "--out", town / "out").out
     assert re.search(r"144 scans along a trajectory, .* \(2 sensors\)", told)
-    assert re.search(r"way         1\.\d\d m in 0.200 s", told)
+    assert re.search(r"trajectory  1\.\d\d m in 0.200 s", told)
     assert re.search(
         r"roof        Ouster OS1-32, 2,048 firings, 2.00 turns; in one .* moves 0\.\d+ m", told
     )

@@ -49,7 +49,7 @@ def test_a_run_writes_what_its_scenario_asks_for_and_a_result_is_exported(
     assert not (tmp_path / "no").exists()
     (out / ".writing-0123").mkdir()  # of an export that was killed
     refused = lidarpool("export", out, "-f", "pcd", "-f", "laz")
-    assert refused.code == 2 and "cloud.laz is there already" in refused.err
+    assert refused.code == 2 and "cloud.laz exists" in refused.err
     assert not (out / "pcd").exists()
     done = lidarpool("export", out, "-f", "pcd", "-f", "laz", "--overwrite")
     assert (done.code, done.out) == (0, f"{out}/pcd\n{out}/cloud.laz\n")

@@ -30,7 +30,7 @@ def test_init_overwrites_nothing(tmp_path, lidarpool):
     (tmp_path / "scenario.yaml").write_text("mine")
     outcome = lidarpool("init", tmp_path)
     assert outcome.code == 2
-    assert f"{tmp_path / 'scenario.yaml'} is there already, and is not overwritten" in outcome.err
+    assert f"{tmp_path / 'scenario.yaml'} exists, and is not overwritten" in outcome.err
     assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
 
 
@@ -56,8 +56,8 @@ def test_init_with_meshes_names_them_as_seen_from_the_scenario(tmp_path, lidarpo
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (["--mesh", "nowhere.stl"], "nowhere.stl is no file of a mesh format"),
-        (["--mesh", "notes.txt"], "notes.txt is no file of a mesh format"),
+        (["--mesh", "nowhere.stl"], "nowhere.stl has no mesh format"),
+        (["--mesh", "notes.txt"], "notes.txt has no mesh format"),
         (["--unit", "mm"], "name it with --mesh"),
         (["--mesh", "notes.txt", "--unit", "ells"], "ells"),
     ],

@@ -1,4 +1,4 @@
-"""The command `lidarpool check`: what a run would do and take, before anything starts."""
+"""The command `lidarpool check`: what a run would do and need, before anything starts."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ def check(
     no_plan: bool,
     as_json: bool,
 ) -> None:
-    """Tell what a run would do and take.
+    """Show what a run would do and need.
 
-    The scenario is checked, and nothing is started.
+    The scenario is checked; nothing is started.
 
     Some scans are cast here to estimate the number of points. The exit code is 0 if it can run,
     and 2, with the reasons, if it cannot.
@@ -84,7 +84,7 @@ def check(
 
 
 def told(job: Job, found: dict[str, Any]) -> Iterator[str]:
-    """Tell of a forecast in lines for people."""
+    """Print a forecast as lines of text."""
     from dask.utils import format_bytes
 
     from ..base.words import counted
@@ -105,7 +105,7 @@ def told(job: Job, found: dict[str, Any]) -> Iterator[str]:
     turn = f"{len(job.survey.carried)} sensors" if several else turn
     yield f"survey      {counted(found['scans'], 'scan')} {where}, {found['rays']:,} rays ({turn})"
     if drive:
-        yield f"way         {drive['metres']:,.2f} m in {drive['seconds']:,.3f} s"
+        yield f"trajectory  {drive['metres']:,.2f} m in {drive['seconds']:,.3f} s"
         for sensor in drive["sensors"]:
             told = f"{sensor['name'] or 'sensor':<11} {sensor['model']}, "
             told += counted(sensor["firings"], "firing")
@@ -132,7 +132,7 @@ def told(job: Job, found: dict[str, Any]) -> Iterator[str]:
     limit = f" of {format_bytes(there)}" if there else ""
     yield f"memory      about {format_bytes(found['memory']['needed'])}{limit}"
     yield (
-        f"disk        about {format_bytes(disk['parts'])} meanwhile and "
+        f"disk        about {format_bytes(disk['parts'])} during the run and "
         f"{format_bytes(disk['result'])} for the result; {format_bytes(disk['free'])} free"
     )
     for note in found["notes"]:

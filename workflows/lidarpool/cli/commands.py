@@ -1,7 +1,7 @@
 """The command `lidarpool`.
 
-The modules of commands import what they need within functions: help and the completion of words
-at a terminal come at once, where everything that is imported for a run takes a second.
+The modules of commands import what they need within functions, so that help and completion are
+immediate: the imports of a run take a second.
 """
 
 from __future__ import annotations
@@ -44,10 +44,14 @@ PROGRAM = "lidarpool"
 _SHOWN = (
     click.option("--tls", is_flag=True, help="Encrypt the traffic of the local cluster."),
     click.option(
-        "--live", is_flag=True, help="Show the run in the browser; the page stays until Ctrl-C."
+        "--live", is_flag=True, help="Show the live page in the browser; it stays until Ctrl-C."
     ),
     click.option(
-        "--no-stay", "stay", flag_value=False, default=True, help="With --live: end with the run."
+        "--no-stay",
+        "stay",
+        flag_value=False,
+        default=True,
+        help="With --live: end the page with the run.",
     ),
     click.option(
         "--only",
@@ -69,14 +73,16 @@ _SHOWN = (
 
 
 def _seconds(_: click.Context, __: click.Parameter, text: str | None) -> float | None:
-    """Take a time such as 90, 90s, 10m or 2h."""
+    """Parse a time such as 90, 90s, 10m or 2h."""
     if text is None:
         return None
     unit = {"s": 1, "m": 60, "h": 3600}.get(text[-1:])
     try:
         return float(text[:-1]) * unit if unit else float(text)
     except ValueError as error:
-        raise click.BadParameter(f"{text!r} is no time: give a number with s, m or h.") from error
+        raise click.BadParameter(
+            f"{text!r} is not a time: give a number with s, m or h."
+        ) from error
 
 
 def _shown(command: options.Command) -> options.Command:
@@ -117,34 +123,35 @@ def demo(out: Path, **shown: Any) -> None:
 @options.cluster
 @options.backend
 @options.no_plan
-@click.option("--resume", is_flag=True, help="Go on with an unfinished run, if there is one.")
-@click.option("--fresh", is_flag=True, help="Drop an unfinished run.")
+@click.option("--resume", is_flag=True, help="Resume an unfinished run, if there is one.")
+@click.option("--fresh", is_flag=True, help="Delete an unfinished run.")
 @click.option(
     "--parts",
     metavar="PLACE",
-    help="Folder or URL (s3://…) that LIDAR workers write points to until the result is whole.",
+    help="Folder or URL (s3://…) where LIDAR workers keep the points during the run.",
 )
 @click.option(
     "--wait",
     "wait_s",
     callback=_seconds,
     metavar="TIME",
-    help=f"Wait so long for partitions that are still empty, 90s or 10m; by default {WAIT_S:g}s, "
-    f"with --cluster {QUEUE_S / 3600:g}h.",
+    help="How long to wait for partitions that are empty at the start, such as 90s or 10m; by "
+    f"default {WAIT_S:g}s, with --cluster {QUEUE_S / 3600:g}h.",
 )
 @click.option(
     "--patience",
     "patience_s",
     callback=_seconds,
     metavar="TIME",
-    help=f"Wait so long for partitions that become empty; by default {PATIENCE_S:g}s, with "
-    f"--cluster {QUEUE_S / 3600:g}h.",
+    help="How long to wait for partitions that become empty later; by default "
+    f"{PATIENCE_S:g}s, with --cluster {QUEUE_S / 3600:g}h.",
 )
 @_shown
 def run(scenario: Path, **given: Any) -> None:
     """Run the survey of a scenario or mesh file.
 
-    A mesh file alone is scanned from its middle, below the ceiling; every hit is kept, to 1 mm.
+    A mesh file is scanned from the middle of its floor, below the ceiling; every hit is kept, to
+    1 mm.
 
     \b
     Examples:
@@ -163,11 +170,11 @@ def run(scenario: Path, **given: Any) -> None:
         )
     if given["tls"] and given["scheduler"] is not None:
         raise click.UsageError(
-            "--tls is for a cluster of this machine; that of --scheduler is encrypted if its "
+            "--tls is for the local cluster; the cluster of --scheduler is encrypted if its "
             "address begins with tls://."
         )
     if given["resume"] and given["fresh"]:
-        raise click.UsageError("--resume goes on with what --fresh drops: give one of them.")
+        raise click.UsageError("--resume continues the run that --fresh deletes: give one of them.")
     _run(scenario, **given)
 
 
@@ -176,9 +183,9 @@ def _run(path: Path | None, **given: Any) -> None:
 
     keep_freed_memory()
     if not given.get("scheduler") and not given.get("cluster"):
-        start_fork_server()  # which imports what workers need meanwhile
+        start_fork_server()  # imports what workers need in the background
     try:
-        with deferred_interrupts():  # an extension module whose import is broken off is lost
+        with deferred_interrupts():  # an interrupted import cannot be repeated
             from ..run.cluster_file import ClusterFile
             from ..scenario.scenario import Scenario
             from .run_command import RunOptions, run_scenario
@@ -248,7 +255,7 @@ def _tell_workers(workers: list[Any]) -> None:
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:
-    """Run the command and exit: 0 done, 2 for what the user can put right, 130 interrupted."""
+    """Run the command and exit: 0 done, 2 an error of the user's, 130 interrupted."""
     interrupt_on_signals()
     set_logs(shown=False)
     try:
@@ -267,8 +274,8 @@ def main(arguments: list[str] | None = None) -> NoReturn:
         notes = _notes(error)
         _die(" ".join([f"{STOPPED}.", *notes]) if notes else UNTOUCHED, INTERRUPTED)
     except OSError as error:
-        # Of a name that no file can have, or that lies in a folder which may not be looked into;
-        # anything else is a defect, and shown whole.
+        # The name is impossible for a file, or its folder may not be read; anything else is a
+        # defect, and gets a traceback.
         if error.filename is None:
             raise
         told = f"{error.filename}: {error.strerror}: give another name or folder."
@@ -286,7 +293,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
 
 
 def _notes(error: BaseException) -> list[str]:
-    """List the notes of an error, or of what it came from: what was kept, and how to go on."""
+    """List the notes of an error or its cause: what was kept, and how to continue."""
     link: BaseException | None = error
     while link is not None:
         if notes := getattr(link, "__notes__", []):
@@ -296,7 +303,7 @@ def _notes(error: BaseException) -> list[str]:
 
 
 def _die(message: str, code: int) -> NoReturn:
-    # Names in it may come from files, and a terminal obeys what cannot be printed.
+    # Names may come from files, and control characters would reach the terminal.
     message = "".join(c if c.isprintable() or c == "\n" else "\ufffd" for c in message)
     click.echo(f"lidarpool: {message}", err=True)
     sys.exit(code)

@@ -19,21 +19,21 @@ from ..base.vocabulary import FORMATS, LAYOUTS
     type=click.Choice(list(FORMATS)),
     multiple=True,
     required=True,
-    help="Write this one; may be given several times.",
+    help="Format to write; may be given several times.",
 )
 @click.option(
     "--layout",
     type=click.Choice(list(LAYOUTS)),
     default="velodyne",
     show_default=True,
-    help="Of the points of mcap and rosbag2.",
+    help="Layout of points in mcap and rosbag2.",
 )
 @click.option(
     "--out",
     type=click.Path(path_type=Path, file_okay=False),
     help="Folder for the files.  [default: FOLDER]",
 )
-@click.option("--overwrite", is_flag=True, help="Replace what is there.")
+@click.option("--overwrite", is_flag=True, help="Replace existing files.")
 def export(
     result: Path, formats: tuple[str, ...], layout: str, out: Path | None, overwrite: bool
 ) -> None:
@@ -49,19 +49,19 @@ def export(
     from ..export.formats import Format
     from ..export.sweeps import SWEEPS_FILE, Sweeps
 
-    # A result is whole where it has its report, which is moved into place last.
+    # The report of a result is moved into place last.
     for name in ("cloud.ply", SWEEPS_FILE, "report.json"):
         if not (result / name).exists():
             raise LidarpoolError(
                 f"{result} holds no {name}: give the folder of a finished run (its --out); "
-                "lidarpool run --resume goes on with one that was cut short."
+                "lidarpool run --resume continues an unfinished one."
             )
     sweeps = Sweeps.load(result / SWEEPS_FILE)
     cloud = CloudFile(result / "cloud.ply")
     wanted = [Format(name, layout) for name in dict.fromkeys(formats)]
     written: list[str] = []
     with result_folder(result if out is None else out) as folder:
-        for one in wanted:  # before the first of them takes its time
+        for one in wanted:  # before any is written, which may take long
             one.check(folder / one.file, cloud, overwrite=overwrite)
         try:
             for one in wanted:

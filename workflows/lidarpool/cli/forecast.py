@@ -1,4 +1,4 @@
-"""What a run would do and take, found out without starting anything."""
+"""What a run would do and need, found out without starting anything."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ from ..scene.scene import Scene
 from ..sensor import Survey
 from .run_command import NO_HITS
 
-# Measured on Linux: a process of ours with Dask loaded, and what a triangle takes at most while
-# a caster is built (Embree 300, NumPy 350, CUDA 360).
+# Measured on Linux: a process of ours with Dask loaded, and the most that a triangle takes while a
+# caster is built (Embree 300, NumPy 350, CUDA 360).
 PROCESS_BYTES = 200 << 20
 TRIANGLE_BYTES = 360
 SCENE_BYTES = 80  # of a triangle, in every process that knows the scene
@@ -58,7 +58,7 @@ SAMPLE_RAYS, SAMPLE_SCANS = 500_000, (16, 500)
 
 @dataclass(frozen=True)
 class Sample:
-    """What some scans of a survey, cast here, say of all.
+    """Estimate for a survey from some of its scans, cast here.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def forecast(
     formats: Sequence[Format] = (),
     file: ClusterFile | None = None,
 ) -> dict[str, Any]:
-    """Find out what a run would do and take, and whether it can.
+    """Find out what a run would do and need, and whether it can run.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def forecast(
     except (LidarpoolError, PoolError) as error:
         reasons.append(str(error))
     sample = None
-    # Casting here takes what it takes on a worker: it would be refused, or killed.
+    # Casting here needs as much memory as on a worker: it would fail or be killed.
     if _worker_bytes(job) <= MEMORY_LIMIT:
         sample = sample_survey(job.scene, job.survey)
         if not sample.hits:
@@ -141,13 +141,13 @@ def forecast(
     free = shutil.disk_usage(_existing(out)).free
     if free < parts + result:
         reasons.append(
-            f"The disk of {out} has {format_bytes(free)} free and the run needs about "
+            f"The disk of {out} has {format_bytes(free)} free, and the run needs about "
             f"{format_bytes(parts + result)}: make room, name another folder with --out, or take "
             "a larger keep_every."
         )
     if memory and memory < needed:
         reasons.append(
-            f"There are {format_bytes(memory)} of memory and the run needs about "
+            f"There are {format_bytes(memory)} of memory, and the run needs about "
             f"{format_bytes(needed)}: take a smaller scene, fewer workers (pool.gpu), "
             "rays_per_revolution or planning.particles, or a machine with more."
         )
@@ -172,7 +172,7 @@ def forecast(
 
 
 def _drive(survey: Survey) -> dict[str, Any] | None:
-    """Tell how far a carrier that moves goes, and what each sensor does meanwhile."""
+    """Describe how far a moving carrier goes, and the turns of each sensor."""
     if not survey.path.moves:
         return None
     seconds = survey.duration_ns / 1e9
@@ -216,7 +216,7 @@ def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> Sample
 def _slots(
     job: Job, pool: PoolSection, client: Client | None, file: ClusterFile | None
 ) -> dict[str, dict[str, int]]:
-    """Slots of each partition: those needed, and those that there are or would be."""
+    """Slots of each partition: those needed, and those that exist or would exist."""
     needed = slots_needed(job.collectors, job.planning is not None)
     if file is not None:
         there = file.slots
@@ -238,12 +238,12 @@ def _backend_here(wanted: str) -> str:
 
 
 def _existing(out: Path) -> Path:
-    """Return the folder itself, or the innermost around it that is there."""
+    """Return the folder itself, or its innermost existing parent."""
     return next(path for path in (out, *out.absolute().parents) if path.exists())
 
 
 def _look_at_folder(out: Path) -> tuple[list[str], list[str]]:
-    """Return reasons why the result cannot go there, and notes; nothing is made or changed."""
+    """Return reasons why the result cannot be written there, and notes; changes nothing."""
     reasons, there = [], _existing(out)
     if not there.is_dir():
         reasons.append(f"{there} is a file: give a folder for the results with --out.")
@@ -251,7 +251,7 @@ def _look_at_folder(out: Path) -> tuple[list[str], list[str]]:
         reasons.append(f"Cannot write to the folder {there}: give another with --out.")
     if not (out / RUN_FOLDER / FILE).exists():
         return reasons, []
-    note = f"{out} holds an unfinished run: --resume goes on with it, --fresh drops it"
+    note = f"{out} holds an unfinished run: --resume continues it, --fresh deletes it"
     return reasons, [note]
 
 
@@ -277,12 +277,12 @@ def _machine_bytes(job: Job, points: int, slots: dict[str, dict[str, int]]) -> i
 
 
 def _disk_bytes(job: Job, points: int, exports: int) -> tuple[int, int]:
-    """Disk that parts and database take meanwhile, and that the result takes."""
+    """Disk that parts and database need during the run, and that the result needs."""
     survey, faces, point = job.survey, len(job.scene.faces), _point_bytes(job)
     parts = min(survey.scan_count, max(16, survey.ray_count // BATCH_RAYS + 1))
     tally = 12 * min(faces, BATCH_RAYS // 10)  # names each triangle that the rays of a part hit
     run = point * points + (PART_BYTES + tally) * parts + SUMMARY_BYTES * survey.scan_count
-    # A row of the PLY has doubles for the coordinates at most; a piece of it is there twice.
+    # A row of the PLY has doubles for coordinates at most; one piece exists twice.
     cloud = (point + 16) * (points + min(points, CHUNK_POINTS))
     exported = (point + FORMAT_BYTES) * points * exports
     return run, cloud + exported + ROOM_BYTES + 36 * faces

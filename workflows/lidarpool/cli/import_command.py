@@ -15,7 +15,7 @@ import click
     metavar="DIR",
     type=click.Path(path_type=Path, exists=True, file_okay=False),
     multiple=True,
-    help="Folder that names in the survey start from; may be given several times.  "
+    help="Folder where references in the survey start; may be given several times.  "
     "[default: the survey's, and those above it]",
 )
 @click.option(
@@ -28,7 +28,7 @@ import click
 def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
     """Write a HELIOS++ survey as a scenario.
 
-    What cannot be taken over is named, one line each. Mesh files stay where they are.
+    Unsupported features are listed, one line each. Mesh files stay where they are.
 
     \b
     Examples:
@@ -43,5 +43,5 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
     name = click.format_filename(made.path)
     click.echo(f"{name}: {counted(sensors, 'sensor')}, {counted(files, 'mesh file')}")
     for line in made.left_out:
-        click.echo(f"not taken over: {line}")
+        click.echo(f"not supported: {line}")
     click.echo(f"next: lidarpool check {shlex.quote(str(made.path))}")

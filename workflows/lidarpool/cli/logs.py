@@ -8,13 +8,13 @@ import warnings
 
 
 def set_logs(shown: bool) -> None:
-    """Show what libraries log and warn of in this process, or drop it.
+    """Show log messages and warnings of libraries in this process, or drop them.
 
-    What its user has to know, the command says. There is no log file: `-v` and the shell make one.
+    The command itself tells users what matters. For a log file, redirect the output of `-v`.
     """
     logging.disable(logging.NOTSET if shown else logging.CRITICAL)
     if shown:
         for handler in logging.getLogger("distributed").handlers:
-            handler.setLevel(logging.INFO)  # which a cluster of this machine has raised
+            handler.setLevel(logging.INFO)  # a local cluster has raised it
     elif not sys.warnoptions:
         warnings.simplefilter("ignore")

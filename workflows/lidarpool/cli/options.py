@@ -18,14 +18,14 @@ out = click.option(
     type=click.Path(path_type=Path),
     default=Path("lidarpool-out"),
     show_default=True,
-    help="Folder for the results; made if it is not there.",
+    help="Folder for the results; made if it does not exist.",
 )
 backend = click.option(
     "--backend",
     type=click.Choice(BACKENDS),
-    help="Ray caster of stage 2; by default the scenario's, else the fastest there is.",
+    help="Ray caster of stage 2; by default the scenario's, else the fastest available.",
 )
-no_plan = click.option("--no-plan", is_flag=True, help="Leave the path planning out.")
+no_plan = click.option("--no-plan", is_flag=True, help="Leave out path planning.")
 cluster = click.option(
     "--cluster",
     metavar="FILE",
@@ -56,8 +56,8 @@ def scheduler(command: Command) -> Command:
     file = click.Path(exists=True, dir_okay=False, path_type=Path)
     for name, what in (
         ("key", "Private key of that certificate, if its file does not hold it."),
-        ("cert", "Certificate to show to an encrypted cluster, a PEM file."),
-        ("ca", "Certificates of the authority of an encrypted cluster, a PEM file."),
+        ("cert", "Own certificate for an encrypted cluster, a PEM file."),
+        ("ca", "Certificate of the authority of an encrypted cluster, a PEM file."),
     ):
         click.option(f"--tls-{name}", type=file, help=what)(with_files)
     return click.option(

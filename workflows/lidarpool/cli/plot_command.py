@@ -1,4 +1,4 @@
-"""The command `lidarpool plot`: the pictures of a finished result, drawn again."""
+"""The command `lidarpool plot`: draw the pictures of a finished result again."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from ..base.vocabulary import PICTURES
 
 
 def _size(ctx: click.Context, param: click.Parameter, value: Any) -> tuple[int, int]:
-    """Width and height in pixels of a text such as 1600x1000."""
+    """Parse width and height in pixels from a text such as 1600x1000."""
     if found := re.fullmatch(r"(\d{1,6})[xX×](\d{1,6})", value):
         return int(found[1]), int(found[2])
     raise click.BadParameter(
-        f"{value!r} is no size of a picture: give width x height in pixels, such as 1600x1000."
+        f"{value!r} is not a picture size: give width x height in pixels, such as 1600x1000."
     )
 
 
@@ -27,7 +27,7 @@ def _size(ctx: click.Context, param: click.Parameter, value: Any) -> tuple[int, 
     "--only",
     type=click.Choice(PICTURES),
     multiple=True,
-    help="Draw this one; may be given several times.  [default: all]",
+    help="Picture to draw; may be given several times.  [default: all]",
 )
 @click.option(
     "--size",
@@ -47,7 +47,7 @@ def _size(ctx: click.Context, param: click.Parameter, value: Any) -> tuple[int, 
     metavar="COLUMN",
     default="z",
     show_default=True,
-    help="Colour the points of the cloud by this column of it.",
+    help="Column to colour the points of the cloud by.",
 )
 def plot(
     result: Path, only: tuple[str, ...], size: tuple[int, int], out: Path | None, colour: str
@@ -65,7 +65,7 @@ def plot(
 
     if not (result / PICTURE_FILE).exists():
         raise LidarpoolError(
-            f"{result} holds no {PICTURE_FILE}, which the pictures are drawn from: give the "
+            f"{result} holds no {PICTURE_FILE}, the data of the pictures: give the "
             "folder of a finished run (its --out)."
         )
     keep_freed_memory()

@@ -37,17 +37,16 @@ from .worker_logs import WorkerLogs
 if TYPE_CHECKING:
     from ..live.run_page import LiveRun
 
-NO_HITS = "no ray that was cast hit anything: look at poses, ranges and units"
+NO_HITS = "no ray hit anything: check poses, ranges and units"
 
 
 @dataclass(frozen=True)
 class RunOptions:
     """How a scenario is to be run; see the options of `lidarpool run`.
 
-    `resumable` says whether the run is kept in the output folder; without that, `resume` and
-    `fresh` mean nothing. `stay` says whether the page of `live` stays when all is done. `only` is
-    "cloud" for a cloud without pictures and page. `overwrite` replaces the result of another
-    survey. `parts` is where the parts go meanwhile.
+    `resumable`: keep the run in the output folder; otherwise `resume` and `fresh` have no effect.
+    `stay`: keep the live page open after the run. `only`: "cloud" for a cloud without pictures and
+    page. `overwrite`: replace the result of another survey. `parts`: where to keep the parts.
     """
 
     out: Path
@@ -78,15 +77,15 @@ class RunOptions:
 
 
 def run_scenario(scenario: Scenario, options: RunOptions) -> None:
-    """Run a scenario, write the result and tell of it.
+    """Run a scenario, write the result and print a summary.
 
     Raises
     ------
     LidarpoolError
-        If something is wrong or fails; notes of the error say what was kept.
+        If the run fails; notes of the error say what was kept.
     """
     set_logs(options.verbose)
-    if options.here:  # before the scene is read, which may take long
+    if options.here:  # before reading the scene, which may take long
         check_backend_here(options.backend or scenario.pool.backend)
     job = make_job(
         scenario,
@@ -117,9 +116,9 @@ def _simulate(
     live: LiveRun | None,
     whole: ExitStack,
 ) -> tuple[RunResult, dict[str, Any]]:
-    """Do what is not done yet, and write the result; returns also the report.
+    """Run what is not done yet, write the result, and return it with its report.
 
-    As soon as the result is in its place, an error or interrupt that ends `whole` says so.
+    Once the result is in place, a note says so in any error or interrupt that ends `whole`.
     """
     formats = formats_of(scenario)
     for one in formats:
@@ -158,13 +157,13 @@ def _simulate(
 
 
 def formats_of(scenario: Scenario) -> list[Format]:
-    """List what a scenario has the cloud exported to."""
+    """List the formats that a scenario exports the cloud to."""
     return [Format(one.format, one.layout) for one in scenario.output.write if one.format != "ply"]
 
 
 @contextmanager
 def _noting_complete(out: Path) -> Iterator[None]:
-    """Let an error or interrupt say that the result is whole."""
+    """Add a note to an error or interrupt that the result is complete."""
     try:
         yield
     except BaseException as error:
@@ -174,7 +173,7 @@ def _noting_complete(out: Path) -> Iterator[None]:
 
 @contextmanager
 def _shown_live(job: Job, options: RunOptions) -> Iterator[LiveRun | None]:
-    """Page that shows the run, if one is wanted."""
+    """Live page of the run, if it is wanted."""
     if not options.live:
         yield None
         return
@@ -185,7 +184,7 @@ def _shown_live(job: Job, options: RunOptions) -> Iterator[LiveRun | None]:
 
 
 def _store(job: Job, options: RunOptions) -> RunStore:
-    """Where the run is kept, with what an earlier one has left if that is to be resumed."""
+    """Store of the run, with what an earlier run has left if it is to be resumed."""
     if not options.resumable:
         return RunStore(job)
     path = options.out / RUN_FOLDER
@@ -200,7 +199,7 @@ def _store(job: Job, options: RunOptions) -> RunStore:
 def _drive(
     scenario: Scenario, store: RunStore, options: RunOptions, live: LiveRun | None
 ) -> RunResult:
-    """Run on a cluster, on one of this machine if none is given."""
+    """Run on a cluster, a local one if none is given."""
     if options.cluster is not None:
         cluster = _started_client(options.cluster, options)
     elif options.scheduler is not None:
@@ -235,7 +234,7 @@ def _note(words: str) -> None:
 
 @contextmanager
 def _local_client(scenario: Scenario, options: RunOptions, planning: bool) -> Iterator[Client]:
-    """Client of a cluster on this machine, whose workers share the terminal."""
+    """Client of a local cluster, whose workers share the terminal."""
     cluster = local_client(
         gpu_workers=scenario.pool.gpu,
         collectors=scenario.pool.collectors,
@@ -271,7 +270,7 @@ def _tell(out: Path, result: RunResult, job: Job, report: dict[str, Any]) -> Non
         possible = (
             f"the shortest possible is {plan.shortest_possible:.2f} m"
             if math.isfinite(plan.shortest_possible)
-            else "none is possible, the obstacles leave no way"
+            else "no path is possible, the obstacles leave no way"
         )
         click.echo(f"{found}; {possible} ({plan.trials} trials, {result.planning_seconds:.1f} s)")
     click.echo(f"results in {click.format_filename(out)}: {', '.join(report['files'])}")

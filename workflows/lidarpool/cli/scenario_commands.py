@@ -22,23 +22,23 @@ from ..base.vocabulary import UNITS_M
     metavar="FILE",
     type=click.Path(path_type=Path),
     multiple=True,
-    help="Survey this mesh file; may be given several times.",
+    help="Mesh file to survey; may be given several times.",
 )
 @click.option(
     "--unit",
     type=click.Choice(list(UNITS_M)),
-    help="Length unit of these files; by default what they state, else metres.",
+    help="Length unit of these files; by default the one they state, else metres.",
 )
 @click.option(
     "--up-axis",
     type=click.Choice(["x", "y", "z"]),
-    help="Axis of these files that points up; by default what they state, else z.",
+    help="Axis of these files that points up; by default the one they state, else z.",
 )
 def init(folder: Path, meshes: tuple[Path, ...], unit: str | None, up_axis: str | None) -> None:
     """Write a commented scenario file with all defaults.
 
-    Beside it goes its JSON Schema, with which editors complete and check it. A scenario that is
-    there is not overwritten.
+    Its JSON Schema is written beside it, so that editors complete and check it. An existing
+    scenario is not overwritten.
 
     \b
     Examples:
@@ -59,7 +59,7 @@ def init(folder: Path, meshes: tuple[Path, ...], unit: str | None, up_axis: str 
         (folder / SCHEMA_FILE).write_text(schema_text(), encoding="utf-8", newline="\n")
     except FileExistsError as error:
         raise LidarpoolError(
-            f"{error.filename} is there already, and is not overwritten: name another folder, "
+            f"{error.filename} exists, and is not overwritten: name another folder, "
             "lidarpool init DIR, or remove it."
         ) from error
     name = click.format_filename(target)
@@ -73,12 +73,12 @@ def init(folder: Path, meshes: tuple[Path, ...], unit: str | None, up_axis: str 
 
 
 def _entry(path: Path, folder: Path, unit: str | None, up_axis: str | None) -> dict[str, str]:
-    """Entry of `scene.files` for a mesh file, named as seen from the scenario's folder."""
+    """Entry of `scene.files` for a mesh file, relative to the scenario's folder."""
     from ..scene.meshfile import SUFFIXES
 
     if not path.is_file() or path.suffix.lower() not in SUFFIXES:
         raise LidarpoolError(
-            f"{path} is no file of a mesh format that can be read; these are: {' '.join(SUFFIXES)}."
+            f"{path} has no mesh format that can be read; these can: {' '.join(SUFFIXES)}."
         )
     said = {"file": Path(os.path.relpath(path, folder)).as_posix()}
     return said | {k: v for k, v in (("unit", unit), ("up_axis", up_axis)) if v}
@@ -88,7 +88,7 @@ def _entry(path: Path, folder: Path, unit: str | None, up_axis: str | None) -> d
 def schema() -> None:
     """Print the JSON Schema of scenario files.
 
-    Editors complete scenarios by it.
+    Editors complete and check scenarios with it.
 
     Visual Studio Code does with the extension redhat.vscode-yaml, Vim, Emacs and others with
     yaml-language-server, once the first line of a scenario names the schema's file:

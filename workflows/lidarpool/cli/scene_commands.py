@@ -1,4 +1,4 @@
-"""The commands `lidarpool scene …`: scenes to try things on, as mesh files."""
+"""The commands `lidarpool scene …`: generated scenes as mesh files."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ if TYPE_CHECKING:
 
 @click.group(name="scene")
 def scene() -> None:
-    """Make scenes to survey, as mesh files."""
+    """Generate scenes as mesh files."""
 
 
 def _made(triangles: int) -> Callable[[Command], Command]:
-    """Add a file to write, about how many triangles, and a seed."""
+    """Add the output file, the number of triangles, and a seed."""
 
     def add(command: Command) -> Command:
         for option in (
             click.option("--seed", default=0, help="The same seed gives the same scene."),
-            click.option("--triangles", default=triangles, help="About how many."),
-            click.option("--overwrite", is_flag=True, help="Replace a file that is there."),
+            click.option("--triangles", default=triangles, help="Approximate number."),
+            click.option("--overwrite", is_flag=True, help="Replace an existing file."),
             click.argument("out", type=click.Path(path_type=Path), metavar="OUT.ply|.glb|.obj"),
         ):
             command = option(command)
@@ -73,7 +73,7 @@ def _write(out: Path, make: Callable[[], Scene], overwrite: bool) -> None:
 
     check_target(out)
     if out.exists() and not overwrite:
-        raise LidarpoolError(f"{out} is there already: give another name, or --overwrite.")
+        raise LidarpoolError(f"{out} exists: give another name, or --overwrite.")
     made = make()
     write_scene(out, made)
     low, high = made.bounds

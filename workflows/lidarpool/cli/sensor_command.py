@@ -1,4 +1,4 @@
-"""The command `lidarpool sensors`: models that there are, and pictures of their beams."""
+"""The command `lidarpool sensors`: lists models, and draws their beams."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ import click
     "--out",
     type=click.Path(path_type=Path),
     metavar="FILE.png",
-    help="Where the picture goes.  [default: named after the model]",
+    help="File for the picture.  [default: named after the model]",
 )
 def sensors(model: str | None, out: Path | None) -> None:
-    """List sensor models, or draw one's beams.
+    """List sensor models, or draw the beams of one.
 
     \b
     Examples:
@@ -33,11 +33,11 @@ def sensors(model: str | None, out: Path | None) -> None:
             cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
             click.echo("  ".join(cells).rstrip())
         return
-    from ..render.beam_picture import draw_beams  # with Matplotlib, which lists do without
+    from ..render.beam_picture import draw_beams  # imports Matplotlib, which lists do not need
 
     target = out or Path("-".join(Path(model).with_suffix("").parts[-2:]) + ".png")
     if target.suffix.lower() != ".png":
-        raise click.UsageError(f"{target} is no name of a picture: give one that ends in .png.")
+        raise click.UsageError(f"{target} is not a picture: give a name that ends in .png.")
     draw_beams(target, load_sensor(model))
     described = read_model(model)
     click.echo(described.name)

@@ -14,17 +14,17 @@ from rich.console import Console
 from ..run.bars import Pace, bars, standing_still
 from ..run.progress import STAGES, Progress, Show
 
-# Plain lines come as a tenth of the time has passed again, within these bounds: a survey of
-# hours should not fill a log.
+# Plain lines come after another tenth of the elapsed time, within these bounds, so that a survey
+# of hours does not fill a log.
 PLAIN_EVERY_S = (2.0, 60.0)
 
 
 @contextmanager
 def shown_progress(quiet: bool = False) -> Iterator[Show]:
-    """Show progress on stderr while the body runs; gives the function to call with it.
+    """Show progress on stderr while the body runs; yields the function that shows it.
 
-    Bars by stage with rates and time left on a terminal, else now and then a line for the
-    survey and one for the planning.
+    On a terminal, bars by stage with rates and time left; elsewhere occasional lines for survey
+    and planning.
     """
     if quiet or sys.stderr is None:
         yield lambda progress: None
@@ -37,7 +37,7 @@ def shown_progress(quiet: bool = False) -> Iterator[Show]:
 
 @contextmanager
 def shown_status(text: str, quiet: bool = False) -> Iterator[None]:
-    """Say on stderr what is going on while the body runs."""
+    """Show a status on stderr while the body runs."""
     if quiet or sys.stderr is None:
         yield
     elif (console := _terminal()) is not None:
@@ -49,19 +49,19 @@ def shown_status(text: str, quiet: bool = False) -> Iterator[None]:
 
 
 def tell(words: str) -> None:
-    """Tell something on stderr, if anybody reads it."""
+    """Print a line on stderr; ignore a closed stream."""
     if sys.stderr is not None:
         _Unheard(sys.stderr).write(f"{words}\n")
 
 
 def _terminal() -> Console | None:
-    """Console of a terminal that can move its cursor; None where lines are all there is."""
+    """Console of a terminal that can move its cursor; None without one."""
     console = Console(file=cast(TextIO, _Unheard(sys.stderr)))
     return console if console.is_terminal and not console.is_dumb_terminal else None
 
 
 class _Unheard:
-    """A stream on which writing does not fail: a terminal may be closed while a run goes on."""
+    """A stream whose writes do not fail: a terminal may be closed during a run."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -73,13 +73,13 @@ class _Unheard:
         try:
             self._stream.write(text)
             self._stream.flush()
-        except OSError:  # what is in its buffer would fail again as Python ends
+        except OSError:  # its buffer would fail again when Python exits
             with suppress(OSError):
                 os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
         return len(text)
 
     def flush(self) -> None:
-        """Do nothing: `write` has done it."""
+        """Do nothing: `write` flushes."""
 
 
 def _tell(stream: Any, line: str) -> None:
@@ -97,13 +97,13 @@ class PlainLines:
 
     def __init__(self, stream: Any) -> None:
         self.stream = stream
-        self._next = PLAIN_EVERY_S[0]  # seconds since the start at which to tell again
+        self._next = PLAIN_EVERY_S[0]  # seconds since the start of the next line
         self._paces = {"survey": Pace(), "planning": Pace()}
         self._done: set[str] = set()
-        self._standing = ""  # what was said of it
+        self._standing = ""  # the last line about it
 
     def __call__(self, progress: Progress) -> None:
-        """Write what is new, if it is time or something has been completed."""
+        """Write a line, if it is time or something has been completed."""
         now = progress.seconds
         if (standing := standing_still(progress)) != self._standing:
             self._standing = standing

@@ -14,9 +14,9 @@ import click
     type=click.IntRange(0, 65_535),
     default=8080,
     show_default=True,
-    help="Port on 127.0.0.1, or the next that is free; 0 for any.",
+    help="Port on 127.0.0.1, or the next free one; 0 for any.",
 )
-@click.option("--no-browser", is_flag=True, help="Only say where the page is.")
+@click.option("--no-browser", is_flag=True, help="Only print the address.")
 def view(result: Path, port: int, no_browser: bool) -> None:
     """Show a result or a cloud in the browser.
 

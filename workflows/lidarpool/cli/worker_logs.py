@@ -10,10 +10,9 @@ from .logs import set_logs
 
 
 class WorkerLogs(WorkerPlugin):
-    """Shows or drops messages of workers that share a terminal with the command.
+    """Shows or drops messages of workers that share the command's terminal.
 
-    A task that fails is told of once, by the driver; Dask's worker would log it as well, with
-    a traceback.
+    The driver reports a failed task once; Dask's worker would log it as well, with a traceback.
 
     Parameters
     ----------
@@ -27,5 +26,5 @@ class WorkerLogs(WorkerPlugin):
         self.shown = shown
 
     def setup(self, worker: Any) -> None:
-        """Take effect, also in a worker that is started again."""
+        """Take effect, also in a restarted worker."""
         set_logs(self.shown)

@@ -132,7 +132,7 @@ class Format:
         self.check_installed()
         if path.exists() and not overwrite:
             raise LidarpoolError(
-                f"{path} is there already: give another place with --out, or --overwrite."
+                f"{path} exists: give another place with --out, or --overwrite."
             )
         there = {column.name for column in cloud.table}
         if missing := [name for name in self.needs if name not in there]:

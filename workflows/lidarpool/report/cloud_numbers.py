@@ -1,4 +1,4 @@
-"""What the points of a cloud look like together, counted while they are read once."""
+"""Statistics of a cloud, computed in one pass."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ..columns.table import Column
 
 
 class CountedCloud:
-    """A cloud that is counted while somebody else reads it: what it takes is one pass.
+    """A cloud that computes its statistics while its points are read for something else.
 
     Parameters
     ----------
@@ -26,7 +26,7 @@ class CountedCloud:
     by_object : int64 (objects,)
         Points of each.
     limits : dict
-        {column: lowest and highest value}; empty without points.
+        {column: minimum and maximum}; empty without points.
     bounds : float64 (2, 3)
         Lowest and highest coordinates in the world.
     """
@@ -42,7 +42,7 @@ class CountedCloud:
         return len(self._cloud)
 
     def chunks(self, points: int = CHUNK_POINTS) -> Iterator[Cloud]:
-        """Give the points in order, and count them."""
+        """Yield the points in order, and update the statistics."""
         for chunk in self._cloud.chunks(points):
             self.by_object += np.bincount(chunk["object"], minlength=len(self.by_object))
             for name, values in chunk.columns.items():

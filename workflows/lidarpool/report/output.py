@@ -23,10 +23,10 @@ from ..scenario.scenario import Scenario
 from .cloud_numbers import CountedCloud
 from .report import make_report
 
-ROOM_BYTES = 32 << 20  # what pictures and report may take
+ROOM_BYTES = 32 << 20  # room for pictures and report
 
 CLOUD, PAGE, REPORT = "cloud.ply", "report.html", "report.json"
-_OF_CLOUD = "cloud.png"  # the picture that is drawn from the cloud's file
+_OF_CLOUD = "cloud.png"  # is drawn from the cloud's file
 _IMAGES = tuple(f"{name}.png" for name in PICTURES)
 FILES = (CLOUD, *_IMAGES, PICTURE_FILE, SWEEPS_FILE, PAGE, REPORT)
 _SURVEY = ("scene", "survey")  # what tells one from another
@@ -39,14 +39,14 @@ def refuse_to_replace(folder: Path, identity: Callable[[], Mapping[str, str]]) -
     Parameters
     ----------
     folder
-        Where a result is to go.
+        Folder for the new result.
     identity
         Returns that of this result, see `RunResult.identity`; large scenes take a moment.
 
     Raises
     ------
     LidarpoolError
-        If there is a result, and it is of another scene or survey, or cannot be read.
+        If there is a result of another scene or survey, or one that cannot be read.
     """
     try:
         report = json.loads((folder / REPORT).read_text("utf-8"))
@@ -73,11 +73,11 @@ def write_result(
 ) -> dict[str, Any]:
     """Write cloud, pictures and report, and return the report.
 
-    They are made in a temporary folder within `folder` and moved into place once all are there
-    and on the disk, so that an earlier result stays whole if one cannot be written. A picture
-    that an earlier run made and this one does not is removed. `then` is called when all are in
-    place, before an interrupt that came meanwhile is let through. `only_cloud` leaves pictures
-    and page out; `formats` are written as well.
+    They are made in a temporary folder within `folder` and moved into place once all are on the
+    disk, so that an earlier result stays whole if one cannot be written. Pictures of an earlier
+    run that this one does not make are removed. `then` is called when all are in place, before
+    a pending interrupt is raised. `only_cloud` leaves out pictures and page; `formats` are
+    written as well.
 
     Raises
     ------
@@ -88,10 +88,10 @@ def write_result(
     scene, survey = result.scene, result.survey
     counted = CountedCloud(result.points, len(scene.all_names))
     makers: dict[str, Callable[[Path], object]] = {}
-    # Pictures are drawn beside the writing of the cloud, which keeps one core busy.
+    # Pictures are drawn while the cloud is written, which keeps one core busy.
     beside = ThreadPoolExecutor(1, "pictures")
     if not only_cloud:
-        # Matplotlib is as much to import as all that a cloud takes.
+        # Importing Matplotlib takes as long as all other imports.
         from .page.page import write_page
         from .pictures import picture_makers
 
@@ -126,7 +126,7 @@ def write_result(
         with deferred_interrupts():
             _publish(staged, folder, files)
             then()
-    except LidarpoolError as error:  # names the file; its temporary folder is nobody's business
+    except LidarpoolError as error:  # names the file, without its temporary folder
         raise LidarpoolError(str(error).replace(str(staged), str(folder))) from error
     except OSError as error:
         raise LidarpoolError(
@@ -142,14 +142,14 @@ def write_result(
 def _publish(staged: Path, folder: Path, files: Collection[str]) -> None:
     """Move a whole result into place.
 
-    A folder with a report is a result: the earlier one's goes first, and the new one comes last.
-    Whoever is killed in between has the run's folder, and goes on with --resume.
+    A folder with a report is a result: the earlier report is removed first, and the new one is
+    moved last. If the process is killed in between, --resume continues from the run's folder.
     """
     for name in (REPORT, PAGE):
         (folder / name).unlink(missing_ok=True)
     flush(folder)
     for name in (*EXPORTS, *FILES):
-        # A path of an earlier run would pass for this one's; and folders are not replaced.
+        # A path of an earlier run would look like this one's; and folders are not replaced.
         if name not in files or name in EXPORTS:
             remove(folder / name)
         if name in files:

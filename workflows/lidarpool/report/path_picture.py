@@ -1,4 +1,4 @@
-"""The picture of the planned path: discs, all trials' paths and the best of them, in plan."""
+"""The picture of the planned path: obstacles, the paths of all trials, and the best one."""
 
 from __future__ import annotations
 
@@ -36,15 +36,14 @@ def draw_path(
     origin: Floats,
     size: tuple[int, int],
 ) -> None:
-    """Draw a plan seen from above: discs, ends, the trials' paths faint and the best one bold.
+    """Draw a plan from above: obstacles, ends, the trials' paths faint and the best one bold.
 
     Parameters
     ----------
     trials
-        What the best was chosen from, the corners of each, (w, 2); of more than 1000 an even
-        choice is drawn.
+        Corners of each trial's path, (w, 2); of more than 1000 an evenly spaced sample is drawn.
     origin
-        x and y of the local origin: the axes tell world coordinates, local + origin.
+        x and y of the local origin: the axes have world coordinates, local + origin.
     size
         Width and height in pixels.
 
@@ -88,7 +87,7 @@ def draw_path(
 
 
 def _verdict(plan: Plan, trials: Sequence[Floats]) -> str:
-    """Length, how it compares with the shortest, whether it is free, and how others fared."""
+    """Caption: length, shortest possible, collisions, and the other trials."""
     length = f"length {plan.length:.2f} m"
     if math.isfinite(plan.shortest_possible) and plan.shortest_possible > 0:
         length += f" · shortest possible {plan.shortest_possible:.2f} m ({plan.excess:+.2%})"
@@ -96,7 +95,7 @@ def _verdict(plan: Plan, trials: Sequence[Floats]) -> str:
         length += " · discs cut the target off"
     state = "collision-free" if plan.collision_free else "enters a disc"
     best_of = f"best of {counted(plan.trials, 'trial')}"
-    if len(trials) > 1:  # paths that are all alike are hidden by the best of them
+    if len(trials) > 1:  # equal paths are hidden by the best one
         longest = max(float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()) for path in trials)
         best_of += f", the longest {longest:.2f} m"
     return f"{length.replace('-', '−')} · {state} · {best_of}"
@@ -149,7 +148,7 @@ def _ends(axes: Axes, page: Page, planning: Planning) -> None:
             *place, marker, color=theme.INK, ms=size * page.unit, mec=theme.GROUND,
             mew=0.8 * page.unit, zorder=6,
         )  # fmt: skip
-        left = place[0] > middle  # names stand towards the middle, inside the plot
+        left = place[0] > middle  # names are towards the middle, inside the plot
         axes.annotate(
             name, place, xytext=(-8 * page.unit if left else 8 * page.unit, 0),
             textcoords="offset points", ha="right" if left else "left", va="center",

@@ -21,12 +21,12 @@ from ..run.picture_file import Pictured, ways_of
 from ..scene.scene import Scene
 from .path_picture import draw_path
 
-SIDE_LEAST, SIDE_MOST = 480, 4096  # letters need some pixels; each takes 0.4 kB of memory
-SIDES_RATIO = 2  # at most, or legends do not fit
+SIDE_LEAST, SIDE_MOST = 480, 4096  # letters need some pixels; a pixel takes 0.4 kB of memory
+SIDES_RATIO = 2  # longer side to shorter, at most, or legends do not fit
 
 
 def check_size(size: tuple[int, int]) -> None:
-    """Check that a picture may have so many pixels; LidarpoolError says how many it may have."""
+    """Check the size of a picture in pixels; LidarpoolError gives the limits."""
     least, most = min(size), max(size)
     if least < SIDE_LEAST or most > SIDE_MOST or most > SIDES_RATIO * least:
         raise LidarpoolError(
@@ -43,9 +43,9 @@ def draw_pictures(
     size: tuple[int, int] = SIZE,
     colour: str = Z.name,
 ) -> Iterator[Path]:
-    """Draw pictures into a folder, which is made, and give the file of each; see `picture_makers`.
+    """Draw pictures into a folder, which is made, and return their files; see `picture_makers`.
 
-    `only` are names of some of them.
+    `only` selects some by name.
     """
     check_size(size)
     makers = picture_makers(shown, cloud, size, colour)
@@ -70,9 +70,9 @@ def draw_pictures(
 def picture_makers(
     shown: Pictured, cloud: Path, size: tuple[int, int] = SIZE, colour: str = Z.name
 ) -> dict[str, Callable[[Path], object]]:
-    """Functions that draw pictures to a file, which all see the scene from the same place.
+    """Return functions that draw pictures to a file, all from the same viewpoint.
 
-    There is no path where none was planned.
+    Without planning there is no picture of the path.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def picture_makers(
 
     @cache
     def part() -> tuple[Scene, NDArray[np.int64], NDArray[np.float64], str]:
-        """Cut out what is drawn; of each triangle, which it was and how much, and words on it."""
+        """Cut out what is drawn; with each triangle's original and its share, and a caption."""
         scene = shown.scene.solid(middle)
         happening = ways_of(shown.sensors, shown.scene.actors, shown.duration_ns)
         box = around_ways(scene.bounds, happening)
@@ -109,7 +109,7 @@ def picture_makers(
 
     @cache
     def shot() -> Shot:
-        # Of sensors that move a marker is where they are halfway, and a line the rest.
+        # A moving sensor has a marker at half time, and a line for its trajectory.
         places = [w.at(middle)[None] if w.moves else w.positions for w in shown.sensors]
         scene, _, _, words = part()
         return take_shot(

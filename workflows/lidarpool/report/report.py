@@ -1,4 +1,4 @@
-"""The report of a run: everything a reader wants to check, as plain data for JSON."""
+"""The report of a run, as plain data for JSON."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
 from .cloud_numbers import CountedCloud
 
-ELEVATION_RAYS = 20_000  # whose elevations are looked at
+ELEVATION_RAYS = 20_000  # whose elevations are examined
 _ORDER = (GENERATE, INTERSECT, SORT, COLLECT, TRIAL)  # in which stages are listed
 
 _PACKAGES = (
@@ -37,7 +37,7 @@ _PLANNING = ("trials", "best_length", "shortest_possible", "collision_free")
 
 
 def versions() -> dict[str, str]:
-    """Versions of this package, of Python and of what it stands on."""
+    """Versions of this package, of Python and of the main dependencies."""
     found = {"lidarpool": __version__, "python": platform.python_version()}
     for name in _PACKAGES:
         try:
@@ -54,7 +54,7 @@ def make_report(
 ) -> dict[str, Any]:
     """Report of a run, ready for JSON.
 
-    Lengths are in metres, times in seconds; what is infinite or unknown is None.
+    Lengths are in metres, times in seconds; infinite and unknown values are None.
     """
     scene, survey = result.scene, result.survey
     return {
@@ -131,7 +131,7 @@ def _parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
 
 
 def _columns(cloud: CountedCloud) -> list[dict[str, Any]]:
-    """Describe the columns of the cloud beside x, y and z."""
+    """Describe the columns of the cloud except x, y and z."""
     return [
         {
             "name": column.name,
@@ -156,7 +156,7 @@ def _sensor(sensor: Sensor) -> dict[str, Any]:
         name: value
         for name, value in vars(sensor.head).items()
         if not name.startswith("_") and isinstance(value, (int, float, str))
-        if sensor.cycle != "frame" or name == "rate_hz"  # of those the head is only the clock
+        if sensor.cycle != "frame" or name == "rate_hz"  # their head is only the clock
     }
     return {
         "kind": sensor.model,
@@ -185,7 +185,7 @@ def _stages(totals: Iterable[StageTotals]) -> dict[str, dict[str, Any]]:
 
 
 def _tasks(totals: Iterable[StageTotals]) -> dict[str, dict[str, int]]:
-    """Tasks by the partition that they really ran on, and by stage."""
+    """Tasks by the partition where they ran, and by stage."""
     tasks: dict[str, dict[str, int]] = {}
     for stage in totals:
         for name, count in stage.resources.items():
@@ -201,7 +201,7 @@ def overlap_seconds(totals: Iterable[StageTotals]) -> float:
 
 
 def _planning(result: RunResult) -> dict[str, Any] | None:
-    """Tell what was planned and found; places are in world coordinates, as in the scenario."""
+    """Describe the planning and its result, in world coordinates, as in the scenario."""
     plan, planning = result.plan, result.planning
     if plan is None or planning is None:
         return None

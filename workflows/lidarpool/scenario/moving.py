@@ -1,4 +1,4 @@
-"""Sections of a scenario about what moves: trajectories, and where sensors sit on their carrier."""
+"""Sections of a scenario about what moves: trajectories, and mounts of sensors."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ Duration = Annotated[float, Field(gt=0, le=1e9)]
 
 
 class MountSection(Section):
-    """Where a sensor sits on its carrier, and how it is turned, in the carrier's axes."""
+    """Position and angles of a sensor on its carrier, in the carrier's axes."""
 
     position: Annotated[Triple, Field(description="x, y and z, metres")] = (0, 0, 0)
-    yaw_deg: Annotated[Angle, Field(description="turned about z, first")] = 0.0
-    pitch_deg: Annotated[Angle, Field(description="turned about the new y, then")] = 0.0
-    roll_deg: Annotated[Angle, Field(description="turned about the new x, last")] = 0.0
+    yaw_deg: Annotated[Angle, Field(description="rotation about z, first")] = 0.0
+    pitch_deg: Annotated[Angle, Field(description="rotation about the new y, second")] = 0.0
+    roll_deg: Annotated[Angle, Field(description="rotation about the new x, last")] = 0.0
 
     def pose(self) -> Pose:
         """Return it as a pose."""
@@ -44,16 +44,16 @@ class MountSection(Section):
 
 
 class CarriedSection(SensorSection):
-    """One of several sensors, where it sits, and when it scans."""
+    """One of several sensors: its mount, and when it scans."""
 
     mount: MountSection = MountSection()
     start_s: Annotated[
         float,
-        Field(ge=0, le=1e9, description="when it starts, seconds after the survey, or its station"),
+        Field(ge=0, le=1e9, description="start, in seconds after that of the survey or station"),
     ] = 0.0
     steps: Annotated[
         Annotated[int, Field(ge=1, le=STEPS_MOST)] | None,
-        Field(description="its time steps (scans), in place of the survey's", examples=[120]),
+        Field(description="its time steps (scans), instead of the survey's", examples=[120]),
     ] = None
 
     def mounted(self, folder: Path, name: str) -> Mounted:
@@ -63,13 +63,13 @@ class CarriedSection(SensorSection):
 
 
 class TimedPose(PoseSection):
-    """A pose at a time; a carrier faces its way if no point of a trajectory has an angle."""
+    """A pose at a time; if no pose has an angle, the carrier faces its direction of travel."""
 
-    time_s: Annotated[Seconds, Field(description="seconds, by the trajectory's clock")]
+    time_s: Annotated[Seconds, Field(description="seconds, by the clock of the trajectory")]
 
 
 class TrajectorySection(Section):
-    """A way through time: from a file, or from points; in YAML the file's name alone will do."""
+    """Poses over time, from a file or from points; in YAML also just the file's name."""
 
     file: Annotated[
         Text | None,
@@ -79,31 +79,34 @@ class TrajectorySection(Section):
         Literal[FORMATS] | None,  # type: ignore[valid-type]
         Field(description="by default kitti with times, csv for a .csv, else tum"),
     ] = None
-    times: Annotated[Text | None, Field(description="of KITTI's poses: the file of times")] = None
+    times: Annotated[Text | None, Field(description="for KITTI poses: the file of times")] = None
     columns: Annotated[
         dict[str, str] | None,
         Field(
-            description="of a table: {time_s, x, y, z, qx, …, yaw_deg, …: name in the file}",
+            description="for a table: {time_s, x, y, z, qx, …, yaw_deg, …: name in the file}",
             examples=[{"time_s": "stamp"}],
         ),
     ] = None
     camera_axes: Annotated[
-        bool | None, Field(description="poses are a camera's, z ahead; by default KITTI's are")
+        bool | None,
+        Field(
+            description="whether poses have camera axes (z ahead); by default those of KITTI have"
+        ),
     ] = None
     points: Annotated[
         tuple[TimedPose, ...],
         Strict(False),
-        Field(description="in place of a file: time_s, position and angles, world metres"),
+        Field(description="instead of a file: time_s, position and angles, world metres"),
     ] = ()
     interpolation: Annotated[
-        Literal["linear", "smooth"], Field(description="of positions; rotations turn evenly")
+        Literal["linear", "smooth"], Field(description="of positions; rotations are even")
     ] = "linear"
     offset_s: Annotated[Seconds, Field(description="added to all times")] = 0.0
     start_s: Annotated[
-        Seconds | None, Field(description="when the survey begins; by default at the first time")
+        Seconds | None, Field(description="start of the survey; by default the first time")
     ] = None
     duration_s: Annotated[
-        Duration | None, Field(description="how long it lasts; by default to the end")
+        Duration | None, Field(description="duration of the survey; by default to the end")
     ] = None
 
     @model_validator(mode="after")
@@ -154,23 +157,23 @@ Length = Annotated[float, Field(gt=0, le=1e4)]
 
 
 class ActorSection(Section):
-    """Something that moves while the scene stands; its axes have x ahead and z up."""
+    """An object that moves through the scene; its axes have x ahead and z up."""
 
-    name: Annotated[Text, Field(description="of the object")]
+    name: Annotated[Text, Field(description="name of the object")]
     file: Annotated[
         MeshEntry | None,
         Field(description="its mesh in its own axes, as in scene.files", examples=["car.glb"]),
     ] = None
     box: Annotated[
         Annotated[tuple[Length, Length, Length], Strict(False)] | None,
-        Field(description="in place of a file: length, width and height of a box, metres"),
+        Field(description="instead of a file: length, width and height of a box, metres"),
     ] = None
     trajectory: Annotated[
-        TrajectoryEntry, Field(description="its way, by the clock of the survey's trajectory")
+        TrajectoryEntry, Field(description="its trajectory, by the clock of the survey's")
     ]
     semantic_class: Annotated[
         Annotated[int, Field(ge=0, le=65_535)] | None,
-        Field(alias="class", description="of its points; by default that of its material"),
+        Field(alias="class", description="class of its points; by default that of its material"),
     ] = None
 
     @model_validator(mode="after")
@@ -178,7 +181,7 @@ class ActorSection(Section):
         if (self.file is None) == (self.box is None):
             raise ValueError("give either file or box.")
         if self.trajectory.start_s is not None or self.trajectory.duration_s is not None:
-            raise ValueError("an actor begins with the survey: give offset_s, not start_s.")
+            raise ValueError("an actor starts with the survey: give offset_s, not start_s.")
         return self
 
     def way(self, folder: Path, origin: NDArray[np.float64], start_s: float) -> Track:

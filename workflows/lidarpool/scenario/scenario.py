@@ -47,23 +47,23 @@ from .sections import (
 from .validation_errors import validation_errors
 from .yamlfile import read_yaml
 
-# Of the objects, those lower than this are floors and markings, which a path may cross.
+# Objects lower than this are floors and markings, which a path may cross.
 FLAT_M = 0.2
 
-# Halls and parts are smaller than the one and larger than the other in metres.
+# Sizes of halls and parts in metres are between these.
 LARGE_M, SMALL_M = 500.0, 0.2
 
 SEED_START = (25.0, 25.0)
 SEED_TARGET = (-30.0, -20.0)
-# Of the sensor, where no poses are given; and how far it stays from the ceiling at least.
+# Heights of the sensor, if no poses are given; and its least distance from the ceiling.
 _HEIGHTS_M, _BELOW_M = (1.0, 2.0, 3.0), 0.2
 
-# Of a mesh file that comes without a scenario: all there is of it.
+# For a mesh file without a scenario: the cloud keeps everything.
 WHOLE_CLOUD = {"keep_every": 1, "precision_m": 0.001}
 
 
 class Scenario(Section):
-    """A survey, and the path planned beside it, as a scenario file describes them.
+    """A survey and its path planning, as described by a scenario file.
 
     Without arguments it is the default survey: six objects, 108 scans from three poses.
 
@@ -72,10 +72,10 @@ class Scenario(Section):
     scene, sensor, materials, returns, noise, weather, cloud, output, planning, pool
         See `lidarpool.scenario.sections`.
     poses
-        Where the sensor scans from, in world coordinates. Where none are given it stands at
-        the origin (default objects) or in the middle of the scene (mesh files), 1, 2 and 3
-        metres above the ground or floor there, or at a quarter, half and three quarters of the
-        height of a room that is lower; see `room_at`.
+        Poses of the sensor, in world coordinates. By default it stands at the origin (default
+        objects) or in the middle of the scene (mesh files), 1, 2 and 3 metres above the ground
+        or floor there, or at a quarter, half and three quarters of the height of a lower room;
+        see `room_at`.
     steps
         Time steps from each pose.
 
@@ -93,7 +93,7 @@ class Scenario(Section):
         Field(
             min_length=1,
             max_length=1_000_000,
-            description="where the sensor stands, world metres, Z-up; by default 1, 2 and 3 m "
+            description="poses of the sensor, world metres, Z-up; by default 1, 2 and 3 m "
             "above the origin (default objects) or the middle of the floor (files), below the "
             "ceiling",
             examples=[[[0, 0, 1], [0, 0, 2], {"position": [0, 0, 3], "yaw_deg": 90}]],
@@ -102,7 +102,7 @@ class Scenario(Section):
     trajectory: Annotated[
         TrajectoryEntry | None,
         Field(
-            description="in place of poses: the way of a carrier that moves, from a TUM, KITTI or "
+            description="instead of poses: the trajectory of a carrier, from a TUM, KITTI or "
             ".csv file, or points",
             examples=["drive.tum"],
         ),
@@ -111,7 +111,7 @@ class Scenario(Section):
         dict[Text, CarriedSection],
         Field(
             max_length=SENSORS_MOST,
-            description="in place of sensor: several on one carrier, by name, each with its mount",
+            description="instead of sensor: several on one carrier, by name, each with its mount",
             examples=[{"front": {"model": "velodyne/vlp16", "mount": {"position": [2, 0, 0.5]}}}],
         ),
     ] = {}  # noqa: RUF012 - of a frozen model
@@ -120,22 +120,22 @@ class Scenario(Section):
         Strict(False),
         Field(
             max_length=10_000,
-            description="what moves: meshes or boxes, each with a trajectory of its own",
+            description="moving objects: meshes or boxes, each with a trajectory",
             examples=[[{"name": "Van", "box": [5, 2, 2.2], "trajectory": "van.tum", "class": 3}]],
         ),
     ] = ()
     mount: Annotated[
         MountSection | None,
         Field(
-            description="where the sensor sits on its carrier, in the carrier's axes",
+            description="pose of the sensor on its carrier, in the carrier's axes",
             examples=[{"position": [1, 0, 2], "pitch_deg": 10}],
         ),
     ] = None
     steps: Annotated[
         Annotated[int, Field(ge=1, le=STEPS_MOST)] | None,
         Field(
-            description="time steps (scans) from each pose; along a trajectory by default as many "
-            "as it lasts",
+            description="time steps (scans) at each pose; by default along a trajectory as many "
+            "as fit into it",
             examples=[36],
         ),
     ] = None
@@ -144,7 +144,7 @@ class Scenario(Section):
         Strict(False),
         Field(
             max_length=100_000,
-            description="what objects are made of, by name; the last that names an object counts",
+            description="materials of objects, by name; the last entry for an object counts",
             examples=[
                 [
                     {"objects": "*", "reflectance": 0.3},
@@ -163,12 +163,12 @@ class Scenario(Section):
 
     _folder: Path = PrivateAttr(default=Path())  # that relative file names start from
     _source: str = PrivateAttr(default="the default survey")  # for messages
-    _notes: list[str] = PrivateAttr(default_factory=list)  # of what was left out of the scene
-    _turned: list[str] = PrivateAttr(default_factory=list)  # files that seem to be Y-up, as is due
+    _notes: list[str] = PrivateAttr(default_factory=list)  # about objects left out of the scene
+    _turned: list[str] = PrivateAttr(default_factory=list)  # files rotated from Y-up to Z-up
 
     @classmethod
     def load(cls, path: str | Path) -> Scenario:
-        """Read a scenario file (YAML), or take a mesh file as a scenario of it alone.
+        """Read a scenario file (YAML), or make a scenario of a mesh file.
 
         Raises
         ------
@@ -208,7 +208,7 @@ class Scenario(Section):
             except ValidationError as error:
                 told = validation_errors(error, _field_names())
                 mistakes.lines += [f"{source}: {line}" for line in told]
-                # What else is wrong is seen without the sections that are.
+                # Validate again without the wrong sections, to find further errors.
                 wrong = {str(detail["loc"][0]) for detail in error.errors() if detail["loc"]}
                 if not wrong:
                     mistakes.tell()
@@ -219,9 +219,9 @@ class Scenario(Section):
         return scenario
 
     def _check(self, mistakes: Mistakes) -> None:
-        """Note what does not fit together; and files that are missing, if more is wrong.
+        """Note fields that do not fit together, and missing files if there are other errors.
 
-        If nothing else is wrong, files are told of when they are read.
+        If nothing else is wrong, reading them reports it.
         """
         ends = [self.planning.start, self.planning.target].count(None)
         checks = (
@@ -231,7 +231,7 @@ class Scenario(Section):
             ),
             (
                 self.planning.enabled is None and not self.scene.has_seed and ends == 1,
-                "planning has one end: give both planning.start and planning.target, or neither.",
+                "give both planning.start and planning.target, or neither.",
             ),
             (
                 self.trajectory is not None and self.poses is not None,
@@ -258,7 +258,7 @@ class Scenario(Section):
                     mistakes.lines.append(f"{path} does not exist: check the name and the folder.")
 
     def advice(self, scene: Scene) -> list[str]:
-        """Return notes on what looks like a mistake: a size that speaks of another unit.
+        """Return notes on likely mistakes, such as a size that suggests another unit.
 
         Also on objects that `build_scene` left out, and on files that it turned to Z-up.
         """
@@ -280,12 +280,12 @@ class Scenario(Section):
             return notes
         return [
             *notes,
-            f"{unitless[0]} states no unit, and in metres the scene is {side:,.5g} m long: if that "
+            f"{unitless[0]} states no unit, and in metres the scene is {side:,.5g} m long. If that "
             f"is wrong, give the file's unit ({'mm' if side > LARGE_M else 'km'}?) in scene.files",
         ]
 
     def build_scene(self) -> Scene:
-        """Read the mesh files and put the scene together.
+        """Read the mesh files and build the scene.
 
         Raises
         ------
@@ -306,7 +306,7 @@ class Scenario(Section):
         return replace(scene, actors=self._actors(scene.origin)) if self.actors else scene
 
     def _actors(self, origin: np.ndarray[Any, np.dtype[np.float64]]) -> tuple[Actor, ...]:
-        """Build what moves; its trajectories begin when that of the survey does."""
+        """Build the actors; their trajectories begin with that of the survey."""
         meshes = [
             one_mesh(entry.name, self._read(entry.file))
             if entry.file is not None
@@ -321,7 +321,7 @@ class Scenario(Section):
         return tuple(Actor(mesh, way) for mesh, way in zip(meshes, ways, strict=True))
 
     def _materials(self) -> list[Material]:
-        """Materials by name; the classes of actors come last, where they count."""
+        """Materials by name; classes of actors come last, so that they count."""
         given = [Material(**entry.model_dump()) for entry in self.materials]
         own = []
         for entry in self.actors:
@@ -336,7 +336,7 @@ class Scenario(Section):
         Raises
         ------
         LidarpoolError
-            If fields that are good by themselves do not fit together.
+            If fields are valid by themselves and do not fit together.
         """
         x0, y0, z0 = scene.origin
         with self._named():
@@ -364,7 +364,7 @@ class Scenario(Section):
             )
 
     def plan(self, scene: Scene) -> Planning | None:
-        """Return what is to be planned, in the local coordinates of `scene`; None for nothing.
+        """Return the planning, in the local coordinates of `scene`; None for none.
 
         Raises
         ------
@@ -382,7 +382,7 @@ class Scenario(Section):
         with self._named():
             discs, labels = self._discs(scene)
             discs[:, 2] += section.clearance_m
-            wide = np.flatnonzero(discs[:, 2])  # upright lines, without area, bar nothing
+            wide = np.flatnonzero(discs[:, 2])  # upright lines have no area
             discs, labels = discs[wide], [labels[i] for i in wide]
             local = [(x - x0, y - y0) for x, y in (start, target)]
             _check_free({"start": local[0], "target": local[1]}, discs, labels)
@@ -414,8 +414,8 @@ class Scenario(Section):
         with self._named():
             try:
                 path = self._folder / Path(entry.file).expanduser()
-            except RuntimeError as error:  # of a user who is not known
-                raise LidarpoolError(f"the file {entry.file!r} has no place: {error}") from error
+            except RuntimeError as error:  # ~name of an unknown user
+                raise LidarpoolError(f"the file {entry.file!r} cannot be found: {error}") from error
             transform = entry.transform()
         told = len(self._notes)
         meshes = load_meshes(
@@ -448,26 +448,26 @@ class Scenario(Section):
             yield (float(x), float(y), float(floor + height)), 0.0, 0.0, 0.0
 
     def _discs(self, scene: Scene) -> tuple[np.ndarray[Any, np.dtype[np.float64]], list[str]]:
-        """Obstacles as local x, y, radius of (m, 3), and what each stands for."""
+        """Obstacles as local x, y, radius (m, 3), and a label for each."""
         tall = np.ptp(scene.object_bounds[..., 2], axis=1) >= FLAT_M
         if self.planning.obstacles is None:
             picked = [i for i in range(len(scene.names)) if tall[i]]
             return scene.footprints[picked], [scene.names[i] for i in picked]
-        rows: dict[str, list[float]] = {}  # {what it stands for: x, y, radius}
+        rows: dict[str, list[float]] = {}  # {label: x, y, radius}
         for number, entry in enumerate(self.planning.obstacles):
             if entry.object is None:
                 assert entry.centre and entry.radius_m, "either of the two kinds is given"
                 place = np.subtract(entry.centre, scene.origin[:2])
                 rows[f"planning.obstacles[{number}]"] = [*place, entry.radius_m]
                 continue
-            # Brackets and all, a name is that object; else it is a pattern.
+            # An exact name comes first, even with brackets; else it is a pattern.
             found = [i for i, name in enumerate(scene.names) if name == entry.object] or [
                 i for i, name in enumerate(scene.names) if fnmatchcase(name, entry.object)
             ]
             if not found:
                 hint = did_you_mean(entry.object, scene.names)
                 raise LidarpoolError(
-                    f"planning.obstacles names {entry.object!r}, and no object is called so."
+                    f"planning.obstacles names {entry.object!r}, but no object has that name."
                     + (hint or f" The scene has {', '.join(scene.names[:5])}, …")
                 )
             rows |= {scene.names[i]: list(scene.footprints[i]) for i in found}
@@ -475,7 +475,7 @@ class Scenario(Section):
 
     @property
     def source(self) -> Path:
-        """The file that it comes from, for people."""
+        """Name of its file, for messages."""
         return Path(self._source)
 
     @contextmanager
@@ -511,7 +511,7 @@ def _check_free(
     discs: np.ndarray[Any, np.dtype[np.float64]],
     labels: list[str],
 ) -> None:
-    """Refuse a path that begins or ends in an obstacle, naming what is there."""
+    """Refuse a path that begins or ends in an obstacle, and name the obstacle."""
     for end, point in ends.items():
         inside = np.hypot(*(discs[:, :2] - point).T) < discs[:, 2]
         if inside.any():

@@ -9,11 +9,11 @@ from pydantic.json_schema import GenerateJsonSchema
 
 from .scenario import Scenario
 
-SCHEMA_FILE = "scenario.schema.json"  # beside a scenario that names it
+SCHEMA_FILE = "scenario.schema.json"  # in the folder of a scenario
 
 
 class _Plain(GenerateJsonSchema):
-    """Leaves out titles, which repeat names, and defaults that repeat a section or are infinite."""
+    """Omits titles, which repeat names, and defaults that repeat a section or are infinite."""
 
     def field_title_should_be_set(self, schema: Any) -> bool:
         return False
@@ -28,14 +28,14 @@ class _Plain(GenerateJsonSchema):
 def scenario_schema() -> dict[str, Any]:
     """Return the JSON Schema of scenario files, short forms and empty sections included.
 
-    What takes several fields to see (a range that ends before it begins) it does not say:
+    It does not check combinations of fields (a range that ends before it begins):
     `Scenario.load` does.
     """
     return {
         "$schema": GenerateJsonSchema.schema_dialect,
         **Scenario.model_json_schema(schema_generator=_Plain),
         "title": "lidarpool scenario",
-        "description": "A survey of a scene with a lidar, and a path planned beside it.",
+        "description": "A lidar survey of a scene, and path planning.",
     }
 
 

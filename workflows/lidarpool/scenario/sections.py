@@ -21,7 +21,7 @@ COLUMN_NAMES = tuple(column.in_files for column in OPTIONAL)
 Coordinate = Annotated[float, Field(ge=-1e8, le=1e8)]
 Angle = Annotated[float, Field(ge=-36_000, le=36_000)]
 Factor = Annotated[float, Field(ge=-1e9, le=1e9)]
-# YAML has lists only, which strict validation would not take for tuples.
+# YAML has only lists, which strict validation does not accept as tuples.
 Pair = Annotated[tuple[Coordinate, Coordinate], Strict(False)]
 Triple = Annotated[tuple[Coordinate, Coordinate, Coordinate], Strict(False)]
 Angles = Annotated[tuple[Angle, Angle, Angle], Strict(False)]
@@ -31,7 +31,7 @@ Matrix = Annotated[tuple[Row, Row, Row, Row], Strict(False)]
 
 
 def _short(is_short: Callable[[Any], bool], long: Callable[[Any], Any], allowed: Any) -> Any:
-    """Take a short form for what it stands for; `allowed` is the type, for the schema."""
+    """Expand a short form; `allowed` is its type, for the schema."""
     return BeforeValidator(
         lambda value: long(value) if is_short(value) else value, json_schema_input_type=allowed
     )
@@ -48,10 +48,10 @@ class Section(BaseModel):
 
 
 class MeshFile(Section):
-    """A mesh file and where it stands; in YAML the file's name alone will do.
+    """A mesh file and its placement; in YAML also just the file's name.
 
-    The mesh is scaled, turned about the world's x, y and z axes, and moved; or `matrix` says
-    it all. Relative names start from the scenario's folder.
+    The mesh is scaled, rotated about the world's x, y and z axes, and moved; `matrix` replaces
+    all three. Relative names start from the scenario's folder.
     """
 
     file: Annotated[
@@ -64,15 +64,19 @@ class MeshFile(Section):
     ]
     unit: Annotated[
         Literal["um", "mm", "cm", "dm", "m", "km", "in", "ft", "yd", "mi"] | None,
-        Field(description="length unit of the file; by default what it states, else metres"),
+        Field(description="length unit of the file; by default the one it states, else metres"),
     ] = None
     up_axis: Annotated[
         Literal["x", "y", "z"] | None,
-        Field(description="axis of the file that points up; by default what its format states"),
+        Field(description="axis of the file that points up; by default that of its format"),
     ] = None
-    translation: Annotated[Triple, Field(description="moved by so many metres, last")] = (0, 0, 0)
+    translation: Annotated[Triple, Field(description="translation in metres, applied last")] = (
+        0,
+        0,
+        0,
+    )
     rotation_deg: Annotated[
-        Angles, Field(description="turned about the world's x, y and z axes, degrees")
+        Angles, Field(description="rotation about the world's x, y and z axes, degrees")
     ] = (0, 0, 0)
     scale: Annotated[
         Factors,
@@ -80,7 +84,7 @@ class MeshFile(Section):
         Field(description="one factor, or one for each axis; applied first"),
     ] = (1, 1, 1)
     matrix: Annotated[
-        Matrix | None, Field(description="all of the placement at once, 4 rows of 4, metres")
+        Matrix | None, Field(description="instead of the three: 4 rows of 4, metres")
     ] = None
 
     @model_validator(mode="after")
@@ -89,7 +93,7 @@ class MeshFile(Section):
         if self.matrix is not None and placed:
             raise ValueError(f"give either matrix or {', '.join(sorted(placed))}, not both.")
         if 0 in self.scale:
-            raise ValueError("scale is 0 along an axis, which flattens the mesh.")
+            raise ValueError("scale must not be 0: it would flatten the mesh.")
         return self
 
     def transform(self) -> Transform:
@@ -105,24 +109,24 @@ MeshEntries = Annotated[tuple[MeshEntry, ...], Strict(False)]
 
 
 class Ground(Section):
-    """A level rectangle under the scene, `margin_m` wider than it on each side."""
+    """A horizontal rectangle under the scene, `margin_m` wider on each side."""
 
     height_m: Annotated[Coordinate, Field(description="z of the rectangle, metres")] = 0.0
     margin_m: Annotated[
-        float, Field(ge=0, le=1e6, description="wider than the scene on each side, metres")
+        float, Field(ge=0, le=1e6, description="how much it extends beyond the scene, metres")
     ] = 5.0
 
 
 class SceneSection(Section):
-    """What is scanned: mesh files, the six default objects, or both.
+    """The scene: mesh files, the six default objects, or both.
 
-    `preset` is 'seed' where no files are given, else 'none'.
+    `preset` is 'seed' without files, else 'none'.
     """
 
     preset: Annotated[
         Literal["seed", "none"] | None,
         Field(
-            description="seed (six objects) where no files are given; with files: none",
+            description="seed (six objects); none is the default with files",
             examples=["seed"],
         ),
     ] = None
@@ -139,7 +143,7 @@ class SceneSection(Section):
     ground: Annotated[
         Ground | None,
         Field(
-            description="a level rectangle below it all, metres",
+            description="a horizontal rectangle below the scene, metres",
             examples=[{"height_m": 0, "margin_m": 5}],
         ),
     ] = None
@@ -147,7 +151,7 @@ class SceneSection(Section):
     @model_validator(mode="after")
     def _something(self) -> SceneSection:
         if self.preset == "none" and not self.files:
-            raise ValueError("there is nothing to scan: give files, or preset: seed.")
+            raise ValueError("the scene is empty: give files, or preset: seed.")
         return self
 
     @property
@@ -165,32 +169,36 @@ class SensorSection(Section):
     model: Annotated[
         str | None,
         Field(
-            description="as its maker specifies it, see `lidarpool sensors`; or a .yaml of one's "
-            "own, from the scenario's folder",
+            description="a sensor model, see `lidarpool sensors`, or your own .yaml, "
+            "from the scenario's folder",
             examples=["velodyne/vlp16"],
         ),
     ] = None
     calibration: Annotated[
         str | None,
         Field(
-            description="file of the unit itself: Velodyne, Ouster, Hesai, RoboSense, Livox, or a "
+            description="calibration file of a Velodyne, Ouster, Hesai, RoboSense, Livox, or a "
             "table of beams",
             examples=["unit.json"],
         ),
     ] = None
     columns: Annotated[
         Annotated[int, Field(ge=1, le=100_000)] | None,
-        Field(description="of an Ouster or a table of beams: azimuths in one turn", examples=[512]),
+        Field(
+            description="for an Ouster or a table of beams: azimuths in one turn", examples=[512]
+        ),
     ] = None
     rays_per_revolution: Annotated[
-        int, Field(ge=1, le=10_000_000, description="of a grid: azimuths in one turn")
+        int, Field(ge=1, le=10_000_000, description="for a grid: azimuths in one turn")
     ] = 1000
-    layers: Annotated[int, Field(ge=1, le=65_535, description="of a grid: elevations (rings)")] = 40
+    layers: Annotated[int, Field(ge=1, le=65_535, description="for a grid: elevations (rings)")] = (
+        40
+    )
     vertical_fov_deg: Annotated[
-        float, Field(gt=0, le=180, description="of a grid: degrees, half of it below the horizon")
+        float, Field(gt=0, le=180, description="for a grid: degrees, half of it below the horizon")
     ] = 60.0
     step_deg: Annotated[
-        float, Field(gt=0, le=360, description="degrees turned in one time step")
+        float, Field(gt=0, le=360, description="degrees that the head turns in one time step")
     ] = 10.0
     rate_hz: Annotated[
         Annotated[float, Field(gt=0, le=1e6)] | None,
@@ -202,14 +210,14 @@ class SensorSection(Section):
     min_range_m: Annotated[
         Annotated[float, Field(ge=0, le=1e8)] | None,
         Field(
-            description="nearer returns are not seen; by default the model's, or 0",
+            description="nearer returns are ignored; by default the model's, or 0",
             examples=[0.5],
         ),
     ] = None
     max_range_m: Annotated[
         Annotated[float, Field(gt=0, allow_inf_nan=True)] | None,
         Field(
-            description="farther returns are not seen; by default the model's, or .inf",
+            description="farther returns are ignored; by default the model's, or .inf",
             examples=[100.0],
         ),
     ] = None
@@ -217,12 +225,12 @@ class SensorSection(Section):
     @model_validator(mode="after")
     def _one_source(self) -> SensorSection:
         own = [name for name in ("model", "calibration") if getattr(self, name) is not None]
-        # Defaults that `lidarpool init` has written out are in nobody's way.
+        # Defaults are allowed, because `lidarpool init` writes them.
         grid = [name for name in _GRID if getattr(self, name) != _GRID[name]]
         if own and grid:
-            raise ValueError(f"a {own[0]} has beams of its own: leave {grid[0]} out.")
+            raise ValueError(f"a {own[0]} defines the beams: leave out {grid[0]}.")
         if self.columns is not None and "rays_per_revolution" in grid:
-            raise ValueError("columns and rays_per_revolution are the same: give one of them.")
+            raise ValueError("columns and rays_per_revolution mean the same: give one of them.")
         return self
 
     def sensor(self, folder: Path) -> Sensor:
@@ -256,12 +264,12 @@ _GRID = {  # {field of a grid: its default}
 
 
 class PoseSection(Section):
-    """Where the sensor stands, in world coordinates."""
+    """Pose of the sensor, in world coordinates."""
 
     position: Annotated[Triple, Field(description="x, y and z, metres")]
-    yaw_deg: Annotated[Angle, Field(description="turned about z, first")] = 0.0
-    pitch_deg: Annotated[Angle, Field(description="turned about the new y, then")] = 0.0
-    roll_deg: Annotated[Angle, Field(description="turned about the new x, last")] = 0.0
+    yaw_deg: Annotated[Angle, Field(description="rotation about z, first")] = 0.0
+    pitch_deg: Annotated[Angle, Field(description="rotation about the new y, second")] = 0.0
+    roll_deg: Annotated[Angle, Field(description="rotation about the new x, last")] = 0.0
 
 
 PoseEntry = Annotated[
@@ -271,29 +279,28 @@ PoseEntry = Annotated[
 
 
 class CloudSection(Section):
-    """What is kept of the hits."""
+    """Which hits become points, and their columns."""
 
     keep_every: Annotated[
-        int,
-        Field(ge=1, le=1_000_000, description="of the hits of a scan, every n-th; by default 5"),
+        int, Field(ge=1, le=1_000_000, description="keep every n-th hit of a scan; by default 5")
     ] = 5
     precision_m: Annotated[
         Annotated[float, Field(ge=1e-6, le=1000)] | None,
         Field(
-            description="metres that points are rounded to; by default the sensor's resolution, "
+            description="step in metres that points are rounded to; by default the sensor's, "
             "or 0.01",
             examples=[0.01],
         ),
     ] = None
     coordinates: Annotated[
         Literal[COORDINATES],  # type: ignore[valid-type]
-        Field(description="world; or sensor: of the sensor when it fired, as its driver has them"),
+        Field(description="world; or sensor: its axes when it fired, as sensor drivers have them"),
     ] = "world"
     columns: Annotated[
         tuple[Literal[COLUMN_NAMES], ...],  # type: ignore[valid-type]
         Strict(False),
         Field(
-            description="what points have beside x, y, z, scan, ring and object: "
+            description="columns in addition to x, y, z, scan, ring and object: "
             + ", ".join(COLUMN_NAMES),
             examples=[["time", "range", "intensity"]],
         ),
@@ -301,7 +308,7 @@ class CloudSection(Section):
 
 
 class ExportSection(Section):
-    """A format that the cloud is exported to; in YAML its name alone will do."""
+    """A format to export the cloud to; in YAML also just its name."""
 
     format: Annotated[
         Literal["ply", *FORMATS],  # type: ignore[valid-type]
@@ -309,12 +316,12 @@ class ExportSection(Section):
     ]
     layout: Annotated[
         Literal[tuple(LAYOUTS)],  # type: ignore[valid-type]
-        Field(description="of the points of mcap and rosbag2"),
+        Field(description="layout of points in mcap and rosbag2"),
     ] = "velodyne"
 
 
 class OutputSection(Section):
-    """Files of the result beside cloud.ply; the columns that they need are kept."""
+    """Further files of the result; the columns that they need are kept."""
 
     write: Annotated[
         tuple[
@@ -325,7 +332,7 @@ class OutputSection(Section):
         ],
         Strict(False),
         Field(
-            description="formats that the cloud is exported to as well",
+            description="further formats of the cloud",
             examples=[["laz", {"format": "mcap", "layout": "autoware"}]],
         ),
     ] = ()
@@ -347,39 +354,39 @@ Share = Annotated[float, Field(ge=0, le=1)]
 
 
 class MaterialSection(Section):
-    """What objects are made of; of the entries that name an object, the last counts."""
+    """Material of objects; the last entry for an object counts."""
 
     objects: Annotated[
         Names,
         _short(_is_text, lambda v: [v], Text | Names),
-        Field(min_length=1, description="names of objects, may hold * and ?"),
+        Field(min_length=1, description="names of objects, with * and ?"),
     ]
     reflectance: Annotated[
         Share | None,
-        Field(description="share of light that is scattered back; by default 0.5, of glass 0"),
+        Field(description="share of light that is scattered; by default 0.5, for glass 0"),
     ] = None
     semantic_class: Annotated[
         int, Field(alias="class", ge=0, le=65_535, description="value of the column class")
     ] = 0
     retro: Annotated[
-        bool, Field(description="whether light goes back where it came from, as from signs")
+        bool, Field(description="whether light returns in its own direction, as from traffic signs")
     ] = False
     transparent: Annotated[
         Literal["none", "pass", "mirror"],
-        Field(description="what becomes of the rest of the light: it goes on, or is reflected"),
+        Field(description="the rest of the light passes through (pass), or is reflected (mirror)"),
     ] = "none"
 
 
 class ReturnsSection(Section):
-    """Rays that make up a beam, and which of its returns are reported."""
+    """Sub-rays of a beam, and which of its returns are reported."""
 
     mode: Annotated[
         Literal[MODES],  # type: ignore[valid-type]
-        Field(description="which returns of a pulse are reported; dual: strongest and last"),
+        Field(description="returns reported for a pulse; dual: strongest and last"),
     ] = "strongest"
     subrays: Annotated[
         Literal[SUBRAYS],  # type: ignore[valid-type]
-        Field(description="rays a beam is divided into: 1, 7, 19, 37, 61, … 217"),
+        Field(description="rays in a beam: 1, 7, 19, 37, 61, … 217"),
     ] = 1
     divergence_mrad: Annotated[
         Annotated[float, Field(ge=0, le=1000)] | None,
@@ -388,7 +395,7 @@ class ReturnsSection(Section):
     pulse_ns: Annotated[
         Annotated[float, Field(ge=0, le=1e6)] | None,
         Field(
-            description="length of the pulse: surfaces nearer to each other than half of it are "
+            description="length of the pulse: surfaces less than half of it apart are "
             "one return; by default the sensor's, or 5",
             examples=[5.0],
         ),
@@ -396,24 +403,24 @@ class ReturnsSection(Section):
 
 
 class NoiseSection(Section):
-    """Noise of ranges and angles, and returns that are lost."""
+    """Noise of ranges and angles, and lost returns."""
 
     range_m: Annotated[
         float, Field(ge=0, le=1000, description="standard deviation of ranges, metres")
     ] = 0.0
     range_per_m: Annotated[
-        float, Field(ge=0, le=1, description="what is added to it for each metre of range")
+        float, Field(ge=0, le=1, description="standard deviation added for each metre of range")
     ] = 0.0
     angle_deg: Annotated[
-        float, Field(ge=0, le=10, description="standard deviation of where beams point, each way")
+        float, Field(ge=0, le=10, description="standard deviation of beam directions, in both axes")
     ] = 0.0
     dropout: Annotated[
-        Share, Field(description="share of returns that are lost, however strong")
+        Share, Field(description="share of returns that are lost, whatever their energy")
     ] = 0.0
     detection_range_m: Annotated[
         Annotated[float, Field(ge=0.001, le=1e8)] | None,
         Field(
-            description="from where half the pulses on a surface of 10 % reflectance are seen; "
+            description="range at which a surface of 10 % reflectance returns half the pulses; "
             "weaker returns are lost",
             examples=[100.0],
         ),
@@ -424,30 +431,31 @@ class NoiseSection(Section):
 
 
 class WeatherSection(Section):
-    """What the air does to light."""
+    """Extinction of the air."""
 
     visibility_km: Annotated[
         Annotated[float, Field(ge=0.001, le=1e6)] | None,
         Field(
-            description="meteorological visibility; by default the air takes nothing",
+            description="meteorological visibility; by default without extinction",
             examples=[10.0],
         ),
     ] = None
 
 
 class Obstacle(Section):
-    """A disc to keep out of; or the bounding circle of the objects of a name.
+    """A disc as an obstacle, or the bounding circle of named objects.
 
-    `object` may hold * and ?, and is all of the entry in the short form: `- Shelf*`.
+    `object` may have * and ?; the short form is just that name: `- Shelf*`.
     """
 
     object: Annotated[
         Text | None,
-        Field(description="name of objects of the scene, may hold * and ?"),
+        Field(description="name of objects of the scene, with * and ?"),
     ] = None
-    centre: Annotated[Pair | None, Field(description="x and y of a disc, metres")] = None
+    centre: Annotated[Pair | None, Field(description="centre of a disc, x and y, metres")] = None
     radius_m: Annotated[
-        Annotated[float, Field(gt=0, le=1e6)] | None, Field(description="of the disc, metres")
+        Annotated[float, Field(gt=0, le=1e6)] | None,
+        Field(description="radius of the disc, metres"),
     ] = None
 
     @model_validator(mode="after")
@@ -467,16 +475,16 @@ Obstacles = Annotated[
 
 
 class PlanningSection(Section):
-    """The path planned beside the survey, in the plane, world coordinates.
+    """Path planning in the plane, in world coordinates.
 
-    `enabled` is as given, else whether there are a start and a target. `obstacles` is 'auto'
-    (the bounding circle of each object that is not flat) or a list; `clearance_m` is added to
-    each radius.
+    `enabled` is by default whether there are a start and a target. `obstacles` is 'auto' (the
+    bounding circle of each object that is not flat) or a list; `clearance_m` is added to each
+    radius.
     """
 
     enabled: Annotated[
         bool | None,
-        Field(description="by default whether there are start and target", examples=[True]),
+        Field(description="by default true if start and target are given", examples=[True]),
     ] = None
     start: Annotated[
         Pair | None,
@@ -490,12 +498,12 @@ class PlanningSection(Section):
         Obstacles | None,
         _short(lambda v: v == "auto", lambda v: None, Literal["auto"] | Obstacles | None),
         Field(
-            description="circles about all objects that are not flat (auto), or names and discs",
+            description="bounding circles of all objects that are not flat (auto), or a list",
             examples=["auto", ["Shelf*", {"centre": [-6, -1], "radius_m": 1}]],
         ),
     ] = None
     clearance_m: Annotated[
-        float, Field(ge=0, le=1000, description="metres kept from obstacles")
+        float, Field(ge=0, le=1000, description="distance to keep from obstacles, metres")
     ] = 0.0
     trials: Annotated[
         int, Field(ge=1, le=1_000_000, description="particle swarms, each with its own seed")
@@ -503,7 +511,7 @@ class PlanningSection(Section):
     particles: Annotated[int, Field(ge=1, le=10_000_000, description="of each swarm")] = 1000
     iterations: Annotated[int, Field(ge=1, le=1_000_000, description="of each swarm")] = 300
     waypoints: Annotated[
-        int, Field(ge=1, le=100, description="corners of the path between its ends")
+        int, Field(ge=1, le=100, description="corners of the path between start and target")
     ] = 5
     seed: Annotated[
         int, Field(ge=0, le=2**63 - 1, description="the same seed gives the same path")
@@ -511,32 +519,34 @@ class PlanningSection(Section):
 
 
 class PoolSection(Section):
-    """The partitions, and what runs on them; sizes that are not given follow the machine.
+    """The partitions and their tasks; default sizes depend on the machine.
 
-    `gpu` and `other` are workers of a cluster on this machine; one that is running already has
-    the workers it has. `collectors` and `queue_capacity` hold for both.
+    `gpu` and `other` set the workers of a local cluster, not of one that is running already.
+    `collectors` and `queue_capacity` apply to both.
     """
 
     gpu: Annotated[
         Annotated[int, Field(ge=1, le=10_000)] | None,
-        Field(description="workers that cast rays; by default one a GPU", examples=[1]),
+        Field(description="workers that cast rays; by default one for each GPU", examples=[1]),
     ] = None
     other: Annotated[
         Annotated[int, Field(ge=1, le=10_000)] | None,
-        Field(description="workers that plan; by default they follow the cores", examples=[1]),
+        Field(
+            description="workers that plan paths; by default by the number of cores", examples=[1]
+        ),
     ] = None
-    collectors: Annotated[int, Field(ge=1, le=64, description="tasks that make points of hits")] = 2
+    collectors: Annotated[int, Field(ge=1, le=64, description="tasks that write the parts")] = 2
     queue_capacity: Annotated[
-        int, Field(ge=1, le=100_000, description="items that stage 1 may be ahead of stage 2")
+        int, Field(ge=1, le=100_000, description="how many items stage 1 may be ahead of stage 2")
     ] = 10
     backend: Annotated[
         Literal[BACKENDS],  # type: ignore[valid-type]
-        Field(description="cuda, embree or numpy; auto takes the fastest that is there"),
+        Field(description="cuda, embree or numpy; auto takes the fastest available"),
     ] = "auto"
 
 
 def may_be_empty(section: type[Section]) -> Any:
-    """Take a section of which all fields are commented out as one of defaults."""
+    """Treat a section with all fields commented out as one of defaults."""
     return _short(lambda v: v is None, lambda v: {}, section | None)
 
 
@@ -544,7 +554,7 @@ def _scene_of(value: str | list[Any] | None) -> dict[str, Any]:
     return {"preset" if value in ("seed", "none") else "files": value} if value else {}
 
 
-# In place of a scene: the name of a mesh file or preset, or a list of files.
+# Short form of a scene: the name of a mesh file or preset, or a list of files.
 scene_in_short = _short(
     lambda v: v is None or isinstance(v, (str, list)),
     _scene_of,

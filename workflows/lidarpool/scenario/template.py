@@ -1,4 +1,4 @@
-"""A scenario file to begin with: every field with its default, made from the sections."""
+"""The scenario file of `lidarpool init`: every field with its default, from the sections."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ _COMMENT_AT = 30  # column of the comments that stand beside a field
 
 _HEAD = f"""\
 # yaml-language-server: $schema={SCHEMA_FILE}
-# A lidar survey for lidarpool, and a path planned beside it. All of it written out: every line
-# may be left out, and this is what it is then. Lines that begin with "# " and a name show what
-# may be given instead of what lidarpool chooses. Lengths are in metres, angles in degrees, Z is up.
+# A lidar survey for lidarpool, with path planning. Every field has its default here, and may be
+# left out. A name after "# " is an example for a field whose default lidarpool chooses. Lengths
+# are in metres, angles in degrees, Z is up.
 #
 #     lidarpool check {SCENARIO_FILE}
 #     lidarpool run {SCENARIO_FILE}
@@ -35,7 +35,7 @@ def scenario_template(files: Sequence[dict[str, str]] = ()) -> str:
     Parameters
     ----------
     files
-        Mesh files to begin with, as in `scene.files`.
+        Mesh files to survey, as in `scene.files`.
     """
     lines = [_HEAD]
     given: dict[str, dict[str, Any]] = {}
@@ -47,9 +47,9 @@ def scenario_template(files: Sequence[dict[str, str]] = ()) -> str:
 
 
 def _top(name: str, field: FieldInfo, given: dict[str, Any]) -> Iterator[str]:
-    """Give the lines of a section, or of a field that stands beside them.
+    """Return the lines of a section, or of a top-level field.
 
-    `given` are values of its fields that stand there instead of their defaults.
+    `given` are values for some fields instead of their defaults.
     """
     section = field.annotation
     if not (isinstance(section, type) and issubclass(section, BaseModel)):
@@ -65,7 +65,7 @@ def _top(name: str, field: FieldInfo, given: dict[str, Any]) -> Iterator[str]:
 
 
 def _lines(name: str, field: FieldInfo, indent: str) -> Iterator[str]:
-    """Give a field with its default; what follows from other things is shown by examples."""
+    """Return a field with its default, or with examples if the default is computed."""
     text = field.description or ""
     if not field.examples:
         yield from _beside(f"{name}: {_flow(field.default)}", text, indent)
@@ -77,7 +77,7 @@ def _lines(name: str, field: FieldInfo, indent: str) -> Iterator[str]:
 
 
 def _beside(code: str, comment: str, indent: str) -> Iterator[str]:
-    """Give code with its comment to the right of it, or above it where there is no room."""
+    """Return code with its comment to the right, or above it where there is no room."""
     line = f"{indent}{code}".ljust(_COMMENT_AT - 1) + f" # {comment}"
     if len(line) <= _WIDTH and len(indent + code) < _COMMENT_AT:
         yield line

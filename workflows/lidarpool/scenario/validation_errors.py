@@ -1,4 +1,4 @@
-"""What pydantic finds wrong with a scenario, in lines for whoever wrote it."""
+"""Errors of pydantic as lines for the author of a scenario."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from pydantic_core import ErrorDetails
 
 from ..base.words import counted, did_you_mean
 
-_GIVEN_LETTERS = 160  # of what was given
+_GIVEN_LETTERS = 160  # letters of the value given
 
 
 def validation_errors(error: ValidationError, fields: Iterable[str]) -> Iterator[str]:
-    """Give a line for each fault: where, what was given, what is allowed.
+    """Yield a line for each error: field, value given, values allowed.
 
     Parameters
     ----------
     error
         What a model raised.
     fields
-        Names of all fields that there are, for those that are misspelt.
+        Names of all fields, to suggest one for a misspelt name.
     """
     fields = list(fields)
     alike: dict[Any, list[ErrorDetails]] = {}  # {field and kind of mistake: where it was made}
@@ -63,13 +63,13 @@ def _dotted(place: Sequence[int | str]) -> str:
 
 
 def _shown(value: Any) -> str:
-    """Show what was given, cut to a readable length, as YAML would say it."""
+    """Return the value given as YAML, cut to a readable length."""
     if value is None:
         return "empty"
     if isinstance(value, bool):
         return "true" if value else "false"
     short = reprlib.Repr()
     short.maxstring = short.maxother = short.maxlong = 40
-    short.maxlevel = 3  # lists of lists of lists, which YAML's aliases make of a few letters
+    short.maxlevel = 3  # YAML aliases make deeply nested lists of a few letters
     text = short.repr(value)
     return text if len(text) <= _GIVEN_LETTERS else f"{text[:_GIVEN_LETTERS]}…"

@@ -1,4 +1,4 @@
-"""YAML files as plain data: no tags, no doubled keys, no surprises with numbers."""
+"""YAML files as plain data: no tags, no duplicate keys, numbers as in YAML 1.2."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-# YAML 1.1, which PyYAML speaks, takes 1e-3 for text; YAML 1.2 and everybody else for a number.
+# In YAML 1.1, which PyYAML implements, 1e-3 is text; in YAML 1.2 it is a number.
 _Loader.add_implicit_resolver(
     "tag:yaml.org,2002:float",
     re.compile(r"^[-+]?[0-9][0-9_]*(\.[0-9_]*)?[eE][-+]?[0-9]+$"),

@@ -1,1 +1,1 @@
-"""The report as a page: one HTML file that opens anywhere and asks for nothing."""
+"""The report as a page: one HTML file that needs no network."""

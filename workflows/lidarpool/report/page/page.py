@@ -1,4 +1,4 @@
-"""Writes the page: puts what is to be told into the template."""
+"""Writes the page: fills the template."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from .timeline import make_timeline
 from .words import duration, excess, large, metres, share
 
 Report = Mapping[str, Any]
-OBJECTS_MOST = 25  # that have a bar
-SCENARIO_MOST = 50_000  # letters; a survey may have a million poses
+OBJECTS_MOST = 25  # objects that have a bar
+SCENARIO_MOST = 50_000  # letters of the scenario; a survey may have a million poses
 
-# {stage: what it is called on the page}, in the order of the pipeline
+# {stage: its name on the page}, in the order of the pipeline
 STAGES = {
     GENERATE: "generate",
     INTERSECT: "intersect",
@@ -40,7 +40,7 @@ STAGES = {
 
 
 class Fact(NamedTuple):
-    """A number at the head of the page; `bad` where it should be another."""
+    """A number at the head of the page; `bad` marks an error."""
 
     value: str
     what: str
@@ -55,7 +55,7 @@ class Picture(NamedTuple):
 
 
 class Bar(NamedTuple):
-    """A row of a bar chart: name in full and short, number, share of all, length in per cent."""
+    """A row of a bar chart: full and short name, number, share, length in per cent."""
 
     name: str
     label: str
@@ -71,18 +71,18 @@ def write_page(
     cloud: CountedCloud,
     scenario: Scenario | None = None,
 ) -> None:
-    """Write a report as one HTML file that needs nothing else, and asks nobody for anything.
+    """Write a report as one HTML file that needs no other files and no network.
 
     Parameters
     ----------
     path
-        Where to; pictures and cloud of the result are in the same folder.
+        The file; pictures and cloud of the result are in its folder.
     report
-        What `make_report` says: all numbers of the page that it has are taken from it.
+        From `make_report`; most numbers of the page come from it.
     result, cloud
-        What it is about, and its cloud, which was counted.
+        The result, and the statistics of its cloud.
     scenario
-        What it was made from, if that was a scenario.
+        The scenario of the run, if there is one.
 
     Raises
     ------
@@ -112,7 +112,7 @@ def write_page(
 
 
 def _written(scenario: Scenario) -> str:
-    """Write a scenario as YAML that can be loaded, unless it is so long that it is cut short."""
+    """Return a scenario as YAML that can be loaded, unless it is so long that it is cut."""
     data = scenario.model_dump(mode="json", exclude_defaults=True)
     text = yaml.safe_dump(
         data, sort_keys=False, allow_unicode=True, default_flow_style=None, width=96
@@ -122,7 +122,7 @@ def _written(scenario: Scenario) -> str:
 
 
 def _object_bars(counts: Mapping[str, int]) -> tuple[list[Bar], str]:
-    """Bars of the objects with the most points, and words on those that have none."""
+    """Bars of the objects with the most points, and a sentence about the others."""
     total, ranked = sum(counts.values()), sorted(counts.items(), key=lambda item: -item[1])
     hit = [item for item in ranked if item[1]]
     shown = hit[:OBJECTS_MOST]
@@ -142,7 +142,7 @@ def _object_bars(counts: Mapping[str, int]) -> tuple[list[Bar], str]:
 
 
 def _environment() -> Environment:
-    """Jinja as it is used here: all values are escaped, and one that is missing is an error."""
+    """Jinja's environment: all values are escaped, and a missing value is an error."""
     environment = Environment(
         loader=PackageLoader(__package__ or ""),
         autoescape=True,
@@ -161,14 +161,14 @@ def _environment() -> Environment:
 
 
 def _presentable(value: object) -> object:
-    """Replace what HTML cannot hold, in every value that goes into the page."""
+    """Replace characters that HTML cannot hold, in every value on the page."""
     if isinstance(value, str) and not isinstance(value, Markup):
         return words.printable(value)
     return value
 
 
 def _summary(report: Report) -> str:
-    """Say in a sentence what was done and what came out."""
+    """Return a sentence on the run and its result."""
     parameters, planning = report["parameters"], report["planning"]
     where = f"from {counted(parameters['poses'], 'position')}"
     if seconds := parameters.get("trajectory_s"):
@@ -181,9 +181,9 @@ def _summary(report: Report) -> str:
     )
     if planning is None:
         return f"{text}."
-    text += f"; {counted(planning['trials'], 'particle swarm')} searched for a path meanwhile"
+    text += f"; {counted(planning['trials'], 'particle swarm')} searched for a path"
     if not planning["collision_free"]:
-        return f"{text}, and found none that is free of collisions."
+        return f"{text}, and found none without collisions."
     text += f": the best is {metres(planning['best_length'])} long"
     if planning["excess"] is None:
         return f"{text}."
@@ -191,7 +191,7 @@ def _summary(report: Report) -> str:
 
 
 def _facts(report: Report) -> Iterator[Fact]:
-    """Give the numbers for the head of the page."""
+    """Return the numbers for the head of the page."""
     seconds, wrong = report["seconds"], report["placement_violations"]
     yield Fact(large(report["points"]), "points in the cloud")
     yield Fact(large(report["rays"]), f"rays, cast by {report['backend']}")
@@ -205,25 +205,24 @@ def _facts(report: Report) -> Iterator[Fact]:
 
 
 def _pictures(report: Report, folder: Path) -> Iterator[Picture]:
-    """Give the pictures that there are."""
+    """Return the pictures of the result."""
     parameters = report["parameters"]
     objects = counted(parameters["objects"], "object")
     poses = counted(parameters["poses"], "sensor position")
     if parameters.get("trajectory_s"):
-        poses = "the way of the sensors"
+        poses = "the trajectories of the sensors"
     actors = parameters["actors"]
-    halfway = ", and what moves where it is halfway"
+    halfway = ", and moving objects at half time"
     halfway = halfway if actors or parameters.get("trajectory_s") else ""
     every = parameters["keep_every"]
     kept = "one for each hit" if every == 1 else f"one for every {every:,} hits of a scan"
     captions = {
         "scene.png": f"The scene: {objects} of {counted(parameters['triangles'], 'triangle')}, "
         f"{poses} in red{halfway}.",
-        "intensity.png": f"Where the {counted(report['hits'], 'hit')} fell, per square metre, "
-        "and some rays.",
+        "intensity.png": f"The {counted(report['hits'], 'hit')} per square metre, and some rays.",
         "cloud.png": f"The cloud: {counted(report['points'], 'point')}, {kept}, rounded to "
         f"{parameters['precision_m']:g} m.",
-        "path.png": "The planned path, seen from above, among those of the trials.",
+        "path.png": "The planned path and those of the other trials, from above.",
     }
     for name, caption in captions.items():
         if name in report["files"]:

@@ -1,4 +1,4 @@
-"""The tasks of a run over time: rows of bars by partition and worker, however many there were."""
+"""The tasks of a run over time, as rows of bars by partition and worker."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from ...base.words import counted
 from ...render.stage import nice_step
 from .words import duration
 
-WIDTH = 1000  # units of the drawing, whatever its width on the page
+WIDTH = 1000  # units of the drawing, which the page scales
 ROW = 18  # height of a row
-ROWS_MOST = 24  # of a partition; the busiest are drawn
-_THIN = 1.2  # units that a bar is wide at least
-_GAP = 0.6  # units between bars that are drawn as one
+ROWS_MOST = 24  # rows of a partition; the busiest are drawn
+_THIN = 1.2  # least width of a bar, in units
+_GAP = 0.6  # bars nearer than this are drawn as one
 
 Span = tuple[float, float]
 
 
 class Row(NamedTuple):
-    """The bars of one stage, on one worker or on all: a path for SVG, lines to be drawn thick."""
+    """The bars of one stage, on one worker or on all: a path of thick lines for SVG."""
 
     label: str
-    detail: str  # said on a closer look
-    stage: str  # whose colour it has
+    detail: str  # the tooltip
+    stage: str  # gives the colour
     bars: str
 
 
@@ -53,14 +53,14 @@ class Timeline(NamedTuple):
 
 
 class _Axis:
-    """Time to units."""
+    """Convert a time to units."""
 
     def __init__(self, stages: Sequence[StageTotals]) -> None:
         self.begin = min(stage.start for stage in stages)
         self.seconds = max(1e-6, max(stage.stop for stage in stages) - self.begin)
 
     def spans(self, times: Iterable[Span]) -> list[Span]:
-        """Spans in units, none thinner than can be seen, near ones as one."""
+        """Spans in units, each wide enough to see, near ones joined."""
         scale = WIDTH / self.seconds
         wide = []
         for start, stop in times:
@@ -75,10 +75,10 @@ class _Axis:
 def make_timeline(
     stages: Sequence[StageTotals], records: Sequence[TaskRecord], names: dict[str, str]
 ) -> Timeline | None:
-    """Lay the tasks of a run out; None where nothing ran.
+    """Lay out the tasks of a run; None if nothing ran.
 
-    `stages` count all tasks, `records` are some of them, and `names` says {stage: what it is called
-    on the page}.
+    `stages` count all tasks, `records` are some of them, and `names` is {stage: its name on the
+    page}.
     """
     if not stages:
         return None
@@ -97,7 +97,7 @@ def make_timeline(
     groups = [Group("Stages", "while at least one task ran", overview)]
     ran = sum((stage.resources for stage in stages), Counter())  # {partition: tasks}
     for partition, tasks in sorted(_by_partition(records).items()):
-        workers = {task.worker for task in tasks}  # that have a record
+        workers = {task.worker for task in tasks}  # tasks that have a record
         workers = workers.union(*(s.workers for s in stages if s.partition == partition))
         groups.append(_group(axis, partition, len(workers), ran[partition], tasks, names))
     ticks = [(100 * t / axis.seconds, f"{t:.6g} s") for t in np.arange(0, axis.seconds, step)]
@@ -105,7 +105,7 @@ def make_timeline(
 
 
 def _by_partition(records: Iterable[TaskRecord]) -> dict[str, list[TaskRecord]]:
-    """Tasks by the partition that their worker really belonged to."""
+    """Tasks by the partition of their worker."""
     found: dict[str, list[TaskRecord]] = defaultdict(list)
     for record in records:
         where = record.partition if not record.misplaced else " + ".join(record.resources)
@@ -127,8 +127,8 @@ def _group(
         rows[task.worker, task.stage].append(task)
     busiest = sorted(rows.items(), key=lambda row: -sum(task.seconds for task in row[1]))
     detail = f"{counted(workers, 'worker')}, {counted(max(ran, len(tasks)), 'task')}"
-    if ran > len(tasks):  # else the gaps would pass for idleness
-        detail += f", of which {len(tasks):,} are known: the gaps are not all idle time"
+    if ran > len(tasks):  # else gaps would look like idle time
+        detail += f", of which {len(tasks):,} are drawn: gaps are not all idle time"
     if len(rows) > ROWS_MOST:
         detail += f"; the busiest {ROWS_MOST} of {len(rows):,} rows"
     drawn = []

@@ -1,4 +1,4 @@
-"""Numbers and names as a reader wants them; a leaf module."""
+"""Formats numbers and names for readers; a leaf module."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ _SPACES = f"\n\t\N{NO-BREAK SPACE}{NARROW}"  # not printable to Python, and harm
 
 
 def printable(text: str) -> str:
-    """Replace what cannot be shown; names come from files, and may reverse the rest of a line."""
+    """Replace unprintable characters; names in files may contain ones that reverse a line."""
     return "".join(
         c if c.isprintable() or c in _SPACES else "\N{REPLACEMENT CHARACTER}" for c in text
     )
 
 
 def grouped(count: int) -> str:
-    """Return a whole number with its thousands apart."""
+    """Return a whole number with thousands separated."""
     return f"{count:,}"
 
 
@@ -36,12 +36,12 @@ def duration(seconds: float) -> str:
 
 
 def rate(number: float, seconds: float) -> str:
-    """Return how many there were in a second; a dash where that cannot be said."""
+    """Return a rate per second; a dash if the time is unknown."""
     return f"{large(number / seconds)}/s" if seconds > 0 else "–"
 
 
 def large(number: float) -> str:
-    """Three figures of a number, with k, M or G where it is large."""
+    """Return a number with three digits, and k, M or G if it is large."""
     for size, letter in ((1e9, "G"), (1e6, "M"), (1e4, "k")):
         if number >= size:
             scaled = number / (1e3 if letter == "k" else size)
@@ -55,19 +55,19 @@ def share(part: float, whole: float) -> str:
 
 
 def excess(fraction: float) -> str:
-    """Return by how much something is longer, in per cent: «+0.12%»."""
+    """Return an excess in per cent: «+0.12%»."""
     if 0 < fraction < 1e-4:
         return "< 0.01%"
     return f"{fraction:+.2%}".replace("-", MINUS)
 
 
 def bound(value: float) -> str:
-    """Lowest or highest value of a column, whole numbers with all their digits."""
+    """Minimum or maximum of a column, whole numbers with all their digits."""
     return f"{value:,}" if isinstance(value, int) else f"{value:,.6g}"
 
 
 def metres(value: float | None) -> str:
-    """Length in metres, and words for none."""
+    """Length in metres, or words for none."""
     return "–" if value is None else f"{value:,.2f} m".replace("-", MINUS)
 
 

@@ -59,11 +59,11 @@ def import_survey(
     ------
     LidarpoolError
         If a file is missing or broken, or something without which the survey has no meaning
-        cannot be taken over; nothing is written then.
+        is not supported; nothing is written then.
     """
     survey, out = Path(survey), Path(out)
     if out.exists():
-        raise LidarpoolError(f"{out} is there already: name another folder, --out DIR.")
+        raise LidarpoolError(f"{out} exists: name another folder, --out DIR.")
     try:
         made = _Import(survey, [Path(folder) for folder in assets])
     except LidarpoolError as error:
@@ -236,7 +236,7 @@ class _Import:
         }
         head = [
             f"From the HELIOS++ survey {self.name!r} by lidarpool import.",
-            *(f"Not taken over: {line}." for line in self.left_out),
+            *(f"Not supported: {line}." for line in self.left_out),
         ]
         text = "".join(f"# {line}\n" for line in head) + _dumped(data)
         sensors = {name: _dumped(sensor) for name, sensor in self.data.items()}
