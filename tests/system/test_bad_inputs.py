@@ -72,7 +72,7 @@ OPTIONS: dict[str, tuple[list[str], str]] = {
     "certificate that is not there": (["info", "--tls-ca", "ca.pem"], "'ca.pem' does not exist"),
     "tls elsewhere": (
         ["run", "good.yaml", "--tls", "--scheduler", "tls://127.0.0.1:1"],
-        "--tls is for a cluster of this machine",
+        "--tls is for the local cluster",
     ),
     "scenario is a folder": (["run", "."], "Is a directory"),
     "name that no file can have": (["run", 300 * "x"], "File name too long"),

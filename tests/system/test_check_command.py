@@ -114,7 +114,7 @@ def test_too_little_memory(check, monkeypatch):
     monkeypatch.setattr(lidarpool.cli.forecast, "MEMORY_LIMIT", 300_000_000)
     outcome = check()
     assert outcome.code == 2
-    assert "There are 286.10 MiB of memory and the run needs about" in outcome.err
+    assert "There are 286.10 MiB of memory, and the run needs about" in outcome.err
 
 
 def test_all_reasons_are_given_at_once(check, tmp_path, monkeypatch):

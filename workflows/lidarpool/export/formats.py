@@ -131,9 +131,7 @@ class Format:
         """Check what `write` needs, before anything is written; LidarpoolError if it lacks."""
         self.check_installed()
         if path.exists() and not overwrite:
-            raise LidarpoolError(
-                f"{path} exists: give another place with --out, or --overwrite."
-            )
+            raise LidarpoolError(f"{path} exists: give another place with --out, or --overwrite.")
         there = {column.name for column in cloud.table}
         if missing := [name for name in self.needs if name not in there]:
             whole = f"{self.name} with the layout {self.layout}" if self._laid_out else self.name
