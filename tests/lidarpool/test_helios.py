@@ -12,6 +12,7 @@ from lidarpool import LidarpoolError
 from lidarpool.cli.import_command import import_
 from lidarpool.scan.rig import Rig, RigPlan
 from lidarpool.scenario.helios import import_survey
+from lidarpool.sensor.materials import MaterialTable
 
 X, Y, Z = np.eye(3)
 SQUARE = "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nf 1 2 3\nf 1 3 4\n"
@@ -53,6 +54,7 @@ def survey(tmp_path):
         (root / "deep").mkdir(exist_ok=True)
         (root / "parts" / "ground.obj").write_text("mtllib g.mtl\nusemtl soil\n" + SQUARE)
         (root / "parts" / "g.mtl").write_text(ON_GROUND)
+        (root / "spectra").mkdir(exist_ok=True)
         for name, text in dict(parts).items():
             (root / "parts" / name).write_text(text)
         (root / "devices.xml").write_text(f"<document>{device}{PLANE}{TRIPOD}</document>")
@@ -209,6 +211,20 @@ def test_a_head_turns_from_start_to_stop_while_its_mirror_draws_lines(imported):
     assert of.begins_ns(3) == pytest.approx((25 / 12 + 0.001) * 1e9)
 
 
+def test_channels_of_a_mirror_that_stands_are_the_beams_of_a_head_that_turns(imported):
+    origin = '<beamOrigin><rot axis="x" angle_deg="{}"/></beamOrigin>'
+    beams = "".join(f'<channel id="{e}">{origin.format(e)}</channel>' for e in (-15, 15))
+    inside = f"<channels>{beams}</channels>"
+    limits = {"scanAngleMax_deg": 1, "scanAngleEffectiveMax_deg": 1, "scanFreqMin_Hz": 0}
+    device = scanner("rotating", inside, headRotatePerSecMax_deg=3600, **limits)
+    head = 'headRotatePerSec_deg="3600" headRotateStart_deg="0" headRotateStop_deg="720"'
+    _, _, of = imported(device, legs(f'pulseFreq_hz="18000" {head}', (0, 0)), platform="tripod")
+    assert [c.name for c in of.carried] == ["leg0--15", "leg0-15"] and of.ray_count == 7200
+    for number, elevation in enumerate((-15, 15)):
+        there = about(Z, 0.2 * 7) @ about(X, elevation) @ Y
+        assert np.allclose(fired(of, number, [7])[0, 0], there)
+
+
 def test_angular_resolutions_set_the_rates(imported):
     device = scanner(
         "rotating",
@@ -261,14 +277,26 @@ def test_parts_turn_grow_move_and_fall_as_in_helios(imported):
     )
     device = scanner("conic", "", scanAngleMax_deg=20, scanFreqMax_Hz=10)
     boxes = {f"box_{n}.obj": f"o B{n}\nv 0 0 0\nv {n} 0 0\nv 0 3 0\nf 1 2 3\n" for n in (1, 2)}
-    made, built, _ = imported(device, legs('pulseFreq_hz="1000"'), scene, parts=boxes)
+    made, built, of = imported(device, legs('pulseFreq_hz="1000"'), scene, parts=boxes)
     assert built.names == ("ground", "B1", "B2")
     low, high = np.moveaxis(built.object_bounds + built.origin, 1, 0)
     # Up is y: (x, y, z) -> (x, -z, y); then x, then z turn, twice as large, onto the ground at 2.
     assert np.allclose(low[1:], [[1, 2, 2], [1, 2, 2]])
     assert np.allclose(high[1:], [[7, 4, 2], [7, 6, 2]])
-    ground = made.scenario.materials[0]
+    ground = made.scenario.materials[1]
     assert (ground.objects, ground.reflectance, ground.semantic_class) == (("ground",), 0.3, 2)
+    MaterialTable.of(of.materials, built.names)  # every object has one
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_reflectances_are_those_of_spectra_at_the_wavelength(imported, known):
+    device = scanner("conic", "", scanAngleMax_deg=20, scanFreqMax_Hz=10, wavelength_nm=1500)
+    parts = {"g.mtl": "newmtl soil\nhelios_spectra loam\n"}
+    if known:
+        parts["../spectra/loam.txt"] = "Name: loam\n\n1.0\t20.0\n2.0\t40.0 \n"
+    made, _, _ = imported(device, legs('pulseFreq_hz="1000"'), parts=parts)
+    assert [m.reflectance for m in made.scenario.materials] == [None, 0.3] * known
+    assert ("the spectrum 'loam', which is not there" in " ".join(made.left_out)) != known
 
 
 def test_a_trajectory_of_its_own_is_followed(imported):

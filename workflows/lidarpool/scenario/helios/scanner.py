@@ -200,7 +200,12 @@ class _Line:
     def of(cls, scanner: Scanner, settings: dict[str, str], pulse_hz: float) -> _Line:
         most = scanner.number("scanAngleMax_deg")
         wide = scanner.number("scanAngleEffectiveMax_deg")
-        fine = number(settings, "verticalResolution_deg", 0)
+        fine, least = (
+            number(settings, "verticalResolution_deg", 0),
+            scanner.number("scanFreqMin_Hz"),
+        )
+        if not fine and not number(settings, "scanFreq_hz", 0) and not least:
+            return cls(0.0, 0.0, 1, 1, pulse_hz, 0.0)  # the mirror stands
         scan_hz = _scan_hz(scanner, settings, pulse_hz * fine / (2 * most) if fine else None)
         half = min(wide, _half(scanner, settings))
         low = number(settings, "verticalAngleMin_deg", -half)
@@ -226,6 +231,8 @@ class _Line:
 
     def standing(self) -> Made:
         """Return a mirror whose firings are pulses."""
+        if not self.scan_hz:
+            raise LidarpoolError("scanFreq_hz is 0, and no head turns.")
         width = self.count * self.step_deg
         mirror = {
             "motion": "sawtooth",

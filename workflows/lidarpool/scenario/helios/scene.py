@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
@@ -55,14 +55,19 @@ class Part:
                     values[words[0].removeprefix("helios_")] = words[1]
         return [values for name, values in found.items() if name in used]
 
-    @property
-    def kind(self) -> dict[str, Any]:
+    def kind(self, spectra: Callable[[str], float | None]) -> dict[str, Any]:
         """Reflectance and class, where all its faces have the same."""
         kinds = []
         for values in self.materials:
+            share = None
+            if "reflectance" in values:
+                share = number(values, "reflectance", 0)
+                share = share if share <= 1 else share / 100
+            elif "spectra" in values:
+                share = spectra(values["spectra"])
             kind: dict[str, Any] = {}
-            if "reflectance" in values and "spectra" not in values:
-                kind["reflectance"] = clean(number(values, "reflectance", 0))
+            if share is not None:
+                kind["reflectance"] = clean(np.clip(share, 0, 1))
             if "classification" in values:
                 kind["class"] = int(number(values, "classification", 0))
             kinds.append(kind)
@@ -96,6 +101,7 @@ class Surroundings:
     """The parts of a scene, and the ground among them."""
 
     def __init__(self, element: Element, assets: Assets) -> None:
+        self._assets = assets
         self.unread: list[str] = []
         self._missing: set[str] = set()
         self.parts: list[Part] = []
@@ -166,32 +172,39 @@ class Surroundings:
         x, y, z = points[points[:, 2].argmin()].tolist()
         part.offset[2] += self.height(x, y) - z
 
-    def materials(self) -> list[dict[str, Any]]:
+    def materials(self, wavelength_nm: float) -> list[dict[str, Any]]:
         """List what objects are made of, where the faces of a file are all of one kind."""
-        kinds = [part.kind for part in self.parts]
+        kinds = [part.kind(partial(self._reflectance, wavelength_nm)) for part in self.parts]
         if not any(kinds):
             return []
         named = [
-            (mesh.name, k) for p, k in zip(self.parts, kinds, strict=True) for mesh in p.meshes()
+            (mesh.name, kind)
+            for part, kind in zip(self.parts, kinds, strict=True)
+            for mesh in part.meshes()
         ]
         names = unique_names([name for name, _ in named])
-        return [
-            {"objects": name, **kind} for name, (_, kind) in zip(names, named, strict=True) if kind
-        ]
+        own = zip(names, (kind for _, kind in named), strict=True)
+        return [{"objects": "*"}, *({"objects": name, **kind} for name, kind in own if kind)]
+
+    def _reflectance(self, wavelength_nm: float, name: str) -> float | None:
+        """Reflectance at a wavelength, by the spectrum of a name; None where there is none."""
+        for place in self._assets.places:
+            for folder in (place / "spectra", place / "data" / "spectra"):
+                try:
+                    text = (folder / f"{name}.txt").read_text("utf-8", "replace")
+                except (OSError, ValueError):  # a zero in the name
+                    continue
+                rows = re.findall(r"^([\d.]+)\s+([\d.]+)\s*$", text, re.MULTILINE)
+                if rows:  # micrometres and per cent
+                    lengths, shares = np.array(sorted((float(x), float(y)) for x, y in rows)).T
+                    return float(np.interp(wavelength_nm / 1000, lengths, shares) / 100)
+        self.unread.append(f"the spectrum {name!r}, which is not there: its reflectance is 0.5")
+        return None
 
     def left_out(self) -> list[str]:
-        """Say what is not taken over."""
-        spectra = {
-            values["spectra"] for p in self.parts for values in p.materials if "spectra" in values
-        }
-        lines = list(self.unread)
-        if self._missing:
-            lines.append(
-                f"onGround at {'; '.join(sorted(self._missing))}: no ground there, so z is 0"
-            )
-        if spectra:
-            lines.append(f"reflectances from spectra ({', '.join(sorted(spectra))}): they are 0.5")
-        return lines
+        """Say what is not taken over, once all has been asked for."""
+        missing = "; ".join(sorted(self._missing))
+        return self.unread + [f"onGround at {missing}: no ground there, so z is 0"] * bool(missing)
 
 
 def _files(text: dict[str, str], assets: Assets) -> list[Path]:

@@ -113,6 +113,8 @@ class _Import:
                 f"{len(self.sensors)} legs and channels scan; a scenario has {SENSORS_MOST} "
                 "sensors at most."
             )
+        first = next(iter(self.scanners.values()))
+        self.materials = self.scene.materials(first.number("wavelength_nm", 1064))
         self.left_out = list(
             dict.fromkeys([*self.left_out, *self._unread(), *self.scene.left_out()])
         )
@@ -225,7 +227,7 @@ class _Import:
             },
             "trajectory": trajectory,
             "sensors": {name: {**sensor, **light.range_m} for name, sensor in self.sensors.items()},
-            **({"materials": materials} if (materials := self.scene.materials()) else {}),
+            **({"materials": self.materials} if self.materials else {}),
             **light.sections,
             "cloud": {
                 "keep_every": 1,
