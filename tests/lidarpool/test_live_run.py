@@ -14,6 +14,8 @@ from tests.clusters import thread_cluster
 from tests.lidarpool.committing import commit
 
 from lidarpool import Column, LidarpoolError, Planning, Scene, Sensor, Survey
+from lidarpool.columns.table import CHANNEL, OBJECT, SCAN
+from lidarpool.export.ply_format import header, row_type
 from lidarpool.live.live_points import LivePoints
 from lidarpool.live.result_page import open_result
 from lidarpool.live.run_page import LiveRun, live_run
@@ -167,6 +169,20 @@ def test_a_run_ends_as_by_an_interrupt(live):
     live.stopped.set()
     with pytest.raises(KeyboardInterrupt):
         live.on_progress(progress(2.0, 2))
+
+
+def test_a_page_that_stays_shows_the_file_of_the_cloud(live, tmp_path):
+    rows = np.zeros(3000, row_type(np.dtype(np.float32), (SCAN, CHANNEL, OBJECT)))
+    rows["x"] = np.linspace(5, 6, 3000)
+    path = tmp_path / "cloud.ply"
+    path.write_bytes(header(rows.dtype, len(rows)) + rows.tobytes())
+    live.follow(RunStore(live._job))
+    live.on_progress(progress(1.0, 1))
+    live.stopped.set()  # it stays no longer than that
+    with looking(live.page.url):
+        live.stay(path)
+        wait_for(lambda: displayed(live) == 3000)
+        wait_for(lambda: "3,000 of 3,000 points, all shown" in panel(live))
 
 
 def test_neither_help_nor_a_run_brings_what_it_does_not_need():

@@ -18,7 +18,7 @@ from ..base.vocabulary import PATIENCE_S, WAIT_S
 from ..base.words import counted
 from ..export.folder import result_folder
 from ..export.formats import Format
-from ..report.output import refuse_to_replace, write_result
+from ..report.output import CLOUD, refuse_to_replace, write_result
 from ..report.report import summary
 from ..run.checks import check_backend_here, slots_needed
 from ..run.cluster_file import ClusterFile
@@ -106,7 +106,7 @@ def run_scenario(scenario: Scenario, options: RunOptions) -> None:
         else:
             _tell(options.out, result, job, report)
         if live is not None and options.stay:
-            live.stay()
+            live.stay(options.out / CLOUD)
 
 
 def _simulate(

@@ -11,6 +11,7 @@ from ..columns.cloud import Cloud
 from ..export.cloud_file import CloudFile
 from .looking import Eye, Filter
 
+VIEW_POINTS = 500_000  # of all in a browser, and as many of what is seen from near
 BLOCK = 1 << 15  # rows that are read at a time
 Search = Generator[float, None, tuple[Cloud, int]]
 

@@ -93,6 +93,12 @@ class LivePoints:
             self._counts, self.hits = result.hit_counts, result.hits
             self.version += 1
 
+    def replace(self, cloud: Cloud) -> None:
+        """Show other points, such as more of them."""
+        with self._lock:
+            self.cloud = cloud
+            self.version += 1
+
     def hit_counts(self) -> NDArray[np.float64]:
         """Hits of each triangle, (f,), scaled up to all hits where not all parts were read."""
         with self._lock:

@@ -19,12 +19,11 @@ from ..export.cloud_file import CloudFile
 from ..run.picture_file import PICTURE_FILE, Pictured, SensorWay
 from ..run.store import RUN_FOLDER
 from ..scan.database import FILE
-from .blocks import Blocks
+from .blocks import VIEW_POINTS, Blocks
 from .page import PORT, LivePage, announced, live_page, redrawn
 from .view import View, bounds_of, described, places_of
 
 CLOUD = "cloud.ply"
-VIEW_POINTS = 500_000  # of all in a browser, and as many of what is seen from near
 DRAW_EVERY_S, BUSY_SHARE = 0.1, 0.7  # of a core: nothing else is to be done
 
 

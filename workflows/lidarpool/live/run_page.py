@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from html import escape
+from pathlib import Path
 from threading import Event
 
 import click
@@ -20,7 +21,8 @@ from numpy.typing import NDArray
 
 from poolpart import Partition
 
-from ..columns.table import SCAN
+from ..columns.table import SCAN, TABLE
+from ..export.cloud_file import CloudFile
 from ..plan import best
 from ..run.job import Job
 from ..run.picture_file import sensor_ways
@@ -29,6 +31,7 @@ from ..run.result import RunResult
 from ..run.store import RunStore
 from ..scan import Frame
 from ..sensor.materials import MaterialTable
+from .blocks import VIEW_POINTS, Blocks
 from .live_points import LivePoints
 from .page import PORT, LivePage, announced, live_page, redrawn
 from .view import View, bounds_of, described, places_of
@@ -147,8 +150,19 @@ class LiveRun:
         self._busy, self._over = {}, True
         self._stop.label = "Close"
 
-    def stay(self) -> None:
-        """Keep the page until Ctrl-C, or until it is closed from the page itself."""
+    def stay(self, cloud: Path) -> None:
+        """Keep the page until Ctrl-C, or until it is closed from the page itself.
+
+        Parameters
+        ----------
+        cloud
+            What the run has written: the parts are gone, and more points are read from there.
+        """
+        own = [column for column in self._job.survey.stored_columns if column.name not in TABLE]
+        file = CloudFile(cloud, own)
+        if self._points is not None:
+            self._points.replace(file.choose(VIEW_POINTS)[0])
+        self._view.cloud.blocks = Blocks(file, self._job.scene.origin, VIEW_POINTS)
         click.echo(f"the live page stays at {self.page.url}; Ctrl-C ends it", err=True)
         with suppress(KeyboardInterrupt):
             while not self.stopped.wait(0.2):  # one without limit is not left on Ctrl-C everywhere
@@ -217,7 +231,8 @@ class LiveRun:
         lines += [escape(self._newest)] if self._newest else []
         shown = len(points.cloud) if points is not None and points.cloud is not None else 0
         some = "" if shown == progress.points else f", {shown:,} of them displayed"
-        lines.append(f"<b>{progress.points:,} points</b>{some}")
+        of_file = self._view.cloud.facts if self._view.cloud.blocks is not None else []
+        lines += of_file or [f"<b>{progress.points:,} points</b>{some}"]
         if points is not None and points.error:
             lines.append(escape(points.error))
         lines += [_bar(f"{escape(name)}, slots busy", *slots) for name, slots in self._busy.items()]
