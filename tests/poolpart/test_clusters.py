@@ -18,7 +18,7 @@ from tests.daemons import wait_until
 import poolpart.clusters
 from poolpart import PoolError, start_partitions
 
-SCHEDULER = {"host": "127.0.0.1", "port": 0, "dashboard": False, "dashboard_address": ":0"}
+SCHEDULER = {"host": "127.0.0.1", "port": 0, "dashboard": False, "dashboard_address": "127.0.0.1:0"}
 
 
 class Queue:

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 import trimesh
-from tests.clusters import thread_cluster
+from tests.clusters import import_jobqueue, thread_cluster
 
 import lidarpool.run.checks as lidarpool_checks
 import lidarpool.run.connection
@@ -70,6 +70,14 @@ OPTIONS: dict[str, tuple[list[str], str]] = {
     "both": (["run", "good.yaml", "--resume", "--fresh"], "give one of them"),
     "certificates alone": (["info", "--tls-key", "a.stl"], "are for the cluster of --scheduler"),
     "certificate that is not there": (["info", "--tls-ca", "ca.pem"], "'ca.pem' does not exist"),
+    "two clusters": (
+        ["run", "good.yaml", "--cluster", "c.yaml", "--scheduler", "tcp://127.0.0.1:1"],
+        "--cluster starts a cluster, --scheduler is for one that runs",
+    ),
+    "tls of a cluster file": (
+        ["run", "good.yaml", "--cluster", "c.yaml", "--tls"],
+        "--tls is for a cluster of this machine",
+    ),
     "tls elsewhere": (
         ["run", "good.yaml", "--tls", "--scheduler", "tls://127.0.0.1:1"],
         "--tls is for the local cluster",
@@ -219,6 +227,46 @@ def test_workers_that_are_waited_for_are_named_meanwhile(place, lidarpool, monke
         outcome.err,
     )
     assert outcome.err.splitlines()[-1].startswith("lidarpool: Partition 'LIDAR' has 0 of the 4")
+
+
+QUEUE = """
+cluster: dask_jobqueue.SLURMCluster
+arguments:
+  cores: 1
+  memory: 1GB
+  scheduler_options: {host: 127.0.0.1, port: 0, dashboard_address: "127.0.0.1:0"}
+partitions: {GPU: {workers: 2}, LIDAR: {slots: 4}, OTHER: {}}
+"""
+
+
+def test_jobs_that_do_not_begin_are_cancelled(place, refused, monkeypatch):
+    job = import_jobqueue().slurm.SLURMJob
+    submitted: list[str] = []
+    cancelled: list[str] = []
+
+    async def submit(self: object, script: str) -> str:
+        submitted.append(str(len(submitted)))
+        return f"Submitted batch job {submitted[-1]}"
+
+    async def cancel(self: object, number: str, command: str) -> None:
+        cancelled.append(number)
+
+    monkeypatch.setattr(job, "_submit_job", submit)
+    monkeypatch.setattr(job, "_close_job", cancel)
+    (place / "queue.yaml").write_text(QUEUE)
+    refused(
+        ["run", "good.yaml", "--cluster", "queue.yaml", "--wait", "0s", "--quiet"],
+        "has no workers",
+    )
+    assert len(submitted) == 4
+    assert sorted(cancelled) == submitted
+
+    (place / "queue.yaml").write_text(QUEUE.replace("slots: 4", "slots: 3"))
+    refused(
+        ["run", "good.yaml", "--cluster", "queue.yaml"],
+        "queue.yaml: partition LIDAR has 3 of the 4 slots needed",
+    )
+    assert len(submitted) == 4
 
 
 def test_a_backend_that_the_workers_lack(cluster, refused):

@@ -20,7 +20,7 @@ from ..export.folder import result_folder
 from ..export.formats import Format
 from ..report.output import CLOUD, refuse_to_replace, write_result
 from ..report.report import summary
-from ..run.checks import check_backend_here, slots_needed
+from ..run.checks import TooFewWorkersError, check_backend_here, slots_needed
 from ..run.cluster_file import ClusterFile
 from ..run.connection import TlsFiles, connected, local_client, started_client
 from ..run.identity import identity_of
@@ -225,7 +225,11 @@ def _started_client(file: ClusterFile, options: RunOptions) -> Iterator[Client]:
             client = stack.enter_context(started_client(file))
         if not options.quiet:
             _note(f"started {file}")
-        yield client
+        try:
+            yield client
+        except TooFewWorkersError as error:
+            error.add_note("Jobs that began and failed say why in their logs.")
+            raise
 
 
 def _note(words: str) -> None:
