@@ -223,7 +223,7 @@ SetEnv PYTHONPATH={os.pathsep.join(filter(None, sys.path))}
 
 def wait_until(condition: Callable[[], bool]) -> None:
     """Wait for something that will be so."""
-    stop = time.monotonic() + 120
+    stop = time.monotonic() + 300
     while not condition():
         assert time.monotonic() < stop, "waited in vain"
         time.sleep(0.1)

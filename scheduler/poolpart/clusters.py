@@ -19,6 +19,7 @@ from .rules import check_name
 logger = logging.getLogger(__name__)
 
 _LOOK_EVERY_S = 5.0  # for workers that are gone
+_DEATH_S = 60  # a worker that finds no scheduler for so long ends, as those of dask-jobqueue do
 
 
 def start_partitions(cluster: SpecCluster, partitions: Mapping[str, Mapping[str, Any]]) -> None:
@@ -152,6 +153,7 @@ def _processes(
         raise ValueError('it needs "hosts", a list of those that its workers are to be on.')
     threads = max(resources.values())
     kwargs = {"name": name, "nthreads": threads, "resources": dict(resources)}
+    kwargs["death_timeout"] = _DEATH_S  # not every SSH server ends processes for its client
     options["kwargs"] = kwargs | options.pop("worker_options", {})
     options["address"] = hosts[number % len(hosts)]
     ssh.Worker(cluster.scheduler_address, **options)  # that it takes them
