@@ -420,6 +420,7 @@ def test_a_mesh_alone_is_scanned_below_its_ceiling_and_whole(tmp_path, height, e
         ((8, 3, 6), "Blender", "hall.glb", "hall.glb was turned from Y-up to Z-up, as glTF asks"),
         ((8, 6, 2), "Blender", "hall.glb", "8 m wide, 6 m high and 2 m thick now"),
         ((8, 3, 6), "https://github.com/mikedh/trimesh", "hall.glb", "trimesh wrote it"),
+        ((8, 6, 2), "lidarpool", "hall.glb", ""),
         ((8, 6, 2), "trimesh", {"file": "hall.glb", "up_axis": "y"}, ""),
         ((8, 6, 2), "trimesh", {"file": "hall.glb", "up_axis": "z"}, ""),
     ],
@@ -431,4 +432,4 @@ def test_it_is_told_that_gltf_was_turned_and_what_to_say(tmp_path, size, generat
     told = made.advice(made.build_scene())
     assert len(told) == bool(says)
     if says:
-        assert says in told[0] and "give it up_axis: z" in told[0]
+        assert says in told[0] and "say up_axis: z in scene.files" in told[0]

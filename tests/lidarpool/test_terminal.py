@@ -10,6 +10,7 @@ import pytest
 
 import lidarpool.cli.commands
 from lidarpool.cli.terminal import PlainLines, shown_progress, shown_status
+from lidarpool.run.bars import bars_here
 from lidarpool.run.progress import Progress
 
 
@@ -97,3 +98,14 @@ def test_plain_lines_tell_why_nothing_goes_on():
     words = "waits for slots of LIDAR, which other runs hold"
     assert run == [f"run  {words}, 20 scans are done", "run  goes on, 40 scans are done"]
     assert len(lines_of(stream)) - len(run) == 4
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_a_script_has_bars_at_a_terminal_and_nothing_elsewhere(terminal, monkeypatch):
+    stream = StringIO()
+    stream.isatty = lambda: terminal
+    monkeypatch.setattr(sys, "stderr", stream)
+    monkeypatch.setenv("TERM", "xterm")
+    with bars_here() as show:
+        show(progress(1.0, 50))
+    assert ("2 intersect" in stream.getvalue()) == terminal

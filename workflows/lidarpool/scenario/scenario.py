@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -19,7 +18,7 @@ from ..plan import Planning
 from ..scene.actors import Actor, box, one_mesh
 from ..scene.floor import room_at
 from ..scene.mesh import Mesh
-from ..scene.meshfile import SUFFIXES, UNITLESS, Y_UP, load_meshes
+from ..scene.meshfile import SUFFIXES, UNITLESS, load_meshes
 from ..scene.scene import Scene
 from ..scene.shapes import seed_objects
 from ..sensor import Material, Mounted, Noise, Pose, Returns, Survey
@@ -164,7 +163,7 @@ class Scenario(Section):
     _folder: Path = PrivateAttr(default=Path())  # that relative file names start from
     _source: str = PrivateAttr(default="the default survey")  # for messages
     _notes: list[str] = PrivateAttr(default_factory=list)  # about objects left out of the scene
-    _turned: list[str] = PrivateAttr(default_factory=list)  # files rotated from Y-up to Z-up
+    _remarks: list[str] = PrivateAttr(default_factory=list)  # about files rotated to Z-up
 
     @classmethod
     def load(cls, path: str | Path) -> Scenario:
@@ -262,14 +261,9 @@ class Scenario(Section):
 
         Also on objects that `build_scene` left out, and on files that it turned to Z-up.
         """
-        notes = list(self._notes)
-        if self._turned:
-            more = f" and {len(self._turned) - 1:,} more were" if self._turned[1:] else " was"
-            notes.append(
-                f"{self._turned[0]}{more} turned from Y-up to Z-up, as glTF asks: if it lies on "
-                "its side now, give it up_axis: z in scene.files, else y "
-                f"(lidarpool init DIR --mesh {shlex.quote(self._turned[0])} --up-axis z)"
-            )
+        notes = [*self._notes, *self._remarks[:1]]
+        if self._remarks[1:]:
+            notes[-1] += f"; {len(self._remarks) - 1:,} more files were turned, too"
         unitless = [
             entry.file
             for entry in self.scene.files
@@ -293,7 +287,7 @@ class Scenario(Section):
             If a mesh file cannot be read.
         """
         self._notes.clear()
-        self._turned.clear()
+        self._remarks.clear()
         meshes: list[Mesh] = list(seed_objects()) if self.scene.has_seed else []
         mistakes = Mistakes()
         for entry in self.scene.files:
@@ -417,17 +411,14 @@ class Scenario(Section):
             except RuntimeError as error:  # ~name of an unknown user
                 raise LidarpoolError(f"the file {entry.file!r} cannot be found: {error}") from error
             transform = entry.transform()
-        told = len(self._notes)
-        meshes = load_meshes(
+        return load_meshes(
             path,
             unit=entry.unit,
             up_axis=entry.up_axis,
             transform=transform,
             tell=self._notes.append,
+            remark=self._remarks.append,
         )
-        if entry.up_axis is None and path.suffix.lower() in Y_UP and len(self._notes) == told:
-            self._turned.append(entry.file)
-        return meshes
 
     def _world_poses(
         self, scene: Scene

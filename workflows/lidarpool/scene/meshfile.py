@@ -35,8 +35,10 @@ _READERS: dict[str, Callable[[bytes, Path], Content]] = {
     ".3mf": read_3mf,
 }
 SUFFIXES = tuple(_READERS)
-Y_UP = (".glb", ".gltf")  # whose standard says so
 UNITLESS = (".obj", ".stl", ".ply", ".off")  # that cannot say in which unit their numbers are
+
+_Y_UP = (".glb", ".gltf")  # whose standard says so
+GENERATOR = "lidarpool"  # that files of our own name, which are Y-up
 
 # Nothing on Earth is farther from the origin of its map; see also `sections.Coordinate`.
 FARTHEST_M = 1e8
@@ -52,6 +54,7 @@ def load_meshes(
     up_axis: str | None = None,
     transform: Transform | None = None,
     tell: Callable[[str], None] = _log.warning,
+    remark: Callable[[str], None] = _log.info,
 ) -> tuple[Mesh, ...]:
     """Read all objects of a mesh file.
 
@@ -73,6 +76,8 @@ def load_meshes(
     tell
         Called with a line on what was left out, or seems to lie on its side; by default a warning
         of this module's logger.
+    remark
+        Called with a line on what is as it should be, and yet may surprise.
 
     Returns
     -------
@@ -101,10 +106,12 @@ def load_meshes(
     if content.skipped:
         names = ", ".join(content.skipped[:3]) + ", …" * (len(content.skipped) > 3)
         tell(f"{path} scales {names} to nothing: left out")
-    if up_axis is None and path.suffix.lower() in Y_UP and (why := _lies(content, meshes)):
-        tell(
-            f"{path} was turned from Y-up to Z-up, as glTF asks, and {why}: if it lies on its side "
-            "now, give it up_axis: z (in Python up_axis='z'), else y"
+    if up_axis is None and path.suffix.lower() in _Y_UP and content.generator != GENERATOR:
+        why = _lies(content, meshes)
+        (tell if why else remark)(
+            f"{path} was turned from Y-up to Z-up, as glTF asks{why}. If it lies on its side now, "
+            "say up_axis: z in scene.files (lidarpool init --mesh … --up-axis z writes such a "
+            "scenario), or up_axis='z' in Python; if not, y"
         )
     return meshes
 
@@ -112,11 +119,11 @@ def load_meshes(
 def _lies(content: Content, meshes: Sequence[Mesh]) -> str:
     """Say why a file that was turned from Y-up seems to have been Z-up; empty if it does not."""
     if "trimesh" in content.generator:
-        return "trimesh wrote it, which keeps the axes that it is given"
+        return ", and trimesh wrote it, which keeps the axes that it is given"
     low = np.min([mesh.vertices.min(axis=0) for mesh in meshes], axis=0)
     x, y, z = np.max([mesh.vertices.max(axis=0) for mesh in meshes], axis=0) - low
     if 2 * y < min(x, z):
-        return f"is {x:,.3g} m wide, {z:,.3g} m high and {y:,.3g} m thick now"
+        return f", and is {x:,.3g} m wide, {z:,.3g} m high and {y:,.3g} m thick now"
     return ""
 
 

@@ -13,6 +13,7 @@ from trimesh.exchange.obj import export_obj
 from trimesh.exchange.ply import export_ply
 
 from ..base.errors import LidarpoolError
+from .meshfile import GENERATOR
 from .scene import Scene
 from .transform import UP_AXES
 
@@ -90,7 +91,7 @@ def _encoded(suffix: str, scene: Scene) -> bytes:
 
 def _name_the_writer(tree: dict[str, Any]) -> None:
     """Say in a glTF who wrote it: files of trimesh's own are mostly not Y-up, and this one is."""
-    tree["asset"]["generator"] = "lidarpool"
+    tree["asset"]["generator"] = GENERATOR
 
 
 def _objects(scene: Scene, turn: np.ndarray[Any, np.dtype[np.float64]]) -> trimesh.Scene:
