@@ -288,7 +288,7 @@ def test_all_faults_are_told_at_once(scenario, tmp_path):
     words = [
         "sensor.layers is 0", "sensor.layer is not a field. Did you mean 'layers'?", "steps is 0",
         "cloud.keep_every is 0", "planning is enabled", "either poses or a trajectory",
-        "no divergence", "no.glb does not exist", "nor.stl does not exist", "drive.tum does not",
+        "no divergence", "no.glb' does not exist", "nor.stl' does not exist", "drive.tum' does not",
     ]  # fmt: skip
     assert len(lines) == len(words)
     for line, word in zip(lines, words, strict=True):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -252,9 +253,9 @@ class Scenario(Section):
         files += [one for one in (self.trajectory and self.trajectory.file,) if one]
         for file in files if mistakes.lines else ():
             with suppress(RuntimeError):  # of a user who is not known
-                path = self._folder / Path(file).expanduser()
-                if not path.exists():
-                    mistakes.lines.append(f"{path} does not exist: check the name and the folder.")
+                path = str(self._folder / Path(file).expanduser())
+                if not os.path.exists(path):  # noqa: PTH110 - also of names that no file can have
+                    mistakes.lines.append(f"{self._source}: {path!r} does not exist.")
 
     def advice(self, scene: Scene) -> list[str]:
         """Return notes on likely mistakes, such as a size that suggests another unit.
