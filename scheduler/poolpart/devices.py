@@ -1,9 +1,8 @@
-"""Which CUDA device each worker uses: the scheduler keeps it for as long as a worker lives.
+"""The CUDA device of each worker, kept on the scheduler for the worker's life.
 
-It is kept with the scheduler's own state of the worker, which goes when the worker goes. So
-whoever asks, and however often, gets one answer; a worker that its nanny starts again, which
-is a new one to Dask and may have a new name, finds the device free that the dead one had; and
-nothing has to be tidied up.
+It is stored in the scheduler's state of the worker, which ends with the worker. So everybody
+gets the same answer; a restarted worker, which is a new one to Dask and may have a new name,
+finds the device of its predecessor free; and nothing has to be cleaned up.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from . import probe
 from .task_context import WorkerLeft, in_event_loop, own_client, telling_departure
 from .workers import WorkerInfo, on_scheduler
 
-_HELD = "poolpart-gpu"  # in what the scheduler knows of a worker: UUID of the device it uses
+_HELD = "poolpart-gpu"  # key in the scheduler's state of a worker: UUID of its device
 
 _lock = threading.Lock()
 _own: dict[str, int | None] = {}  # {address of a worker of this process: its device}
@@ -28,12 +27,11 @@ _own: dict[str, int | None] = {}  # {address of a worker of this process: its de
 def assign_devices(client: Client, workers: Iterable[WorkerInfo]) -> dict[str, int]:
     """Give each worker a CUDA device, by the worker's own numbering.
 
-    Workers spread over the devices that they see: each takes the first one in its own list
-    that the fewest others have, of the workers that share a partition with it first, then of
-    all. dask-cuda rotates `CUDA_VISIBLE_DEVICES` from worker to worker so that number 0 is
-    another device in each, whereas workers from a plain `dask worker` all list the same
-    devices in the same order. Those with the fewest to choose from choose first. A worker
-    keeps its device until it ends, whoever asks again.
+    Workers spread over the devices that they see: each takes the first device in its list that
+    the fewest others use, in its partition first, then in the cluster. dask-cuda rotates
+    `CUDA_VISIBLE_DEVICES` from worker to worker so that number 0 is another device in each,
+    whereas workers of a plain `dask worker` all list the same devices in the same order.
+    Workers that see the fewest devices choose first. A worker keeps its device until it ends.
 
     Parameters
     ----------
@@ -45,7 +43,7 @@ def assign_devices(client: Client, workers: Iterable[WorkerInfo]) -> dict[str, i
     Returns
     -------
     dict
-        Address to ordinal, for the workers that are there and see any device.
+        Address to ordinal, for the present workers that see a device.
 
     Raises
     ------
@@ -66,7 +64,7 @@ def assign_devices(client: Client, workers: Iterable[WorkerInfo]) -> dict[str, i
 
 @telling_departure()
 def own_device() -> int | None:
-    """CUDA device that this task's worker should use; None where it sees none.
+    """CUDA device that this task's worker should use; None if it sees none.
 
     See `assign_devices`, which need not have been called. The answer is the same for all tasks
     of a worker, and takes no time from the second one on.
@@ -78,7 +76,7 @@ def own_device() -> int | None:
     ValueError
         Outside of a task.
     PoolError
-        In a coroutine, if its worker has not been asked before: ask in a thread.
+        In the first call on a worker, if it is in a coroutine: call it in a thread.
 
     Examples
     --------
@@ -91,14 +89,14 @@ def own_device() -> int | None:
         return _own[address]
     if in_event_loop():  # a thread that holds the lock needs the loop
         return _ask(address)
-    with _lock:  # of several tasks that begin at once, one asks
+    with _lock:  # of several tasks that start at once, one asks
         if address not in _own:
             _own[address] = _ask(address)
         return _own[address]
 
 
 def _ask(address: str) -> int | None:
-    # The driver is not asked where the devices are known already: that takes up to a second.
+    # Ask the driver only for unknown devices: that takes up to a second.
     if not probe.has_driver():
         return None
     device: int | None = on_scheduler(own_client(), _known, address=address)
@@ -120,7 +118,7 @@ def _known(address: str, dask_scheduler: Any = None) -> int | None:
 
 
 def _assign(visible: Mapping[str, Sequence[str]], dask_scheduler: Any = None) -> dict[str, int]:
-    """Choose for those that have none yet; {address: UUIDs that it sees, by ordinal}."""
+    """Choose for workers without a device; {address: UUIDs that it sees, by ordinal}."""
     here = {a: list(gpus) for a, gpus in visible.items() if a in dask_scheduler.workers}
     for address, gpus in sorted(here.items(), key=lambda item: len(item[1])):
         state = dask_scheduler.workers[address]

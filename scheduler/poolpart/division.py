@@ -1,7 +1,7 @@
-"""What clients ask of the steward: to make partitions, to move workers, and to undo it.
+"""Requests of clients to the steward: make partitions, move workers, dissolve partitions.
 
-Each is one question to the scheduler, which is answered whole: a client that dies meanwhile
-leaves all of it behind, or nothing, and of two that ask at the same moment one is first.
+Each is one request to the scheduler, which completes it or refuses it, also if the client dies
+meanwhile; simultaneous requests run one after the other.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from .steward import Seat, Steward, names_of, steward_of
 from .workers import on_scheduler
 
 PATIENCE_S = 60.0  # for a worker to answer
-_RETURN_S = 10.0  # for workers to declare what they did before, at least
-_LOOK_EVERY_S = 0.05  # at all tasks, for those that have not ended
+_RETURN_S = 10.0  # for workers to declare their former resources, at least
+_LOOK_EVERY_S = 0.05  # between looks for tasks that have not ended
 _UNFINISHED = ("waiting", "queued", "no-worker", "processing")
 
 
@@ -40,7 +40,7 @@ def ask(client: Client, question: Callable[..., Any], **arguments: Any) -> Any:
 async def _answer(
     question: Callable[..., Any], arguments: Mapping[str, Any], dask_scheduler: Any = None
 ) -> tuple[Any, str]:
-    # An error that is raised here would be in the scheduler's log with a traceback.
+    # Raised here, the error would be in the scheduler's log with a traceback.
     with steward_of(dask_scheduler) as steward:
         try:
             return await question(steward, **arguments), ""
@@ -60,10 +60,10 @@ async def declare(
 ) -> str:
     """Make partitions, and follow their rules from now on; all or none.
 
-    `chosen` are addresses of workers to begin with, `seen` the partitions that the client saw when
-    it chose, `gpus` what it knows of the workers. Returns what a user should know of all
-    partitions, "" for nothing; PoolError if a worker left meanwhile, somebody else has put it into
-    a partition or made a partition of such a name, or other workers have it.
+    `chosen` are addresses of the first workers, `seen` the partitions that the client saw when it
+    chose, `gpus` the devices of the workers. Returns a note on all partitions, or ""; PoolError if
+    a worker left meanwhile, another client has put it into a partition or made a partition of this
+    name, or other workers have it.
     """
     # Up to the first await nothing else happens on the scheduler.
     seats = {name: [_seat(steward, name, a) for a in chosen[name]] for name in rules}
@@ -81,15 +81,15 @@ async def declare(
     late = await steward.arrive(everyone, PATIENCE_S)
     if away := [seat for seat in everyone if seat in late or seat.gone]:
         raise PoolError(
-            f"{names_of(away)} left, or did not answer, while being put into partition "
+            f"{names_of(away)} left, or did not answer, when assigned to partition "
             f"{' and '.join(sorted({str(seat.partition) for seat in away}))}; the other workers "
-            "are in theirs. Make the pool anew to divide it again."
+            "were assigned. Make a new pool to divide it again."
         )
     return note
 
 
 def _begin(steward: Steward, rules: Mapping[str, Rule]) -> str:
-    """Have tasks inherit the partitions, raise or lower their fences, and count their tasks."""
+    """Let tasks inherit the partitions, raise or lower fences, and count tasks."""
     scheduler = steward.scheduler
     try:
         note = begin_inheritance(rules, scheduler)
@@ -98,7 +98,7 @@ def _begin(steward: Steward, rules: Mapping[str, Rule]) -> str:
                 enclose(scheduler, name)
             elif name in steward.rules and steward.rules[name].exclusive:
                 lower(scheduler, name)
-    except PoolError:  # this version of Dask lacks what fences build on
+    except PoolError:  # this version of Dask lacks what fences need
         for name in rules.keys() - steward.rules.keys():
             lower(scheduler, name)
             end_inheritance(scheduler, name)
@@ -112,12 +112,12 @@ def _seat(steward: Steward, name: str, address: str) -> Seat:
     if seat is None:
         raise PoolError(
             f"The worker at {address} could not be put into partition {name!r}: it has left. "
-            "Make the pool anew and divide that."
+            "Make a new pool and divide that."
         )
     if others := sorted(_declared_by(steward, seat) - {name}):
         raise PoolError(
             f"Worker {seat.info.name} already declares {', '.join(others)}; a worker belongs to "
-            f"one partition. If somebody has put it there meanwhile, make the pool anew "
+            f"one partition. If somebody has just put it there, make a new pool "
             "(Pool.from_client) and divide what is left."
         )
     return seat
@@ -129,7 +129,7 @@ def _check_sole(steward: Steward, name: str, chosen: Sequence[Seat], seen: Colle
     members = [s for s in seats if not s.away and name in _declared_by(steward, s)]
     if others := [seat for seat in members if name not in seen or seat not in chosen]:
         raise PoolError(
-            f"There is a partition {name!r} already, with {names_of(others)}, which this call did "
+            f"Partition {name!r} exists already, with {names_of(others)}, which this call did "
             f"not see, or does not choose: use Pool.partitions()[{name!r}] of a new pool, or give "
             "another name."
         )
@@ -142,8 +142,8 @@ def _declared_by(steward: Steward, seat: Seat) -> set[str]:
 
 # -- moving workers --------------------------------------------------------------------
 #
-# A worker that is to leave gets no new tasks of its partition; those that it has not started go
-# to other members, those that run end there; then it declares what it is to be.
+# A worker that leaves gets no new tasks of its partition; waiting tasks go to other members,
+# running tasks end there; then it declares its new resources.
 
 
 async def grow(
@@ -153,7 +153,7 @@ async def grow(
     _check(count)
     steward.adopt(name)
     if source == name:
-        raise PoolError(f"Partition {name!r} cannot grow by its own workers.")
+        raise PoolError(f"Partition {name!r} cannot take workers from itself.")
     if source is not None:
         steward.adopt(source)
     lender = source or steward.remainder()
@@ -165,7 +165,7 @@ async def grow(
         place = f"partition {lender!r}, beyond its minimum," if source else "the remainder"
         raise PoolError(
             f"Partition {name!r} cannot grow by {count}: {place} has "
-            f"{len(there)} workers to spare. Start more, or shrink another partition first."
+            f"{len(there)} spare workers. Start more, or shrink another partition first."
         )
     return await _move(steward, _by_load(steward, there)[:count], name, timeout_s)
 
@@ -192,7 +192,7 @@ def _check(count: int) -> None:
 async def _move(
     steward: Steward, seats: Sequence[Seat], target: str | None, timeout_s: float
 ) -> list[str]:
-    """Move workers; PoolError if some do not come free in time, which then stay."""
+    """Move workers; PoolError if some are not free in time, and those stay."""
     before = {seat: (seat.partition, seat.slots) for seat in seats}
     for seat in seats:
         steward.resize(seat.partition, -1)
@@ -202,7 +202,7 @@ async def _move(
     for seat in late:
         origin, slots = before[seat]
         if seat.partition != target or (origin and origin not in steward.rules):
-            continue  # meanwhile somebody else has moved it, or dissolved where it was
+            continue  # another client has moved it, or dissolved its partition
         steward.resize(target, -1)
         steward.resize(origin, 1)
         steward.put(seat, origin, slots)
@@ -210,9 +210,9 @@ async def _move(
         steward.settle(late)
         raise PoolError(
             f"{len(late)} of {len(seats)} workers could not be moved within "
-            f"{timeout_s:g} s, for their tasks have not ended; left in place: {names_of(late)}."
+            f"{timeout_s:g} s, because their tasks have not ended: {names_of(late)} stay."
         )
-    # Whoever else moves workers waits until they have arrived; dissolving does not.
+    # Other moves wait until the workers have arrived; dissolving does not.
     if target is not None and target not in steward.rules:
         raise PoolError(
             f"{names_of(seats)} did not arrive in partition {target!r}: somebody has dissolved it."
@@ -221,12 +221,12 @@ async def _move(
 
 
 def _arrived(steward: Steward, name: str) -> list[Seat]:
-    """Members that may be moved, by load: not those under way, which may turn back."""
+    """Members that may be moved, by load; not those on their way, which may return."""
     return _by_load(steward, [s for s in steward.members(name) if steward.settled(s)])
 
 
 def _by_load(steward: Steward, seats: Sequence[Seat]) -> list[Seat]:
-    """Those first that have the least to do, and long-running tasks last."""
+    """Sort by load, workers with long-running tasks last."""
 
     def load(seat: Seat) -> tuple[int, int]:
         worker = steward.scheduler.workers[seat.info.address]
@@ -246,7 +246,7 @@ async def dissolve(steward: Steward, names: Collection[str] | None, timeout_s: f
         return [name for name in steward.rules if names is None or name in names]
 
     deadline = time.monotonic() + timeout_s
-    # What the client submitted just before comes by another connection, after some milliseconds.
+    # Tasks that the client just submitted arrive by another connection, milliseconds later.
     await asyncio.sleep(_LOOK_EVERY_S)
     while tasks := _unfinished(scheduler, those()):
         if time.monotonic() >= deadline:
@@ -255,13 +255,13 @@ async def dissolve(steward: Steward, names: Collection[str] | None, timeout_s: f
                 f"had not ended, such as {tasks[0].key}: wait or cancel, then dissolve."
             )
         await asyncio.sleep(_LOOK_EVERY_S)
-    # From here to the next await nothing else happens on the scheduler; up to here somebody else
-    # may have dissolved the same partitions, or made some.
+    # Until the next await nothing else happens on the scheduler; before, another client may have
+    # dissolved the same partitions, or made some.
     gone = those()
     seats = [seat for seat in steward.seats.values() if seat.partition in gone]
     for name in gone:
         del steward.rules[name]
-        # Here and now, whatever becomes of the client and of workers that do not answer.
+        # At once, even if the client dies or workers do not answer.
         lower(scheduler, name)
         end_inheritance(scheduler, name)
     if names is None:
@@ -271,12 +271,12 @@ async def dissolve(steward: Steward, names: Collection[str] | None, timeout_s: f
     for seat in seats:
         steward.put(seat, None)
     lift_restrictions(scheduler, gone)
-    # A worker that is away comes back as it was started.
+    # An absent worker comes back as it was started.
     here = [seat for seat in seats if not seat.away]
     if late := await steward.arrive(here, max(timeout_s, _RETURN_S)):
         raise PoolError(
             f"{names_of(late)} did not answer while {' and '.join(gone)} were dissolved; they "
-            "become what they were when they do."
+            "are restored when they answer."
         )
     return gone
 

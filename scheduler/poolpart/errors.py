@@ -1,13 +1,13 @@
-"""What can go wrong with pools and pipes; a leaf module."""
+"""Errors of pools and pipes; a leaf module."""
 
 
 class PoolError(RuntimeError):
-    """A pool cannot be divided as asked, or lacks what a job needs."""
+    """A pool cannot be divided as requested, or lacks something that a job needs."""
 
 
 class PipeClosed(Exception):  # noqa: N818 - like StopIteration: an end, not an error
-    """A pipe was closed and, for a consumer, everything in it was taken."""
+    """A pipe is closed and, for a consumer, empty."""
 
 
 class PipeFailed(RuntimeError):  # noqa: N818 - reads as what happened to the pipe
-    """Somebody declared that a pipe's work has failed; the message is the reason."""
+    """A pipe was failed with `Pipe.fail`; the message is the reason."""

@@ -1,26 +1,26 @@
-"""A fence around a partition: other tasks stay out.
+"""A fence around a partition keeps other tasks out.
 
-A Dask resource is a fence in one direction: tasks that ask for it run on workers that have
-it, and all other tasks run there as well. A raised fence closes the other direction. Only
-tasks that take a slot of the partition run on its workers; un-annotated ones, dask
-collections, tasks submitted from inside other tasks, recomputed and stolen ones, actors and
-the outputs of shuffles go to the remainder of the cluster, whoever submitted them and when.
+A Dask resource works in one direction: tasks that ask for it run on workers that have it, but
+all other tasks run there as well. A fence closes the other direction. Only tasks that take a slot
+of the partition run on its workers; un-annotated tasks, dask collections, nested tasks, recomputed
+and stolen ones, actors and the outputs of shuffles go to the rest of the cluster, whoever
+submitted them and when.
 
-What a fence does not concern: tasks that a worker was given before go on there; `Client.run`
-reaches all workers; data that is scattered, replicated or rebalanced may be put anywhere
-(give ``workers=`` to keep it out). A task with ``allow_other_workers=True`` is Dask's to place
-where none of the workers that it names, or no worker outside, has room.
+A fence does not affect tasks that a worker already has, `Client.run`, which reaches all workers,
+and data that is scattered, replicated or rebalanced (give ``workers=`` to keep it out). Dask may
+place a task with ``allow_other_workers=True`` inside if none of its workers, or no worker outside,
+has room.
 
 The fence lives on the scheduler until it is lowered, also when the client has gone. Workers
-that join late, are restarted or move between partitions need nothing else. Tasks that no worker
-outside may take wait; the scheduler logs that, and every client gets a warning.
+that join late, are restarted or move between partitions are covered. Tasks that no worker outside
+may take wait; the scheduler logs that, and every client gets a warning.
 
-A fence is a rule that is asked whenever the scheduler decides where a task goes, see
-`internals.py`; nothing is written on tasks or workers. Two ways that need no such rule were tried:
+A fence is a rule that is called whenever the scheduler places a task, see `internals.py`; tasks
+and workers are not modified. Two approaches without such a rule were tried:
 a resource that all workers outside declare, put on every task without one, and
-`worker_restrictions` that name the workers outside. Both make every task a restricted one, and
-Dask holds no restricted tasks back: of 200 root tasks all 200 were given to the open worker at
-once, whose memory then holds all their results. With the rule it is 2, and 198 wait.
+`worker_restrictions` that name the workers outside. Both restrict every task, and Dask does not
+hold back restricted tasks: the open worker got all of 200 root tasks at once, and its memory all
+their results. With the rule it gets 2, and 198 wait.
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ logger = logging.getLogger(__name__)
 
 NAME = "poolpart-fences"
 COMPLAIN_EVERY_S = 10.0
-_EXPECTED = "poolpart-partition"  # in what the scheduler knows of a worker
+_EXPECTED = "poolpart-partition"  # key in the scheduler's state of a worker
 
 
 def enclose(scheduler: Any, name: str) -> None:
-    """Raise a fence: from now on no task comes in.
+    """Raise a fence: from now on no other task comes in.
 
     Raises
     ------
     PoolError
-        If this version of Dask decides by other means.
+        If this version of Dask places tasks in another way.
     """
     fences: Fences | None = scheduler.plugins.get(NAME)
     if fences is None:
@@ -57,7 +57,7 @@ def enclose(scheduler: Any, name: str) -> None:
 
 
 def expect(scheduler: Any, worker: Any, name: str | None) -> None:
-    """Note to which partition a worker is to belong: it is behind its fence from now on."""
+    """Record the future partition of a worker, which is behind its fence from now on."""
     worker.extra.pop(_EXPECTED, None)
     if name is not None:
         worker.extra[_EXPECTED] = name
@@ -66,7 +66,7 @@ def expect(scheduler: Any, worker: Any, name: str | None) -> None:
 
 
 def lower(scheduler: Any, name: str) -> None:
-    """Lower a fence; the last one takes the rule with it."""
+    """Lower a fence; the last one removes the rule."""
     fences: Fences | None = scheduler.plugins.get(NAME)
     if fences is None or name not in fences.names:
         return
@@ -83,7 +83,7 @@ def fences_of(scheduler: Any) -> frozenset[str]:
 
 
 class Fences(SchedulerPlugin):
-    """The rule: a worker behind a fence takes tasks only that ask for the fence's resource."""
+    """The rule: a worker behind a fence takes only tasks that ask for the fence's resource."""
 
     name = NAME
 
@@ -97,7 +97,7 @@ class Fences(SchedulerPlugin):
         scheduler.add_plugin(self)
 
     def uninstall(self) -> None:
-        """Take everything back."""
+        """Remove all rules."""
         take_back_fences(self._rules, self.scheduler)
         self.scheduler.remove_plugin(NAME)
 
@@ -109,7 +109,7 @@ class Fences(SchedulerPlugin):
             self.look_at(worker)
 
     def look_at(self, worker: Any) -> None:
-        """Enclose a worker, or open it, by what it declares and where it is to belong."""
+        """Enclose or release a worker, by its resources and its future partition."""
         declares = any(worker.resources.get(name) for name in self.names)
         if declares or worker.extra.get(_EXPECTED) in self.names:
             self.closed.add(worker)
@@ -119,7 +119,7 @@ class Fences(SchedulerPlugin):
             open_to_all(self.scheduler, worker)
 
     def add_worker(self, scheduler: Any, worker: str) -> None:
-        """Enclose a worker that joins, if it is to be."""
+        """Enclose a worker that joins, if necessary."""
         self.look_at(scheduler.workers[worker])
 
     def remove_worker(self, scheduler: Any, worker: str, **kwargs: Any) -> None:
@@ -134,17 +134,17 @@ class Fences(SchedulerPlugin):
         return not asked or self.names.isdisjoint(asked)
 
     def holds_up(self, task: Any) -> bool:
-        """Whether fences are why no worker may take a task now."""
+        """Whether only fences keep all workers from taking a task."""
         could: set[Any] = could_take(self.scheduler, task) if self.stop(task) else set()
         return bool(could) and could <= self.closed
 
-    # -- never silently ----------------------------------------------------------------
+    # -- warnings ----------------------------------------------------------------------
 
     def transition(self, key: Any, start: str, finish: str, *args: Any, **kwargs: Any) -> None:
-        """Say so when a task waits because of fences."""
+        """Warn when a task waits because of fences."""
         if finish not in ("no-worker", "queued"):
             return
-        # In the queue tasks wait for their turn as well.
+        # Queued tasks may also wait just for their turn.
         if finish == "queued" and not self.scheduler.running <= self.closed:
             return
         now = time.monotonic()

@@ -15,7 +15,7 @@ from .internals import answer_to, as_bytes, ask, ping, take_from_worker, who_has
 
 T = TypeVar("T")
 
-_HANDLER = "poolpart_take_held"  # what a worker that holds bytes is asked by
+_HANDLER = "poolpart_take_held"  # name of the worker's handler for held bytes
 
 _held: dict[str, Any] = {}  # {name: bytes} of this process
 
@@ -23,15 +23,14 @@ _held: dict[str, Any] = {}  # {name: bytes} of this process
 def fetch_available(
     client: Client, keys: Collection[str], patience_s: float = 2.0, *, at: str | None = None
 ) -> dict[str, Any]:
-    """Fetch those of the results that can be had now; ask again for the others.
+    """Fetch the results that are available now; call it again for the others.
 
     `Client.gather` is the wrong tool for a long-running consumer. When a worker dies, a
     connection to it is tried for half a minute, and nothing else is delivered meanwhile; and
-    a future for a key that was released since makes the scheduler wait for ever for a task
-    that nobody submits. This asks where the keys are, takes them from there, and gives up on
-    a worker that is silent for `patience_s`: the next call asks anew, and finds them where they
-    were computed again. It takes no reference to the keys: whoever submitted them must hold
-    theirs.
+    a future for a released key makes the scheduler wait for ever for a task that nobody
+    submits. This asks where the keys are, fetches them from there, and gives up on a worker
+    that is silent for `patience_s`: the next call asks again, and finds recomputed results
+    elsewhere. It takes no reference to the keys: the submitter must hold one.
 
     Parameters
     ----------
@@ -41,7 +40,7 @@ def fetch_available(
         Keys of tasks, finished or not.
     patience_s
         Longest time to wait for an answer of the scheduler, and then for a sign of life of each
-        worker, in seconds. What a worker sends may take longer.
+        worker, in seconds. A transfer may take longer.
     at
         Address of a worker that has them: the scheduler is not asked where they are.
 
@@ -61,7 +60,7 @@ def fetch_available(
         by_worker: dict[str, list[str]] = defaultdict(list)
         for key, addresses in found.items():
             if addresses:
-                # Any one of them: if it does not answer, the next call may ask another.
+                # Any of the workers: if it does not answer, the next call may ask another.
                 by_worker[random.choice(list(addresses))].append(key)
         taken = await asyncio.gather(
             *(_take(client, *worker, patience_s) for worker in by_worker.items())
@@ -79,12 +78,12 @@ async def _take(client: Client, address: str, held: list[str], patience_s: float
 async def _unless_silent(
     client: Client, address: str, request: Coroutine[Any, Any, T], patience_s: float
 ) -> T | None:
-    """Await a request to a worker; None if the worker gives no sign of life for so long."""
+    """Await a request to a worker; None if the worker is silent for so long."""
     asking = asyncio.ensure_future(request)
     try:
-        # To give up one that answers would throw away what has come, and all would come again
-        # with the next call, as slowly: on a busy machine that went on for ever. And a worker
-        # keeps each message that nobody reads to its end (the error holds its own stream).
+        # Giving up a worker that answers would discard the data so far, and the next call would be
+        # as slow: on a busy machine that never ended. And a worker keeps each message that nobody
+        # reads to its end (the error holds its own stream).
         while not (await asyncio.wait([asking], timeout=patience_s))[0]:
             if not await _answers(client, address, patience_s):
                 return None
@@ -104,7 +103,7 @@ async def _answers(client: Client, address: str, patience_s: float) -> bool:
 def hold_for_driver(name: str, data: Any) -> str:
     """Keep bytes in this worker's memory until `take_held`; returns the worker's address.
 
-    Whoever calls it bounds how much is held: it stays for ever if nobody fetches it.
+    The caller has to limit the amount: bytes that nobody fetches stay for ever.
     """
     worker = get_worker()
     _held[name] = data
@@ -124,13 +123,13 @@ def take_held(client: Client, address: str, name: str, patience_s: float = 2.0) 
     name
         Name that the bytes are held under.
     patience_s
-        Longest time without a sign of life of that worker, in seconds. What it sends may take
+        Longest time without a sign of life of that worker, in seconds. A transfer may take
         longer.
 
     Returns
     -------
     bytes-like or None
-        None if they are gone: taken before, or the worker has died.
+        None if they were taken before, or the worker has died.
     """
 
     async def take() -> Any:
@@ -141,7 +140,7 @@ def take_held(client: Client, address: str, name: str, patience_s: float = 2.0) 
     try:
         return client.sync(take)
     except (OSError, ValueError, AttributeError, TypeError, KeyError):
-        return None  # the worker has died; one that was restarted knows no such question
+        return None  # the worker has died; a restarted one has no such handler
 
 
 def _hand_over(name: str) -> dict[str, Any]:

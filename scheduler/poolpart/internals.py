@@ -1,9 +1,9 @@
 """All that poolpart relies on in Dask beyond its documented interfaces; a leaf module.
 
-docs/pool-partitions.md has the list: what is used, why, the versions it was seen to hold with, and
-the test that says so when it does not. No other module of poolpart reaches into Dask, which a test
-checks. Everything here but `local_cluster`'s cluster and what clients ask runs in the event loop
-of a scheduler, worker or nanny.
+docs/pool-partitions.md has the list: what is used, why, the versions tried, and the test that fails
+when it changes. No other module of poolpart reaches into Dask, which a test checks. Everything here
+except `local_cluster`'s cluster and the requests of clients runs in the event loop of a scheduler,
+worker or nanny.
 """
 
 from __future__ import annotations
@@ -32,28 +32,28 @@ logger = logging.getLogger(__name__)
 
 Resources = dict[str, float]
 
-# -- a say in what the scheduler decides -------------------------------------------------
+# -- rules for decisions of the scheduler ------------------------------------------------
 #
-# Plugins of the scheduler hear of what happens; they have no say in it. An attribute of the
-# instance hides the class's method until it is deleted.
+# Plugins of the scheduler only observe. An attribute of the instance hides the class's method
+# until it is deleted.
 
 After = Callable[..., Any]  # gets the method's result and its arguments; returns the result
 Before = Callable[[dict[str, Any]], dict[str, Any]]  # gets the keyword arguments; returns them
 
 
 class _Method:
-    """What stands in for a method: the method itself, with rules before and after it.
+    """Replacement of a method: the method itself, with rules before and after it.
 
-    A rule that raises steps aside, and the log says so once: whoever shares the cluster gets what
-    Dask does without it. An error of the method itself goes to its caller untouched.
+    A rule that raises is skipped, and the log says so once: other users of the cluster get what
+    Dask does without it. An error of the method itself reaches its caller unchanged.
     """
 
     def __init__(self, original: Callable[..., Any]) -> None:
         self.original = original
-        self.__name__ = original.__name__  # the server tells its log which handler it calls
+        self.__name__ = original.__name__  # the server logs the name of the handler
         self.before: list[Before] = []
         self.after: list[After] = []
-        self._said: set[Any] = set()  # rules whose failure is in the log
+        self._said: set[Any] = set()  # rules whose failure has been logged
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         for before in self.before:
@@ -73,7 +73,7 @@ class _Method:
         if rule not in self._said:
             self._said.add(rule)
             logger.exception(
-                "A rule of poolpart for %s failed with distributed %s, and Dask decides without "
+                "A rule of poolpart for %s failed with distributed %s, so Dask decides without "
                 "it: tasks may run outside their partition, or others in it.",
                 self.__name__,
                 distributed.__version__,
@@ -81,23 +81,23 @@ class _Method:
 
 
 class Rules:
-    """Rules for methods of a running scheduler; others may have rules for the same ones."""
+    """Rules for methods of a running scheduler; several may have rules for one method."""
 
     def __init__(self) -> None:
         self._places: list[tuple[Any, str, Any]] = []
 
     def after(self, owner: Any, name: str, rule: After, *parameters: str) -> None:
-        """Have `rule(result, …)` called with a method's result and arguments; it returns a result.
+        """Call `rule(result, …)` with a method's result and arguments; it returns a result.
 
-        `parameters` are what the first ones of the method are called. PoolError if there is no
-        such method in this version of Dask; then all rules are taken back.
+        `parameters` are the names of the method's first parameters. PoolError if this version of
+        Dask has no such method; then all rules are removed.
         """
         self._check(owner, name, parameters, in_order=True)
         self._stand_in(owner, name).after.append(rule)
         self._places.append((owner, name, rule))
 
     def before(self, owner: Any, name: str, rule: Before, *parameters: str) -> None:
-        """Have `rule(keywords)` called before a method; it returns those to call it with."""
+        """Call `rule(keywords)` before a method; it returns the keywords to use."""
         self._check(owner, name, parameters, in_order=False)
         self._stand_in(owner, name).before.append(rule)
         self._places.append((owner, name, rule))
@@ -110,7 +110,7 @@ class Rules:
         self.take_back()
         raise PoolError(
             f"{type(owner).__name__} of distributed {distributed.__version__} has no "
-            f"{name}({', '.join(parameters)}), which poolpart builds on: use a version that it "
+            f"{name}({', '.join(parameters)}), which poolpart needs: use a version that it "
             "asks for."
         )
 
@@ -122,7 +122,7 @@ class Rules:
         return method
 
     def take_back(self) -> None:
-        """Have the methods without these rules."""
+        """Remove these rules."""
         while self._places:
             owner, name, rule = self._places.pop()
             method = vars(owner)[name]
@@ -135,7 +135,7 @@ class Rules:
 def rule_for_graphs(rules: Rules, scheduler: Any, bequeath: Callable[[Any], Resources]) -> None:
     """Give tasks resources that their graph leaves open, by the task that submits the graph.
 
-    `bequeath` gives them, from the state of the submitting task.
+    `bequeath` returns them, from the state of the submitting task.
     """
 
     def before(graph: dict[str, Any]) -> dict[str, Any]:
@@ -159,10 +159,10 @@ def rule_for_graphs(rules: Rules, scheduler: Any, bequeath: Callable[[Any], Reso
 
 
 def rule_for_shuffles(rules: Rules, scheduler: Any) -> None:
-    """Have shuffles and rechunks choose workers for their output that may take it.
+    """Let shuffles and rechunks choose permitted workers for their output.
 
-    Dask pins each output to any worker of the cluster, also where the tasks ask for a resource
-    that the worker lacks; they would wait for ever.
+    Dask pins each output to any worker of the cluster, even if the tasks ask for a resource that
+    the worker lacks; they would wait for ever.
     """
     if not (shuffle := scheduler.extensions.get("shuffle")):
         return
@@ -174,7 +174,7 @@ def rule_for_shuffles(rules: Rules, scheduler: Any) -> None:
         if not valid:  # any worker, or none
             return chosen
         allowed = sorted(worker.address for worker in valid)
-        start = hash(spec.id)  # of many small shuffles not all go to the first
+        start = hash(spec.id)  # so that many small shuffles do not all use the first worker
         return {
             output: worker if worker in allowed else allowed[(start + number) % len(allowed)]
             for number, (output, worker) in enumerate(chosen.items())
@@ -188,13 +188,13 @@ def rule_for_fences(
 ) -> None:
     """Keep tasks away from workers behind a fence.
 
-    `closed` are the states of those workers, read each time; `stop` says whether a task is to stay
-    out. PoolError if this version of Dask decides by other means.
+    `closed` are the states of those workers, read each time; `stop` says whether a task has to stay
+    out. PoolError if this version of Dask places tasks in another way.
     """
     if not isinstance(getattr(scheduler, "idle_task_count", None), set):
         raise PoolError(
             f"The scheduler of distributed {distributed.__version__} keeps no set of idle "
-            "workers, which fences build on: use a version that poolpart asks for."
+            "workers, which fences need: use a version that poolpart asks for."
         )
 
     def valid_workers(valid: Any, task: Any) -> Any:
@@ -204,7 +204,7 @@ def rule_for_fences(
         if valid is None:
             return remainder
         allowed = valid - closed
-        # Restrictions that are mere wishes; without this Dask would then take any worker.
+        # Loose restrictions; without this Dask would then take any worker.
         return allowed or (remainder if task.loose_restrictions else allowed)
 
     def rootish(worker: Any, task: Any) -> Any:
@@ -219,7 +219,7 @@ def rule_for_fences(
 
 
 def take_back_fences(rules: Rules, scheduler: Any) -> None:
-    """Have the scheduler decide without that rule."""
+    """Remove that rule from the scheduler."""
     rules.take_back()
     scheduler.idle_task_count = set(scheduler.idle_task_count)
 
@@ -247,7 +247,7 @@ class _OpenWorkers(set[Any]):
 
 
 def show(scheduler: Any, worker: Any, resources: Resources) -> None:
-    """Have tasks placed by these resources of a worker, and no others, from now on."""
+    """Let the scheduler place tasks by these resources of a worker, and no others."""
     for name in worker.resources.keys() | resources.keys():
         declaring = scheduler.resources.setdefault(name, {})
         declaring.pop(worker.address, None)
@@ -260,12 +260,12 @@ def show(scheduler: Any, worker: Any, resources: Resources) -> None:
 
 
 def recount(worker: Any) -> None:
-    """Count the resources in use anew.
+    """Recount the resources in use.
 
     Dask forgets them when a worker declares something while it is busy, and counts a task
     that was moved by work stealing against the worker that it was moved from.
     """
-    # Also of names that it does not declare any more: a task that was stolen may still come.
+    # Also resources that it no longer declares: a stolen task may still come.
     worker.used_resources = defaultdict(float, dict.fromkeys(worker.resources, 0))
     for task in worker.processing:
         for name, quantity in (task.resource_restrictions or {}).items():
@@ -275,7 +275,7 @@ def recount(worker: Any) -> None:
 def wake(scheduler: Any, worker: Any) -> None:
     """Send tasks that wait for such a worker to it, as the scheduler does when one joins.
 
-    It does not when a running worker gets a resource: those tasks would wait for ever.
+    The scheduler does not when a running worker gets a resource: the tasks would wait for ever.
     """
     if worker in scheduler.running:
         stimulus = f"poolpart-{worker.address}-{time.time()}"
@@ -285,7 +285,7 @@ def wake(scheduler: Any, worker: Any) -> None:
 
 
 def open_to_all(scheduler: Any, worker: Any) -> None:
-    """Send tasks to a worker that no fence keeps them from any more."""
+    """Send tasks to a worker that a fence no longer closes to them."""
     scheduler.check_idle_saturated(worker)
     if worker.status is Status.running:
         wake(scheduler, worker)
@@ -298,9 +298,9 @@ def asks_for(task: Any, names: Collection[str]) -> bool:
 
 
 def lift_restrictions(scheduler: Any, names: Collection[str]) -> None:
-    """Let results that are still held be computed again, if they are lost, on any worker.
+    """Let any worker recompute results that are still held, if they are lost.
 
-    There is none any more that could take such a task: it would wait for ever.
+    No worker has the task's resource any more: the task would wait for ever.
     """
     for task in scheduler.tasks.values():
         if asks_for(task, names):
@@ -308,13 +308,13 @@ def lift_restrictions(scheduler: Any, names: Collection[str]) -> None:
             task.resource_restrictions = kept or None
 
 
-# -- moving tasks that have not started, by the protocol of work stealing ----------------
+# -- moving waiting tasks, by the protocol of work stealing --------------------------------
 #
-# The worker is asked, and gives a task up unless the task runs; then another worker gets it.
+# A worker gives up a task on request unless the task runs; then another worker gets it.
 
 
 def held_by(scheduler: Any, worker: Any, names: Collection[str]) -> list[str]:
-    """Keys of a worker's tasks that need these resources of it, with those on their way there."""
+    """Keys of a worker's tasks that need these resources, and of those on their way there."""
     tasks = {task for task in worker.processing if asks_for(task, names)}
     if stealing := scheduler.extensions.get("stealing"):
         moves = stealing.in_flight.items()
@@ -326,12 +326,14 @@ def hand_off(scheduler: Any, worker: Any, names: Collection[str], asked: set[Any
     """Move a worker's tasks that have not started to other members of their partition.
 
     A task that no other worker may take stays, and ends here. `names` are the partitions that the
-    worker leaves; `asked` are tasks that it was asked for already, and is added to.
+    worker leaves; `asked` are tasks that were requested already, and is extended.
     """
     stealing = scheduler.extensions.get("stealing")
     if stealing is None:
         return
-    given: Counter[Any] = Counter()  # to whom; the scheduler counts a task when the worker agrees
+    given: Counter[Any] = (
+        Counter()
+    )  # the new worker; the scheduler counts a task when the old one agrees
     for task in list(worker.processing - worker.long_running):
         if task in asked or task.actor or not asks_for(task, names):
             continue
@@ -346,7 +348,7 @@ def hand_off(scheduler: Any, worker: Any, names: Collection[str], asked: set[Any
 
 
 async def call(scheduler: Any, address: str, function: Callable[..., Any], **arguments: Any) -> Any:
-    """Call a function in the event loop of a worker, which it gets as `dask_worker`.
+    """Call a function in the event loop of a worker, passed as `dask_worker`.
 
     OSError if nobody answers there, or the function raises something.
     """
@@ -354,8 +356,8 @@ async def call(scheduler: Any, address: str, function: Callable[..., Any], **arg
     if answer["status"] != "OK":
         raise OSError(answer["exception_text"])
     result = answer["result"]
-    # The scheduler leaves what passes through it as it came: as bytes, or not yet packed where
-    # the worker is in the same process.
+    # The scheduler passes the reply on as it is: as bytes, or unpacked if the worker is in the same
+    # process.
     if isinstance(result, Serialized):
         return deserialize(result.header, result.frames)
     return result.data if isinstance(result, Serialize) else result
@@ -364,12 +366,11 @@ async def call(scheduler: Any, address: str, function: Callable[..., Any], **arg
 def declare_on_worker(resources: Resources, dask_worker: Any = None) -> bool:
     """Declare these resources, and none of any other; runs on a worker.
 
-    The names of others stay: this request goes by another connection than tasks, of which one
-    that was cancelled may still be on its way, and a worker breaks down that gets a task for a
-    resource whose name it does not know.
+    Other names stay with 0: this request and tasks use different connections, so a cancelled task
+    may still be on its way, and a worker breaks down if it gets a task for an unknown resource.
 
-    Returns False if tasks still hold a resource that is to go. Such a task may be one that was
-    cancelled but runs on, of which the scheduler knows nothing any more.
+    Returns False if tasks still hold a resource that is removed. Such a task may be cancelled but
+    still running, and unknown to the scheduler.
     """
     state = dask_worker.state
     total, available = state.total_resources, state.available_resources
@@ -382,7 +383,7 @@ def declare_on_worker(resources: Resources, dask_worker: Any = None) -> bool:
 
 
 def resources_here(worker: Any) -> tuple[str, ...]:
-    """Names of the resources of which a worker has any; runs on the worker."""
+    """Names of the resources that a worker has; runs on the worker."""
     return tuple(sorted(name for name, slots in worker.state.total_resources.items() if slots))
 
 
@@ -430,7 +431,7 @@ async def put_into(scheduler: Any, name: str, item: Any) -> None:
 
 
 async def forget_queue(scheduler: Any, name: str) -> None:
-    """Forget a queue and the variable of the same name, whoever refers to them."""
+    """Delete a queue and the variable of the same name, whoever refers to them."""
     queues, variables = scheduler.extensions["queues"], scheduler.extensions["variables"]
     while name in queues.queues:
         queues.release(name=name, client="poolpart")
@@ -447,7 +448,7 @@ def serve(scheduler: Any, application: web.Application) -> None:
 
 
 def serve_no_longer(scheduler: Any, kind: type[web.Application]) -> None:
-    """Take pages of a kind away."""
+    """Remove pages of a kind."""
     pages = scheduler.http_application.applications
     pages[:] = [page for page in pages if not isinstance(page, kind)]
 
@@ -458,10 +459,9 @@ def serve_no_longer(scheduler: Any, kind: type[web.Application]) -> None:
 def when_done(future: Future, function: Callable[[Future], Any]) -> None:
     """Call `function(future)` once the task has succeeded, failed or been cancelled.
 
-    It is called in the client's event loop and must not block. `Future.add_done_callback`
-    calls in a thread that all callbacks of the process share: a user's callback that waits
-    there for this one would wait for ever. It also takes a task for done whose result was lost
-    with its worker, while that is computed again.
+    It is called in the client's event loop and must not block. `Future.add_done_callback` uses a
+    thread that all callbacks of the process share: a user's callback that waits there for this
+    one would wait for ever. It also considers a task done whose lost result is being recomputed.
     """
 
     async def wait() -> None:
@@ -475,9 +475,9 @@ def when_done(future: Future, function: Callable[[Future], Any]) -> None:
 async def identities(client: Client) -> dict[str, dict[str, Any]]:
     """Ask the scheduler for all its workers, by address.
 
-    `Client.scheduler_info(n_workers=-1)` asks too, but returns what is in an attribute by then.
-    Every two seconds the client itself puts an answer there that has no workers, so that on a
-    busy machine a cluster of hundreds looks empty now and then.
+    `Client.scheduler_info(n_workers=-1)` asks too, but returns an attribute, into which the client
+    puts an answer without workers every two seconds: on a busy machine a cluster of hundreds
+    looks empty now and then.
     """
     identity: dict[str, Any] = await client.scheduler.identity(n_workers=-1)
     workers: dict[str, dict[str, Any]] = identity["workers"]
@@ -491,7 +491,7 @@ async def who_has(client: Client, keys: Collection[str]) -> dict[str, Collection
 
 
 async def take_from_worker(client: Client, address: str, keys: Collection[str]) -> dict[str, Any]:
-    """Fetch results straight from a worker; those that it has."""
+    """Fetch results straight from a worker, as far as it has them."""
     from distributed.utils_comm import gather_from_workers
 
     data, *_ = await gather_from_workers({key: [address] for key in keys}, rpc=client.rpc)
@@ -504,17 +504,17 @@ async def ping(client: Client, address: str) -> None:
 
 
 def answer_to(worker: Any, question: str, answer: Callable[..., Any]) -> None:
-    """Have a worker answer a question of its own, unless it does."""
+    """Add a handler to a worker, unless it has it."""
     worker.handlers.setdefault(question, answer)
 
 
 async def ask(client: Client, address: str, question: str, **arguments: Any) -> Any:
-    """Ask a worker such a question."""
+    """Call such a handler of a worker."""
     return await getattr(client.rpc(address), question)(**arguments)
 
 
 def as_bytes(data: Any) -> Any:
-    """Have bytes sent as they are, without copying."""
+    """Wrap bytes so that they are sent without copying."""
     return to_serialize(memoryview(data))
 
 
@@ -522,17 +522,17 @@ def as_bytes(data: Any) -> Any:
 
 
 def forked_workers() -> AbstractContextManager[object]:
-    """Have nannies fork workers from the fork server, also when they start one again.
+    """Let nannies fork workers from the fork server, also for a restart.
 
-    Dask would have it import pandas and whatever else it knows; it has imported what is needed.
+    Dask would make it import pandas and more; it has already imported what is needed.
     """
     distributed.utils._forkserver_preload_set = True
     return dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"})
 
 
-@cache  # once is enough
+@cache  # only once
 def spare_workers_the_script() -> None:
-    """Have workers that are started from here not import the script that starts them.
+    """Keep workers from importing the script that starts them.
 
     multiprocessing imports it to find functions by name, and a script without a main guard would
     start itself again in each worker. Dask sends what a script defines by value.
@@ -550,18 +550,18 @@ def spare_workers_the_script() -> None:
 
 
 class FixedCluster(SpecCluster):
-    """A cluster that leaves dead workers to their nannies, and keeps the workers it has.
+    """A cluster that leaves dead workers to their nannies, and cannot be scaled.
 
-    A SpecCluster looks 15 seconds after a worker was lost whether one of its name is there,
-    and if not closes the nanny for good. A worker that dies twice within that time may be
-    starting just then, and would never come back.
+    15 seconds after a worker was lost, a SpecCluster closes its nanny unless a worker of its name
+    is present. A worker that dies twice within that time may be starting just then, and would
+    never come back.
     """
 
     def _update_worker_status(self, op: str, msg: Any) -> None:
         super(SpecCluster, self)._update_worker_status(op, msg)
 
     def scale(self, n: int = 0, **options: Any) -> None:
-        """Refuse: SpecCluster would drop the workers described last, whatever their kind."""
+        """Refuse: SpecCluster would drop the workers specified last, whatever their kind."""
         if self.status == Status.closing:  # it stops its workers by this
             super().scale(n, **options)
             return

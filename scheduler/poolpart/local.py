@@ -15,9 +15,9 @@ from .rules import check_name
 
 LOOPBACK = "127.0.0.1"
 
-# Dask's nannies have each worker give freed memory back to the system at once, so that every large
-# array is made of pages that have to be faulted in again. With these settings workers that make
-# arrays of megabytes ran 1.36 times as fast. They have to be set before the process starts.
+# Dask's nannies make each worker return freed memory to the system at once, so that the pages of
+# every large array have to be faulted in again. With these settings workers that make arrays of
+# megabytes ran 1.36 times as fast. They have to be set before the process starts.
 _PRE_SPAWN = {
     f"distributed.nanny.pre-spawn-environ.{name}": 256 << 20
     for name in ("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_")
@@ -44,9 +44,9 @@ def local_cluster(
     dashboard_port
         Port of Dask's dashboard, 0 for any free one, None for none.
     security
-        True encrypts what the processes say to each other, with a certificate that is made
-        for this cluster and kept in memory; nobody without it can connect. A
-        `distributed.Security` brings certificates of one's own. The dashboard stays http.
+        True encrypts the traffic between the processes, with a certificate that is made for
+        this cluster and kept in memory; nobody can connect without it. A
+        `distributed.Security` has your own certificates. The dashboard stays http.
 
     Returns
     -------
@@ -96,13 +96,13 @@ def local_cluster(
             )
     except RuntimeError as error:
         raise PoolError(
-            f"The workers did not start ({error.__cause__ or error}): look what they wrote above "
+            f"The workers did not start ({error.__cause__ or error}): see their output above "
             "this, and whether memory is short."
         ) from error
 
 
 def _worker_spec(partition: str, slots: int, security: Security) -> dict[str, Any]:
-    """Describe a worker of a partition as SpecCluster wants it."""
+    """Specification of a worker of a partition for SpecCluster."""
     options = {
         "nthreads": slots,
         "resources": {partition: slots},
@@ -110,7 +110,7 @@ def _worker_spec(partition: str, slots: int, security: Security) -> dict[str, An
         "security": security,
         "dashboard": False,
         "memory_limit": "auto",
-        # One thread for each worker's numerical libraries: the processes share the cores.
+        # One thread for numerical libraries in each worker: the processes share the cores.
         "env": dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"),
         "silence_logs": logging.ERROR,
     }

@@ -1,7 +1,7 @@
-"""Results of one function for many items, several items in a task, with bounded work under way.
+"""Results of one function for many items, several items in a task, with a bounded number of tasks.
 
 A map of a map is one map of two stages: each task of the first is followed by a task of the
-second, which takes what the first has left on its worker. Data goes from worker to worker.
+second, which fetches the result of the first from its worker.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ logger = logging.getLogger(__name__)
 
 NOTE = "poolpart: "  # how the notes that name a failed item start
 MOST_ITEMS = 1024
-GROWTH = 4  # from one size that was tried to the next
+GROWTH = 4  # most growth of the chunk size at once
 MOST_BYTES = 2**20
-LOOK_S = 5.0  # between looks at how many slots there are
-CHUNK_S = 0.1  # a task is to take so long …
-CHUNK_S_PER_SLOT = 0.005  # … or, with many slots, so long that the scheduler keeps up
-PATIENCE = 4  # a task ends after so many times that; the rest of its items are sent again
+LOOK_S = 5.0  # between looks at the number of slots
+CHUNK_S = 0.1  # target time of a task …
+CHUNK_S_PER_SLOT = 0.005  # … or longer with many slots, so that the scheduler keeps up
+PATIENCE = 4  # a task ends after so many times the target; its other items are sent again
 
 Call = tuple[Any, ...]  # the arguments of one call
-Row = tuple[Call, ...]  # of one item, by stage: what it is called with beside the result before
+Row = tuple[Call, ...]  # of one item, by stage: arguments besides the previous result
 
 
 @dataclass(frozen=True)
 class Chunk:
-    """Items that travel as one task: index of the first, and calls of each, by stage."""
+    """Items of one task: index of the first, and the calls of each, by stage."""
 
     first: int
     rows: Sequence[Row]
@@ -52,12 +52,12 @@ class Chunk:
 
 @dataclass(frozen=True)
 class Answer:
-    """What came of a chunk.
+    """Result of a chunk.
 
     Parameters
     ----------
     results
-        Of its first items, at least one; of all, unless one failed or the time was up.
+        Results of its first items, at least one; of all, unless one failed or the time was up.
     seconds
         Time from start to end.
     nbytes
@@ -79,10 +79,10 @@ def run_chunk(
 ) -> Answer:
     """Call a function for the items of a chunk, one after the other; runs on a worker.
 
-    It stops early when `patience_s` seconds have passed, so that items which take longer than
-    those before them do not wait for each other on one worker. An error of the first item is
-    the task's; at a later one it stops, and whoever sends the rest again learns of it. What the
-    stage before has made of the items is argument number `at`.
+    It stops early after `patience_s` seconds, so that items which take longer than earlier ones do
+    not wait for each other on one worker. An error of the first item is the task's; at a later
+    one it stops, and the error occurs when the rest is sent again. Argument number `at` is the
+    result of the stage before.
     """
     start = time.perf_counter()
     results: list[Any] = []
@@ -112,15 +112,15 @@ def _call(function: Callable[..., Any], call: Call) -> Any:
     try:
         return function(*call)
     except StopIteration as error:
-        # Out of an iterator's `__next__` it would end the map as if there were no more items.
+        # Raised from an iterator's `__next__`, it would end the map silently.
         raise RuntimeError(f"{function} raised StopIteration") from error
 
 
 class ChunkSize:
-    """How many items make a task of about `target_s` seconds, learned from those that ran.
+    """Number of items for a task of about `target_s` seconds, learned from past chunks.
 
-    It starts with one, takes at most four times what was tried, and keeps a task's items and
-    results to about a mebibyte.
+    It starts with one, grows at most fourfold at once, and limits a task's items and results to
+    about a mebibyte.
 
     Examples
     --------
@@ -140,14 +140,14 @@ class ChunkSize:
         self._item_s = self._item_bytes = 0.0  # moving averages
 
     def learn(self, items: int, seconds: float, nbytes: int) -> None:
-        """Enter a chunk that ran."""
+        """Learn from a chunk that ran."""
         weight = 0.3 if self._tried else 1.0
         self._item_s += weight * (seconds / items - self._item_s)
         self._item_bytes += weight * (nbytes / items - self._item_bytes)
         self._tried = max(self._tried, items)
 
     def items(self, target_s: float) -> int:
-        """Items to put into the next chunk."""
+        """Return the number of items for the next chunk."""
         by_time = target_s / max(self._item_s, 1e-9)
         by_bytes = MOST_BYTES / max(self._item_bytes, 1.0)
         return int(max(1, min(GROWTH * self._tried, by_time, by_bytes, MOST_ITEMS)))
@@ -155,7 +155,7 @@ class ChunkSize:
 
 @dataclass(frozen=True)
 class Stage:
-    """A function that is mapped, where and how; see `Partition.map` for the options."""
+    """One stage of a map: function, partition and options; see `Partition.map`."""
 
     client: Client
     partition: str
@@ -182,7 +182,7 @@ class Stage:
 
     def send(self, patience_s: float, *columns: Sequence[Any]) -> list[Future]:
         """Submit a task for each row of columns."""
-        # One message costs the scheduler less than one for each.
+        # One message is cheaper for the scheduler than one for each task.
         futures: list[Future] = self.client.map(
             partial(run_chunk, self.function, patience_s, self.at),
             *columns,
@@ -196,27 +196,27 @@ class Stage:
 
 
 class Results(Iterator[Any]):
-    """Results of a function for many items, as `Partition.map` gives them.
+    """Results of a function for many items, an iterator from `Partition.map`.
 
-    The first tasks start at once; further items are taken, sent and fetched while results
-    are asked for. Close it, or let go of it, to stop early.
+    The first tasks start at once; further items are taken, sent and fetched while results are
+    read. Close or delete it to stop early.
     """
 
     def __init__(self, stage: Stage, iterables: Sequence[Iterable[Any]]) -> None:
         self._closed = False
-        self._begun = False  # somebody has asked for a result
+        self._begun = False  # a result was requested
         self._taken = 0  # items taken from the source
         self._again: list[tuple[int, Sequence[Row]]] = []  # heap of items to be sent once more
         self._size = ChunkSize()
         self._running: dict[Future, Chunk] = {}
         self._done: queue.SimpleQueue[Future] = queue.SimpleQueue()
-        # {index of its first item: a chunk that came back and was not delivered yet}
+        # {index of its first item: a chunk that was fetched and not delivered yet}
         self._back: dict[int, tuple[Chunk, Answer | Future]] = {}
-        self._next_item = 0  # the one to be delivered next, if in order
+        self._next_item = 0  # index of the next one to deliver, if in order
         self._ready: deque[Any] = deque()  # results to be delivered
         self._failed: tuple[Chunk, Future] | None = None  # to be raised after these
         maps = [n for n, i in enumerate(iterables) if isinstance(i, Results) and not i._begun]
-        # Of two, the second is an iterable like others: their tasks are not of the same items.
+        # A second map is an ordinary iterable: its tasks have other items.
         before = iterables[maps[0]] if maps else None
         if isinstance(before, Results):
             others = [i for i in iterables if i is not before]
@@ -228,7 +228,7 @@ class Results(Iterator[Any]):
         self._submit()
 
     def _follow(self, before: Results, stage: Stage, iterables: Sequence[Iterable[Any]]) -> None:
-        """Take over a map from which nothing was taken, as the stages before the last."""
+        """Take over an unread map, as the stages before the last."""
         calls: Iterator[Call] = zip(*iterables, strict=False) if iterables else repeat(())
         self._stages = (*before._stages, stage)
         self._source = ((*row, call) for call, row in zip(calls, before._source, strict=False))
@@ -274,11 +274,11 @@ class Results(Iterator[Any]):
         )
 
     def close(self) -> None:
-        """Stop: tasks that have not started never do, results that were not taken are dropped."""
+        """Stop: waiting tasks are cancelled, results that were not read are dropped."""
         self._closed, self._failed = True, None
         for held in (self._ready, self._back, self._again):
             held.clear()
-        # Each is released by itself: the callback that waits for it holds a reference as well.
+        # Release each one: the callback that waits for it holds a reference as well.
         for future in self._running:
             future.release()
         self._running.clear()
@@ -290,7 +290,7 @@ class Results(Iterator[Any]):
     # -- steps -------------------------------------------------------------------------
 
     def _step(self) -> None:
-        """Wait for tasks, take back what is done, send more."""
+        """Wait for tasks, fetch their results, send more."""
         if not self._running:
             self._submit()
         if self._running:
@@ -301,7 +301,7 @@ class Results(Iterator[Any]):
             self.close()
 
     def _look(self) -> None:
-        """See how many slots there are: partitions grow, shrink, and lose workers."""
+        """Read the number of slots: partitions grow, shrink, and lose workers."""
         running = [stage.running() for stage in self._stages]
         self._slots, self._window = max(running), 0
         for stage, number in zip(self._stages, running, strict=True):
@@ -313,18 +313,18 @@ class Results(Iterator[Any]):
     def _submit(self) -> None:
         """Send chunks, several in one message, up to the window."""
         free = self._window - len(self._running)
-        # One at a time would be many messages; the rest keeps the slots busy meanwhile.
+        # Avoid a message for each chunk; the tasks under way keep the slots busy.
         if self._running and free < self._window // 4:
             return
         chunks: list[Chunk] = []
-        # What came back out of turn takes room as well, but not from the items it waits for.
+        # Chunks that came out of order take room as well, but not from earlier items.
         fresh = free - len(self._back)
         while len(chunks) < free and (chunk := self._next_chunk(fresh=len(chunks) < fresh)):
             chunks.append(chunk)
         self._run(chunks)
 
     def _run(self, chunks: Sequence[Chunk], done: list[Future] | None = None) -> None:
-        """Send chunks through all stages, or through the last where those before are `done`."""
+        """Send chunks through all stages, or through the last if the others are `done`."""
         if not chunks:
             return
         firsts = [chunk.first for chunk in chunks]
@@ -333,14 +333,14 @@ class Results(Iterator[Any]):
         for number, stage in stages if done is None else stages[-1:]:
             patience_s = math.inf if stage.chunk else PATIENCE * self._target_s()
             calls = [[row[number] for row in chunk.rows] for chunk in chunks]
-            # Nobody holds what a stage has made but the task that takes it.
+            # Only the next task holds the result of a stage.
             futures = stage.send(patience_s, firsts, calls, *([futures] if futures else []))
         for future, chunk in zip(futures or [], chunks, strict=True):
             self._running[future] = chunk
             when_done(future, self._done.put)
 
     def _next_chunk(self, fresh: bool) -> Chunk | None:
-        """Take items: first those to be sent once more, then, if `fresh`, from the source."""
+        """Take items: first those to send again, then, if `fresh`, from the source."""
         own = (stage.chunk for stage in self._stages[::-1] if stage.chunk)
         size = next(own, 0) or self._size.items(self._target_s())
         if self._again:
@@ -374,12 +374,12 @@ class Results(Iterator[Any]):
         return done
 
     def _take_back(self, done: list[Future]) -> None:
-        """Fetch the answers of finished tasks, all in one go."""
+        """Fetch the results of finished tasks, all at once."""
         finished = []
         for future in done:
             if future.status == "finished":
                 finished.append(future)
-            elif future.status in ("pending", "lost"):  # so was its worker: it runs once more
+            elif future.status in ("pending", "lost"):  # lost with its worker: run it again
                 when_done(future, self._done.put)
             else:
                 chunk = self._running.pop(future)
@@ -391,7 +391,7 @@ class Results(Iterator[Any]):
             self._size.learn(max(1, len(answer.results)), answer.seconds, answer.nbytes)
 
     def _deliver(self) -> None:
-        """Make results ready whose turn it is."""
+        """Queue the results to be delivered next."""
         while self._back and self._failed is None:
             first = self._next_item if self._stages[-1].ordered else next(iter(self._back))
             if first not in self._back:
@@ -407,12 +407,12 @@ class Results(Iterator[Any]):
                 heapq.heappush(self._again, (first + count, chunk.rows[count:]))
 
     def _raise(self, chunk: Chunk, future: Future) -> NoReturn:
-        """Stop, and raise what a task raised; a note says at which item."""
+        """Stop, and raise a task's error; a note names the item."""
         self.close()
         try:
             future.result()
         except Exception as error:
-            # Without a note of its own it comes from Dask, not from an item.
+            # Without a note it comes from Dask, not from an item.
             if not any(note.startswith(NOTE) for note in getattr(error, "__notes__", ())):
                 last = chunk.first + len(chunk.rows) - 1
                 error.add_note(f"{NOTE}the task was for items {chunk.first} to {last} of a map")

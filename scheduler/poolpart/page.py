@@ -1,6 +1,6 @@
 """A page in Dask's dashboard: partitions, stages, workers and pipes, as tables.
 
-It is made on the scheduler and loads itself anew every two seconds: there is no script in it.
+The scheduler makes it, and it reloads every two seconds, without scripts.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _COUNTS = ("waiting", "queued", "running", "done", "failed")
 
 
 def page_of(scheduler: Any) -> str:
-    """HTML of what the page shows now."""
+    """HTML of the current page."""
     statistics = statistics_of(scheduler)
     workers = list(scheduler.workers.values())
     names = {name for worker in workers for name, slots in worker.resources.items() if slots}
@@ -81,7 +81,7 @@ def page_of(scheduler: Any) -> str:
 
 
 def _table(title: str, head: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
-    """Make a table, or nothing of no rows. Names come from users: all text is escaped."""
+    """Make a table, or nothing without rows. Names come from users: all text is escaped."""
 
     def line(tag: str, cells: Iterable[object]) -> str:
         texts = (escape(str(cell)[:_LONGEST]) for cell in cells)
@@ -120,7 +120,7 @@ def _pipes(scheduler: Any) -> Iterator[list[object]]:
 
 
 class _Handler(web.RequestHandler):
-    """Sends the page; the browser is told to load and run nothing else."""
+    """Sends the page; the browser may load and run nothing else."""
 
     def initialize(self, scheduler: Any) -> None:
         self.scheduler = scheduler
@@ -132,20 +132,20 @@ class _Handler(web.RequestHandler):
 
 
 class PageApplication(web.Application):
-    """The page, as the scheduler's HTTP server takes it and gives it back."""
+    """Adds the page to the scheduler's HTTP server, and removes it."""
 
 
 class PageOwners(SchedulerPlugin):
-    """Takes the page away when the last client that wanted it has gone."""
+    """Removes the page when the last client that wanted it has gone."""
 
     name = NAME
 
     def __init__(self, scheduler: Any) -> None:
-        self.owners: set[str | None] = set()  # None is whoever leaves it to the scheduler
+        self.owners: set[str | None] = set()  # None stands for `stay`
         self.began_to_count = STATISTICS not in scheduler.plugins
 
     def remove_client(self, scheduler: Any, client: str) -> None:
-        """Note that a client has gone, or wants the page no longer."""
+        """Record that a client has gone, or no longer wants the page."""
         self.owners.discard(client)
         if not self.owners:
             close_page(scheduler)
@@ -170,12 +170,12 @@ def partitions_page(client: Client, stay: bool = True) -> str:
 
 
 def leave_page(client: Client) -> None:
-    """Have the page go, unless others want it, as when the client goes."""
+    """Remove the page, unless others want it, as when the client leaves."""
     on_scheduler(client, _leave, owner=client.id)
 
 
 async def _open(owner: str, stay: bool, dask_scheduler: Any = None) -> None:
-    if not stay and owner not in dask_scheduler.clients:  # killed, and already seen off
+    if not stay and owner not in dask_scheduler.clients:  # killed, and already removed
         return
     if NAME not in dask_scheduler.plugins:
         dask_scheduler.add_plugin(PageOwners(dask_scheduler))
@@ -192,7 +192,7 @@ async def _leave(owner: str, dask_scheduler: Any = None) -> None:
 
 
 def close_page(scheduler: Any) -> None:
-    """Serve the page no longer."""
+    """Stop serving the page."""
     if NAME in scheduler.plugins:
         serve_no_longer(scheduler, PageApplication)
         scheduler.remove_plugin(NAME)

@@ -1,4 +1,4 @@
-"""A partition: the workers that declare one Dask resource, and work for them alone."""
+"""A partition: the workers that declare one Dask resource, and the tasks for them."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from .stats import PartitionStats, partition_stats
 from .task_context import own_client
 from .workers import WorkerInfo, all_workers
 
-# What `with partition:` has to undo, innermost last; of this thread or coroutine.
+# Exits of the `with partition:` blocks of this thread or coroutine, innermost last.
 _entered: ContextVar[tuple[ExitStack, ...]] = ContextVar("_entered", default=())
 
 
 class Partition:
     """The workers of a cluster that declare the resource `name`.
 
-    Whatever it submits takes one slot of that resource, so that it runs on these workers and
-    on no others. Membership is what the workers declare now: a worker that its nanny
-    restarted, or one that joined with the resource, belongs.
+    Every task that it submits takes a slot of that resource, so that it runs on these workers
+    only. The members are the workers that declare the resource now, including restarted
+    workers and ones that joined with it.
 
     Parameters
     ----------
@@ -36,11 +36,11 @@ class Partition:
     client
         Client of the cluster. By default, in a task, that of its worker.
     note
-        Something a user should know of it, such as that it had to do without GPUs.
+        A remark for users, such as that there were no GPUs.
 
     Notes
     -----
-    It can be given to a task, which submits with the client of its worker then.
+    It can be an argument of a task, which then submits with the client of its worker.
     """
 
     def __init__(self, name: str, client: Client | None = None, note: str = "") -> None:
@@ -53,7 +53,7 @@ class Partition:
     @property
     def client(self) -> Client:
         """The client that is used."""
-        # Not where it is unpickled: that happens in the event loops of scheduler and worker.
+        # Not when unpickled: that happens in the event loops of scheduler and worker.
         if self._client is None:
             self._client = own_client()
         return self._client
@@ -62,7 +62,7 @@ class Partition:
     def workers(self) -> tuple[WorkerInfo, ...]:
         """The members now, by name."""
         members = (w for w in all_workers(self.client) if w.resources.get(self.name))
-        return tuple(sorted(members, key=lambda w: (len(w.name), w.name)))  # 10 behind 9
+        return tuple(sorted(members, key=lambda w: (len(w.name), w.name)))  # sorts 10 behind 9
 
     @property
     def slots(self) -> int:
@@ -76,7 +76,7 @@ class Partition:
         return f"<Partition {self.name!r}{'; ' + self.note if self.note else ''}>"
 
     def stats(self) -> PartitionStats:
-        """How busy it is and what it has done, whoever submitted the tasks."""
+        """Its load and its finished tasks, whoever submitted them."""
         return partition_stats(self.client, self.name)
 
     # -- tasks -------------------------------------------------------------------------
@@ -98,19 +98,19 @@ class Partition:
         Parameters
         ----------
         function, args, kwargs
-            What to call. Give arguments that are named like an option of `Client.submit`, such
-            as `key` or `workers`, by position, or bind them with `functools.partial`.
+            The call. Give arguments that have the name of an option of `Client.submit`, such as
+            `key` or `workers`, by position, or bind them with `functools.partial`.
         key
             The task's key; by default a new one, so that equal calls run each by itself.
         priority
-            Of tasks that wait for the same worker, those of a higher one run first.
+            Of tasks that wait for the same worker, those with higher priority run first.
         retries
             How often the task runs again if it fails.
         slots
-            Slots of one worker that it takes while it runs; it waits for ever where no member
-            has so many.
+            Slots of one worker that it takes while it runs; it waits for ever if no member has
+            so many.
         worker
-            Address of the one member to run on; if it leaves, the task waits for ever.
+            Address of the member to run on; if it leaves, the task waits for ever.
 
         Returns
         -------
@@ -150,42 +150,40 @@ class Partition:
         retries: int = 0,
         slots: int = 1,
     ) -> Results:
-        """Call a function for each item; an iterator gives the results.
+        """Call a function for each item; returns an iterator of the results.
 
-        For any number of items, also without end: they are taken, and results are fetched,
-        while results are asked for, and a bounded number is under way. Small items travel
-        several in a task; how many, is learned from how long they take and how large they
-        are.
+        The number of items may be infinite: items are taken, and results fetched, while
+        results are read, and a bounded number is under way. Small items share a task; their
+        number is learned from their time and size.
 
-        A map that is given the results of another as items takes them on the workers, also
-        of another partition: nothing of them passes driver and scheduler. That holds for one
-        map among the iterables, of which nothing was taken before.
+        A map over the results of another map fetches them between workers, also of different
+        partitions, past driver and scheduler. That holds for one unread map among the
+        iterables.
 
         Parameters
         ----------
         function, iterables
-            Called with one item of each, until the shortest has no more.
+            The function gets one item of each iterable, until the shortest ends.
         ordered
-            Results in the order of the items, or else as they come.
+            Results in the order of the items, or as they complete.
         window
-            Tasks under way at most; by default twice the slots, of which there may be more
-            or fewer later.
+            Tasks under way at most; by default twice the slots, which may change during the map.
         chunk
-            Items in a task; by default as many as take a tenth of a second, or longer where
-            there are many slots. Give 1 where items differ much, or must not wait for others.
+            Items in a task; by default as many as take a tenth of a second, or longer if there
+            are many slots. Give 1 if items differ much, or must not wait for others.
         priority
             Higher runs first.
         retries
-            How often an item that fails is tried again, at least.
+            How often a failed item is tried again, at least.
         slots
             Slots of one worker that each task takes.
 
         Returns
         -------
         Results
-            An iterator. It raises what `function` raises, after the results before; a note
-            names the item. To go on after such an item, have `function` catch and return the
-            error. To stop early, close it or let go of it: tasks that have not started never do.
+            An iterator. It raises an error of `function` after the results before it; a note
+            names the item. To continue after errors, let `function` catch and return them. To
+            stop early, close or delete the iterator: waiting tasks are cancelled.
 
         Raises
         ------
@@ -210,7 +208,7 @@ class Partition:
         slots
             Slots that each task takes.
         options
-            Others of `Client.compute`, such as ``sync=True`` for the result in place of a future.
+            Others of `Client.compute`, such as ``sync=True`` for the result instead of a future.
 
         Returns
         -------
@@ -231,7 +229,7 @@ class Partition:
         Returns
         -------
         collection or list of collections
-            With the same meaning, backed by futures.
+            The same collections, backed by futures.
         """
         keep_shuffles_in(self.client)
         return self.client.persist(collections, resources=self._taking(slots), **options)
@@ -243,7 +241,7 @@ class Partition:
     def scatter(self, data: Any, **options: Any) -> Any:
         """Put data into the memory of these workers; returns futures.
 
-        Scattered data cannot be computed again when its worker dies.
+        Scattered data cannot be recomputed when its worker dies.
 
         Parameters
         ----------
@@ -263,9 +261,9 @@ class Partition:
         return self.client.scatter(data, workers=addresses, **options)
 
     def __enter__(self) -> Self:
-        """Have what is computed or submitted in the block run on these workers.
+        """Run everything that is computed or submitted in the block on these workers.
 
-        That is `compute` and `persist` of Dask collections, `dask.compute`, and `Client.submit`
+        This covers `compute` and `persist` of Dask collections, `dask.compute`, and `Client.submit`
         and `Client.map` of this partition's client, in this thread. Each task takes a slot.
 
         Examples
@@ -285,32 +283,31 @@ class Partition:
         _entered.set(tuple(outer))
         stack.close()
 
-    # -- workers that come and go ------------------------------------------------------
+    # -- moving workers ----------------------------------------------------------------
 
     def grow(
         self, workers: int = 1, *, source: str | None = None, timeout_s: float = 60.0
     ) -> list[str]:
         """Move workers into this partition while everything runs; returns their names.
 
-        What a worker has begun for the partition that it leaves ends there first, and what it
-        has not begun goes to others. Where the partition was made of a number of workers, that
-        number grows too.
+        Tasks of the former partition that a worker runs end there first, and its waiting tasks
+        go to other members. If this partition's rule is a number of workers, that grows too.
 
         Parameters
         ----------
         workers
             How many.
         source
-            Name of the partition that they leave; by default they are taken of workers that
-            belong to none and of the partition that has the rest.
+            Name of the partition that they leave; by default they come from workers without a
+            partition and from the partition that has the rest.
         timeout_s
-            How long to wait for them to come free.
+            How long to wait until they are free.
 
         Raises
         ------
         PoolError
-            If there are too few, counting those that `source` needs; or if tasks do not end
-            in time, in which case their workers stay where they are.
+            If there are too few, beyond the minimum of `source`; or if tasks do not end in time,
+            in which case their workers stay.
 
         Examples
         --------
@@ -324,8 +321,8 @@ class Partition:
     def shrink(self, workers: int = 1, *, timeout_s: float = 60.0) -> list[str]:
         """Move workers out of this partition while everything runs; returns their names.
 
-        They go to the partition that has the rest, if there is one, or to none; those with
-        the least to do go first, in the way that `grow` describes.
+        They go to the partition that has the rest, or to none, as described for `grow`. Those
+        with the least load go first.
 
         Raises
         ------

@@ -1,18 +1,16 @@
 """Bounded, closable pipes between the tasks of a Dask cluster.
 
 A pipe is a `distributed.Queue` of items and a `distributed.Variable` with its state, both under
-the pipe's name. Why not a bare Queue: a consumer that dies while it blocks in `Queue.get` leaves
-its request on the scheduler, and the next item goes to nobody; a queue cannot be closed, so its
-consumers cannot end; and a blocking `put` or `get` does not notice that the other side has failed.
+the pipe's name. A Queue alone has three problems: a consumer that dies within `Queue.get` leaves
+its request on the scheduler, and the next item is lost; a queue cannot be closed, so its consumers
+cannot end; and a blocking `put` or `get` does not notice that the other side has failed.
 
-So the two are used only from functions that run on the scheduler, each of which is one request:
-it waits there, looks at items and state together, and puts or takes something only if the client
-that asked is still there. Polling over the network would cost a request each time, and find news
-late.
+So both are used only by functions that run on the scheduler, one request each: it waits there,
+looks at items and state together, and puts or takes an item only if its client is still there.
+Polling over the network would cost a request each time, and be late.
 
-Pipes end with the client that made them, also where it was killed. Otherwise tasks at both ends
-would wait for ever, and keep their slots from whoever comes after; Dask does not stop the thread
-of a task whose client has left.
+Pipes end with the client that made them, also if it was killed. Otherwise tasks at both ends would
+wait for ever, and keep their slots; Dask does not stop the thread of a task whose client has left.
 """
 
 from __future__ import annotations
@@ -43,14 +41,17 @@ from .task_context import own_client
 from .workers import on_scheduler
 
 _WAIT_S = 1.0  # in one request; a pipe that is closed or fails ends it
-_SOON_S = 0.02  # something that comes will come soon, mostly
-_LOOK_EVERY_S = (0.002, 0.005)  # on the scheduler, first and then; some microseconds each time
+_SOON_S = 0.02  # most items come soon
+_LOOK_EVERY_S = (
+    0.002,
+    0.005,
+)  # between looks on the scheduler, first and later; some microseconds each
 _OWNERS = "poolpart-pipe-owners"
 
 
 @dataclass(frozen=True)
 class PipeState:
-    """What a pipe's Variable holds, as a dictionary."""
+    """Content of a pipe's Variable, as a dictionary."""
 
     owner: str  # id of the client that made the pipe
     closed: bool = False
@@ -61,21 +62,21 @@ class PipeState:
 class Pipe:
     """A bounded first-in-first-out connection that can be closed and can fail.
 
-    Whoever makes the pipe calls `create`, hands it (it is small when pickled) to the tasks on
-    both ends, and calls `delete` in the end; it is deleted as well when the client that made it
-    closes or dies. Any number of producers and consumers may share it, in any process and
-    thread; threads may share the object itself.
+    The maker of the pipe calls `create`, passes it to the tasks on both ends (it is small when
+    pickled), and finally calls `delete`; it is also deleted when the maker's client closes or dies.
+    Any number of producers and consumers may share it, in any process and thread; threads may
+    share the object itself.
 
-    Once `fail` was called, every `put` raises `PipeFailed`, and every `get` when what the consumer
-    has taken is used up; within a second also those that wait. A pipe that does not exist, or was
-    deleted, raises it as well. When the scheduler has died they raise OSError, after Dask's
+    After `fail`, every `put` raises `PipeFailed`, and every `get` once the consumer has used up its
+    items; waiting calls do so within a second. A pipe that does not exist, or was deleted, raises
+    it as well. If the scheduler has died they raise OSError, after Dask's
     ``distributed.comm.timeouts.connect``.
 
     A consumer takes all that is queued, some `capacity` items, in one request; `get` and
     iteration hand them out one by one. At most ``capacity * (1 + consumers)`` items are
-    under way. Where items are slow and consumers several, choose a small capacity, so that
-    none sits on work while another idles. Items taken by a consumer that dies are lost with
-    it: whoever needs each item exactly once notes what has arrived, and puts what is missing again.
+    under way. With slow items and several consumers, choose a small capacity, so that no consumer
+    holds items while another idles. Items taken by a consumer that dies are lost with it: for
+    exactly-once delivery, record what has arrived, and put missing items again.
 
     Parameters
     ----------
@@ -114,12 +115,12 @@ class Pipe:
     @property
     def client(self) -> Client:
         """The client that is used."""
-        # Kept: a worker's thread that has seceded would find another one each time.
+        # Kept: a seceded thread of a worker would get another one each time.
         if self._client is None:
             self._client = own_client()
         return self._client
 
-    # -- coming and going --------------------------------------------------------------
+    # -- creating and deleting ---------------------------------------------------------
 
     def create(self) -> Pipe:
         """Open the pipe on the scheduler; returns itself.
@@ -138,7 +139,7 @@ class Pipe:
         return self
 
     def delete(self) -> None:
-        """Forget the pipe on the scheduler, with what is still in it; no error if it is gone."""
+        """Delete the pipe on the scheduler, with its items; no error if it is gone."""
         forget_pipes(self.client, [self.name])
 
     def __enter__(self) -> Pipe:
@@ -148,7 +149,7 @@ class Pipe:
         self.delete()
 
     def _ask(self, question: Callable[..., Any], **arguments: Any) -> tuple[PipeState, Any]:
-        """Ask the scheduler; returns the state of the pipe there, and the answer."""
+        """Ask the scheduler; returns the state of the pipe, and the answer."""
         asker = self.client.id
         state, answer = on_scheduler(
             self.client, question, name=self.name, asker=asker, **arguments
@@ -166,7 +167,7 @@ class Pipe:
         return int(self._ask(_look)[1])
 
     def close(self) -> None:
-        """No more items will be put; consumers take what is left, then end."""
+        """End the pipe for producers; consumers take the remaining items, then end."""
         self._ask(_change, closed=True)
 
     def fail(self, reason: str) -> None:
@@ -180,14 +181,14 @@ class Pipe:
 
     @property
     def advice(self) -> int:
-        """How much the consuming side would like in one item, as of the last `put`.
+        """Amount that the consumer wants in one item, as of the last `put`.
 
-        A producer is free to ignore it.
+        A producer may ignore it.
         """
         return (self._state or self._ask(_look)[0]).advice
 
     def advise(self, amount: int) -> None:
-        """Tell producers how much to put into one item; for one adviser."""
+        """Set the amount that producers should put into one item; for one caller."""
         if amount != self.advice:
             self._ask(_change, advice=amount)
 
@@ -202,7 +203,7 @@ class Pipe:
         timeout_s
             Longest wait in seconds.
         unbounded
-            Put it whatever is queued: for producers that bound what is under way themselves.
+            Ignore the capacity: for producers that limit their items themselves.
 
         Raises
         ------
@@ -230,7 +231,7 @@ class Pipe:
     # -- consumers ---------------------------------------------------------------------
 
     def poll(self) -> list[Any]:
-        """Everything that is queued now, possibly nothing; never waits, and raises `PipeFailed`."""
+        """Take all queued items, possibly none; never waits, and raises `PipeFailed`."""
         return self._take(0.0)[1]
 
     def _take(self, seconds: float) -> tuple[PipeState, list[Any]]:
@@ -244,7 +245,7 @@ class Pipe:
         return state, [*taken, *items]
 
     def get_all(self, timeout_s: float | None = None) -> list[Any]:
-        """Everything that is queued, as soon as there is anything.
+        """Take all queued items, as soon as there are any.
 
         Parameters
         ----------
@@ -271,9 +272,9 @@ class Pipe:
                 raise TimeoutError(f"Nothing came through pipe {self.name!r} for {timeout_s} s.")
 
     def get(self, timeout_s: float | None = None) -> Any:
-        """Take the next item; waits for one, and raises as `get_all` does."""
+        """Take the next item; waits for one, and raises like `get_all`."""
         try:
-            # One operation, not a look and then a step: threads may share this object.
+            # One atomic operation: threads may share this object.
             return self._taken.popleft()
         except IndexError:
             item, *more = self.get_all(timeout_s)
@@ -281,7 +282,7 @@ class Pipe:
             return item
 
     def __iter__(self) -> Iterator[Any]:
-        """Items until the pipe is closed and empty."""
+        """Yield items until the pipe is closed and empty."""
         while True:
             try:
                 item = self.get()
@@ -299,14 +300,14 @@ def _one_wait(deadline: float) -> float:
 
 
 def forget_pipes(client: Client, names: Sequence[str]) -> None:
-    """Remove these pipes from the scheduler, with what is in them; those unknown are skipped."""
+    """Delete these pipes on the scheduler, with their items; unknown ones are skipped."""
     on_scheduler(client, _forget, names=list(names))
 
 
 def take_news(
     client: Client, seconds: float, pipes: Collection[str], keys: Collection[str] = ()
 ) -> dict[str, list[Any]]:
-    """Wait until there is something in a pipe, or a task has ended, and take what is in the pipes.
+    """Wait until a pipe has an item or a task has ended, and take the items of the pipes.
 
     Parameters
     ----------
@@ -348,11 +349,11 @@ def pipes_of(scheduler: Any) -> dict[str, State]:
 
 async def _open(name: str, state: State, dask_scheduler: Any = None) -> bool:
     taken = depth_of(dask_scheduler, name) is not None or state_of(dask_scheduler, name) is not None
-    # An owner that was killed, and whose last question is read after that was seen: nobody would
-    # take the pipe away, nor hear the answer.
+    # The last request of a killed owner may arrive after its removal: nobody would delete the pipe,
+    # or get the answer.
     if taken or state["owner"] not in dask_scheduler.clients:
         return False
-    # Without a limit: of two producers that see room for one the second would wait inside it.
+    # Without a limit: if two producers see room for one, the second would wait inside the queue.
     await make_queue(dask_scheduler, name, state)
     if _OWNERS not in dask_scheduler.plugins:
         dask_scheduler.add_plugin(PipeOwners(), name=_OWNERS)
@@ -409,13 +410,13 @@ async def _forget(names: list[str], dask_scheduler: Any = None) -> None:
 
 
 class PipeOwners(SchedulerPlugin):
-    """Forgets the pipes of clients that leave; there as long as there are pipes."""
+    """Deletes the pipes of clients that leave; exists as long as there are pipes."""
 
     def __init__(self) -> None:
         self._under_way: set[asyncio.Future[None]] = set()  # else they might be collected
 
     def remove_client(self, scheduler: Any, client: str) -> None:
-        """Forget the pipes of a client that has left."""
+        """Delete the pipes of a client that has left."""
         names = [name for name, state in pipes_of(scheduler).items() if state["owner"] == client]
         if names:
             work = asyncio.ensure_future(_forget(names, dask_scheduler=scheduler))
@@ -434,7 +435,7 @@ async def _take_news(
 
 
 async def _wait(seconds: float, pipes: list[str], keys: list[str], scheduler: Any) -> None:
-    """Wait until there is something in a pipe, or one or a task has ended."""
+    """Wait until a pipe has an item, or a pipe or task has ended."""
 
     def news() -> bool:
         tasks = (scheduler.tasks.get(key) for key in keys)

@@ -1,4 +1,4 @@
-"""Where tasks really ran, reported by the tasks themselves."""
+"""Where tasks ran, reported by the tasks themselves."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class TaskRecord:
-    """One task as it ran: on which worker, with which resources, and when.
+    """One task that ran: its worker, the worker's resources, and when.
 
-    `start` and `stop` are seconds since the epoch by the worker's clock; `items` is whatever
-    the task counts.
+    `start` and `stop` are seconds since the epoch by the worker's clock; `items` is the task's own
+    count.
     """
 
     stage: str
@@ -37,22 +37,21 @@ class TaskRecord:
 
     @property
     def misplaced(self) -> bool:
-        """Whether the worker did not belong to the partition that the task was meant for."""
+        """Whether the worker was not in the task's partition."""
         return self.partition not in self.resources
 
 
 class Recorder:
-    """Takes the time and place of the task that makes it; `done` gives the record."""
+    """Records time and worker of the current task; `done` returns the record."""
 
     def __init__(self, stage: str, partition: str) -> None:
         self.stage, self.partition = stage, partition
         self.start = time.time()
-        # A clock may be set while the task runs; it must not seem to have taken hours, or less
-        # than nothing.
+        # The clock may be set while the task runs; its time must not become hours, or negative.
         self._begun = time.perf_counter()
 
     def done(self, items: int = 1) -> TaskRecord:
-        """Record of the task up to now."""
+        """Record of the task until now."""
         worker = get_worker()
         return TaskRecord(
             stage=self.stage,
@@ -75,5 +74,5 @@ def recorded(
 
 
 def placement_violations(records: Iterable[TaskRecord]) -> list[TaskRecord]:
-    """Those records whose task ran outside its partition."""
+    """Select the records of tasks that ran outside their partition."""
     return [record for record in records if record.misplaced]

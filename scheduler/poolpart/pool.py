@@ -1,4 +1,4 @@
-"""All workers of a cluster, and how they are divided into partitions."""
+"""All workers of a cluster, and their division into partitions."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ logger = logging.getLogger(__name__)
 class Pool:
     """Some workers of a Dask cluster that can be divided into partitions.
 
-    Start with all of them (`Pool.from_client`); `partition` takes some out under a name and
-    returns the rest, which can be divided again. A cluster whose workers were started with
-    ``--resources "GPU=1"`` and the like is divided already: see `partitions`.
+    Start with all of them (`Pool.from_client`); `partition` takes some out under a name and also
+    returns the rest, which can be divided again. If workers were started with
+    ``--resources "GPU=1"`` and the like, the cluster is divided already: see `partitions`.
 
     Examples
     --------
@@ -51,8 +51,8 @@ class Pool:
         client
             Client of the cluster.
         declaring
-            Only workers that declare one of these resources; others are not asked anything,
-            and need not have this package.
+            Only workers that declare one of these resources; others are not contacted, and need
+            not have this package.
 
         Raises
         ------
@@ -74,10 +74,10 @@ class Pool:
             fact = facts.get(worker.address)
             if isinstance(fact, BaseException):
                 raise PoolError(
-                    f"Worker {worker.name} at {worker.address} cannot tell about its "
+                    f"Worker {worker.name} at {worker.address} cannot describe its "
                     f"machine ({type(fact).__name__}: {fact}); is poolpart installed there?"
                 )
-            if fact is not None:  # it may have gone since
+            if fact is not None:  # it may have left
                 asked.append(worker.with_gpus(fact["gpus"]))
         return cls(client, asked)
 
@@ -109,14 +109,14 @@ class Pool:
     def require(self, slots: Mapping[str, int], purpose: Mapping[str, str] | None = None) -> None:
         """Check that partitions have enough slots before anything is submitted.
 
-        Dask itself would wait, silently and for ever, for a resource that nobody declares.
+        Dask itself would wait silently for ever for a resource that no worker declares.
 
         Parameters
         ----------
         slots
             Slots needed, by partition.
         purpose
-            What they are needed for, by partition, where it is worth saying; shown in the error.
+            What they are needed for, by partition; shown in the error.
 
         Raises
         ------
@@ -127,7 +127,7 @@ class Pool:
             if len(several := [name for name in slots if name in worker.partitions]) > 1:
                 raise PoolError(
                     f"Worker {worker.name} declares {' and '.join(several)}: give each worker "
-                    "one of them, since a task of one holds up those of the other."
+                    "one of them, because tasks of one would delay those of the other."
                 )
         for name, needed in slots.items():
             there = int(sum(worker.resources.get(name, 0) for worker in self.workers))
@@ -143,18 +143,18 @@ class Pool:
     # -- dividing ----------------------------------------------------------------------
 
     def divide(self, rules: Mapping[str, Rule]) -> dict[str, Partition]:
-        """Divide this pool by rules, which hold from now on, also when this client has gone.
+        """Divide this pool by rules, which stay in force, also when this client has gone.
 
-        Each rule takes of the workers that those before it have left. The scheduler follows
-        them: a worker that joins later gets its partition by them, where one is short of
-        workers first, and tasks that waited run. A worker that comes back is in its partition
-        again; while its nanny starts it, its place is kept for half a minute. An adaptive cluster
-        stops none that a partition needs for its minimum.
+        Each rule takes from the workers that the rules before it have left. The scheduler keeps
+        the rules: a worker that joins later gets its partition by them, first where workers are
+        missing, and waiting tasks run. A restarted worker returns to its partition; its place is
+        kept for half a minute. An adaptive cluster keeps the workers that a partition needs for
+        its minimum.
 
         Parameters
         ----------
         rules
-            What each partition wants, by name; see `per_gpu`, `per_host`, `n_workers`,
+            Rule of each partition, by name; see `per_gpu`, `per_host`, `n_workers`,
             `named` and `rest`.
 
         Returns
@@ -165,8 +165,8 @@ class Pool:
         Raises
         ------
         PoolError
-            If a partition would have fewer workers than its minimum, or somebody else makes
-            one of this name, or takes a worker, at the same moment.
+            If a partition would have fewer workers than its minimum, or another client makes one
+            of this name, or takes a worker, at the same moment.
 
         Examples
         --------
@@ -193,19 +193,18 @@ class Pool:
     ) -> tuple[Partition, Pool]:
         """Take workers out of this pool under a name.
 
-        Give exactly one selector. The chosen workers declare the Dask resource `name`, and
-        declare it again when their nanny restarts them. Tasks that wait for the resource
-        already are sent to them. What counts is the cluster as it is now: a worker that has
-        left, or that another partition has taken since this pool was made, is not chosen.
-        Workers that join later belong by the same selector, as with `divide`.
+        Give exactly one selector. The chosen workers declare the Dask resource `name`, also after
+        a restart by their nanny. Waiting tasks for the resource are sent to them. Workers that
+        have left, or were taken by another partition since this pool was made, are not chosen.
+        Workers that join later are chosen by the same selector, as with `divide`.
 
         Parameters
         ----------
         name
             Name of the partition and of the resource.
         max_workers_per_gpu
-            At most so many workers for each GPU. Where the pool has no GPU at all, the
-            partition falls back to so many CPU workers a host; its `note` says so.
+            At most so many workers for each GPU. If the pool has no GPU at all, the partition
+            takes so many CPU workers a host instead, and its `note` says so.
         max_workers_per_host
             At most so many workers of each host.
         n_workers
@@ -215,15 +214,15 @@ class Pool:
         slots
             Tasks that each worker takes at a time; its number of threads by default.
         minimum
-            Workers that the partition keeps whatever is moved.
+            Least number of workers, which moving them respects.
         exclusive
-            Whether tasks of others are kept off its workers: un-annotated ones, collections,
-            those of other users. What a worker was given before ends there.
+            Whether to keep other tasks off its workers: un-annotated ones, collections, those of
+            other users. Tasks that a worker already has end there.
 
         Returns
         -------
         partition, remainder
-            The partition, and a pool of the workers that are left.
+            The partition, and a pool of the remaining workers.
 
         Raises
         ------
@@ -247,7 +246,7 @@ class Pool:
                 f"workers to partition {name!r}, not {len(given)}."
             )
         [rule] = given
-        # All that were asked for are to be there now, though it may have fewer later.
+        # All of the workers have to be present now; later there may be fewer.
         needed = n_workers or len(workers or ()) or max(1, minimum)
         made, remainder = self._divide({name: rule}, {name: replace(rule, minimum=needed)})
         return made[name], remainder
@@ -255,15 +254,14 @@ class Pool:
     def page(self, *, stay: bool = True) -> str:
         """Add a page to Dask's dashboard: partitions, stages, workers and pipes; returns its URL.
 
-        It is for all users of the cluster, and reads: nobody can change anything with it. It
-        needs no bokeh, and is as open as the dashboard is: on a shared network, whoever reaches
-        the one sees the other.
+        All users of the cluster can see it, and it is read-only. It needs no bokeh, and is as
+        public as the dashboard: on a shared network, whoever reaches one can see the other.
 
         Parameters
         ----------
         stay
-            Whether it is there until all partitions are dissolved or the scheduler ends; else
-            until this client closes, or `leave_page`.
+            Keep it until all partitions are dissolved or the scheduler ends; else until this
+            client closes, or `leave_page`.
 
         Raises
         ------
@@ -273,15 +271,15 @@ class Pool:
         return partitions_page(self.client, stay)
 
     def leave_page(self) -> None:
-        """Have a page that does not stay go, unless other clients want it."""
+        """Remove a page that does not stay, unless other clients want it."""
         leave_page(self.client)
 
     def dissolve(self, timeout_s: float = 30.0) -> list[str]:
-        """Undo every partition of this cluster that was made while it ran, whoever made it.
+        """Undo every partition of this cluster that was made while it ran, by any client.
 
-        Workers declare what they did when they were found, and so they do after a restart.
-        Rules, fences, statistics and the page are gone. Results that are held stay; should one
-        be lost, any worker computes it again. Partitions that workers were started with stay.
+        Workers declare their original resources again. Rules, fences, statistics and the page
+        are removed. Results that are held stay; if one is lost, any worker recomputes it.
+        Partitions that workers were started with stay.
 
         Parameters
         ----------
@@ -291,12 +289,12 @@ class Pool:
         Returns
         -------
         list of str
-            Names of the partitions that there were.
+            Names of the partitions.
 
         Raises
         ------
         PoolError
-            If tasks of theirs have not ended; then everything stays.
+            If their tasks have not ended; then everything stays.
         """
         names: list[str] = ask(self.client, dissolve, names=None, timeout_s=timeout_s)
         return names
@@ -311,7 +309,7 @@ class Pool:
         for name in rules:
             check_name(name)
         cluster = all_workers(self.client)
-        # By name: the address of a worker that was restarted meanwhile is another one.
+        # By name: a restarted worker has another address.
         gpus = {worker.name: worker.gpus for worker in self.workers}
         mine = [w.with_gpus(gpus[w.name]) for w in cluster if w.name in gpus]
         chosen, notes = divide(now, mine)

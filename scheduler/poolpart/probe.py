@@ -1,4 +1,4 @@
-"""What a worker says about its machine; these functions run on the workers."""
+"""Facts about a worker's machine; these functions run on the workers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ if cuda.cuInit(0) == 0 and cuda.cuDeviceGetCount(ctypes.byref(count)) == 0:
 
 
 def has_driver() -> bool:
-    """Whether this machine has a CUDA driver; whether it works is another question."""
+    """Whether this machine has a CUDA driver, which may still not work."""
     try:
         ctypes.CDLL(_DRIVER)
     except OSError:
@@ -42,7 +42,7 @@ def has_driver() -> bool:
 def visible_gpus() -> tuple[str, ...]:
     """UUIDs of the CUDA devices this process may use, by ordinal; empty without a driver.
 
-    A driver that is there and cannot be asked counts as none, with a warning in the log.
+    A driver that fails counts as none, with a warning in the log.
     """
     if not has_driver():
         return ()
@@ -55,12 +55,14 @@ def visible_gpus() -> tuple[str, ...]:
             check=True,
         )
     except (subprocess.CalledProcessError, subprocess.TimeoutExpired) as error:
-        logger.warning("No GPU is used, listing them failed: %s %s", error, error.stderr or "")
+        logger.warning(
+            "No GPU is used, because listing them failed: %s %s", error, error.stderr or ""
+        )
         return ()
     return tuple(listing.stdout.split())
 
 
 async def probe_worker(dask_worker: Any = None) -> dict[str, Any]:
     """Facts about this worker that the scheduler does not know."""
-    # In a thread: the worker's event loop must go on answering meanwhile.
+    # In a thread, to keep the worker's event loop free.
     return {"gpus": await asyncio.to_thread(visible_gpus)}

@@ -1,4 +1,4 @@
-"""Which workers a partition takes, now and when more of them join."""
+"""Rules that choose the workers of a partition, now and when more join."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ NO_GPU = "no GPU in the pool: CPU workers instead"
 
 @dataclass(frozen=True, kw_only=True)
 class Rule:
-    """What a partition wants.
+    """Rule of a partition.
 
     Parameters
     ----------
     slots
         Tasks that each worker takes at a time; its number of threads by default.
     minimum
-        Workers without which the partition is of no use: there is an error when it is made
-        with fewer, and moving workers never leaves it with fewer.
+        Least number of workers: making it with fewer is an error, and moving workers never
+        leaves it with fewer.
     exclusive
-        Whether tasks of others are kept off its workers.
+        Whether to keep other tasks off its workers.
     """
 
     slots: int | None = None
@@ -33,23 +33,23 @@ class Rule:
     exclusive: bool = False
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
-        """Take what it wants of workers that may be had; the first ones are preferred."""
+        """Choose from available workers; the first ones are preferred."""
         raise NotImplementedError
 
     def wants(
         self, worker: WorkerInfo, members: Sequence[WorkerInfo], everyone: Sequence[WorkerInfo]
     ) -> bool:
-        """Whether one more worker is wanted, beside the members; `everyone` is all workers."""
+        """Whether to add a worker to the members; `everyone` is all workers."""
         return len(self.choose([*members, worker])) > len(self.choose(members))
 
     def slots_of(self, worker: WorkerInfo) -> int:
-        """Slots that a worker gets as a member."""
+        """Slots of a worker as a member."""
         return self.slots or worker.nthreads
 
 
 @dataclass(frozen=True, kw_only=True)
 class PerGpu(Rule):
-    """At most so many workers for each GPU, or where there is none for each host."""
+    """At most so many workers for each GPU, or without GPUs for each host."""
 
     most: int
 
@@ -59,7 +59,7 @@ class PerGpu(Rule):
             return _by_host(free, self.most)
         taken: Counter[str] = Counter()  # {GPU: workers chosen for it}
         chosen = []
-        # Those that see the fewest GPUs first: the others have a choice.
+        # Those that see the fewest GPUs first: the others have more choice.
         for worker in sorted(free, key=lambda worker: len(worker.gpus)):
             if worker.gpus:
                 gpu = min(worker.gpus, key=lambda gpu: taken[gpu])
@@ -71,7 +71,7 @@ class PerGpu(Rule):
     def wants(
         self, worker: WorkerInfo, members: Sequence[WorkerInfo], everyone: Sequence[WorkerInfo]
     ) -> bool:
-        """Want a worker with a GPU to spare; one without only where nobody has a GPU."""
+        """Whether the worker has a spare GPU, or no worker has any."""
         if not worker.gpus and any(other.gpus for other in everyone):
             return False
         alike = [member for member in members if bool(member.gpus) == bool(worker.gpus)]
@@ -117,13 +117,13 @@ class Named(Rule):
     names: tuple[str, ...]
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
-        """Those of them that are there."""
+        """Choose those of them that are present."""
         return [worker for worker in free if {worker.name, worker.address} & set(self.names)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rest(Rule):
-    """Every worker that no rule before it wants."""
+    """Every worker that no earlier rule takes."""
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
         """All of them."""
@@ -132,15 +132,15 @@ class Rest(Rule):
 
 @dataclass(frozen=True, kw_only=True)
 class Declared(Rule):
-    """Workers that were started with the resource; nobody else joins by itself."""
+    """Workers that were started with the resource, and no others."""
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
-        """None: who declares the resource belongs without being chosen."""
+        """None: workers that declare the resource are members without being chosen."""
         return []
 
 
 def per_gpu(most: int, **common: Any) -> PerGpu:
-    """At most so many workers for each GPU; CPU workers, so many a host, where there is none.
+    """At most so many workers for each GPU; without GPUs so many CPU workers a host.
 
     `common` are `slots`, `minimum` and `exclusive`, as in every `Rule`.
 
@@ -168,23 +168,23 @@ def named(*names: str, **common: Any) -> Named:
 
 
 def rest(*, minimum: int = 0, **common: Any) -> Rest:
-    """Every worker that no rule before it wants, perhaps none; `common` as in every `Rule`."""
+    """Every worker that no earlier rule takes, perhaps none; `common` as in every `Rule`."""
     return Rest(minimum=minimum, **common)
 
 
 def divide(
     rules: Mapping[str, Rule], pool: Sequence[WorkerInfo]
 ) -> tuple[dict[str, list[WorkerInfo]], dict[str, str]]:
-    """Divide workers by rules, each of which takes of what those before it have left.
+    """Divide workers by rules, each of which takes from the workers that the others have left.
 
-    Workers that a rule names are kept for it. Members of a partition come first, so that the
-    same rules, again, make the same partitions. Workers that declare something else are left
-    alone. Returns the workers by partition, and what a user should know of a choice, where there
-    is anything. PoolError if a partition would have fewer workers than its minimum.
+    Workers that a rule names are kept for it. Members of a partition come first, so that
+    repeating the rules gives the same partitions. Workers that declare another resource are not
+    taken. Returns the workers by partition, and notes on the choices. PoolError if a partition
+    would have fewer workers than its minimum.
     """
     chosen: dict[str, list[WorkerInfo]] = {}
     notes: dict[str, str] = {}
-    taken: set[str] = set()  # addresses: names need not differ
+    taken: set[str] = set()  # addresses, because names may repeat
     named_by = {n for rule in rules.values() if isinstance(rule, Named) for n in rule.names}
     for name, rule in rules.items():
         declaring = [worker for worker in pool if worker.partitions == {name}]
@@ -196,9 +196,9 @@ def divide(
         taken |= {worker.address for worker in chosen[name]}
         if len(chosen[name]) < rule.minimum:
             raise PoolError(
-                f"Partition {name!r} would have {len(chosen[name])} workers, of the {rule.minimum} "
-                f"that it needs: {len(free)} of {len(pool)} are left for it. Start more, or put it "
-                "before others. Workers that declare another resource are not taken."
+                f"Partition {name!r} would have {len(chosen[name])} of the {rule.minimum} workers "
+                f"that it needs: {len(free)} of {len(pool)} are left for it. Start more, or list "
+                "it first. Workers that declare another resource are not taken."
             )
         if isinstance(rule, PerGpu) and free and not any(worker.gpus for worker in free):
             notes[name] = NO_GPU
@@ -210,10 +210,10 @@ def partition_for(
     rules: Mapping[str, Rule],
     members: Mapping[str, Sequence[WorkerInfo]],
 ) -> str | None:
-    """Which partition a worker that joins belongs to; None for none.
+    """Partition of a worker that joins; None for none.
 
-    A rule that names it comes first, then partitions with fewer workers than their minimum or
-    with none, then those whose rule comes first.
+    A rule that names the worker comes first, then partitions with fewer workers than their
+    minimum or with none, then the order of the rules.
     """
     everyone = [worker, *(member for group in members.values() for member in group)]
     willing = [n for n, rule in rules.items() if rule.wants(worker, members[n], everyone)]

@@ -1,9 +1,9 @@
-"""How busy a partition is and what it has done.
+"""Load and finished tasks of a partition.
 
 A plugin of the scheduler counts tasks that have ended, by partition and stage. A task's partition
-is the resource that it asks for, "" for a task that asks for none; its stage is the prefix of its
-key, which for most tasks is the function's name; there are as many as Dask itself keeps. What is
-under way is counted when somebody asks.
+is the resource that it asks for, or ""; its stage is the prefix of its key, for most tasks the
+function's name; there are as many stages as Dask itself keeps. Tasks under way are counted on
+request.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from .fence import fences_of
 from .workers import on_scheduler
 
 NAME = "poolpart-stats"
-_LOOK_AT_MOST = 1000  # tasks of one worker, in search of those that run
+_LOOK_AT_MOST = 1000  # tasks of one worker that are examined for running ones
 _WAITING = {"waiting": "waiting", "queued": "queued", "no-worker": "queued", "processing": "given"}
 
 
@@ -35,7 +35,7 @@ class Tally:
 
 
 class Statistics(SchedulerPlugin):
-    """Counts what the scheduler's tasks do, from when it was made."""
+    """Counts the scheduler's tasks that end, from its creation on."""
 
     name = NAME
 
@@ -73,15 +73,15 @@ def members(scheduler: Any, partition: str) -> list[Any]:
 
 
 def slots_of(worker: Any, partition: str) -> int:
-    """Slots that a worker has for a partition; its threads, for tasks of none."""
+    """Slots of a worker for a partition; its threads for tasks without one."""
     return int(worker.resources.get(partition, 0)) if partition else int(worker.nthreads)
 
 
 def running_on(worker: Any, partition: str) -> tuple[Counter[str], int]:
     """Tasks of a partition that a worker runs, by stage, and the slots that they hold.
 
-    As far as the scheduler knows, which is what it gave to a worker: of that, as many run as the
-    worker has slots. Tasks that were submitted from inside others take none, but a thread each.
+    The scheduler only knows which tasks it gave to a worker: as many of them run as the worker
+    has slots. Nested tasks take no slot, but a thread each.
     """
     slots, threads = slots_of(worker, partition), worker.nthreads
     held = nested = 0
@@ -109,16 +109,15 @@ class StageStats:
     queued
         Tasks that wait for a worker, or for their turn on one.
     running
-        Tasks that run. The scheduler does not see when a task starts: of what it gave to a
-        worker, as many count as running as the worker has slots.
+        Running tasks. The scheduler does not see when a task starts: of a worker's tasks, as many
+        count as running as the worker has slots.
     done
-        Times that a task ended well; again where its result was lost with a worker.
+        Successful runs of tasks, including those whose result was lost and recomputed.
     failed
-        Times that a task raised an error or was given up after too many dead workers. Those
-        that depend on it and never ran do not count.
+        Tasks that raised an error or were given up after too many dead workers. Their dependents,
+        which never ran, do not count.
     seconds
-        Time that tasks have run, with the failed ones; of those that were lost with their
-        worker, nobody knows.
+        Running time of tasks, including failed ones, without those lost with their worker.
     """
 
     waiting: int = 0
@@ -131,10 +130,10 @@ class StageStats:
 
 @dataclass(frozen=True)
 class PartitionStats(StageStats):
-    """What a partition does now and has done since its tasks are counted.
+    """Current and finished tasks of a partition.
 
-    Those that have ended are counted from when the cluster is divided, the first statistics are
-    asked for, or the page is opened, whichever comes first.
+    Counting of finished tasks begins when the cluster is divided, the first statistics are
+    requested, or the page is opened, whichever comes first.
 
     Parameters
     ----------
@@ -143,8 +142,7 @@ class PartitionStats(StageStats):
     workers
         Workers that it has now.
     slots, busy
-        Slots that they have, and how many of those are held by a task. Tasks submitted from
-        inside others run without holding one.
+        Slots of these workers, and how many are held by a task. Nested tasks hold none.
     exclusive
         Whether a fence keeps other tasks out.
     stages
@@ -160,7 +158,7 @@ class PartitionStats(StageStats):
 
     @property
     def occupancy(self) -> float:
-        """Share of the slots that is busy; 0 without slots."""
+        """Share of busy slots; 0 without slots."""
         return self.busy / self.slots if self.slots else 0.0
 
 
@@ -182,7 +180,7 @@ def partition_stats(client: Client, name: str) -> PartitionStats:
 
 
 def statistics_of(scheduler: Any) -> Statistics:
-    """Find the scheduler's statistics; count from now on if it has none."""
+    """Find the scheduler's statistics, or start counting."""
     statistics: Statistics | None = scheduler.plugins.get(NAME)
     if statistics is None:
         statistics = Statistics(scheduler)
@@ -191,7 +189,7 @@ def statistics_of(scheduler: Any) -> Statistics:
 
 
 def forget_statistics(scheduler: Any) -> None:
-    """Count no more, and forget what was counted."""
+    """Stop counting, and delete the counts."""
     if NAME in scheduler.plugins:
         scheduler.remove_plugin(NAME)
 

@@ -1,16 +1,16 @@
-"""Who belongs to which partition: the one place that knows, a plugin of the scheduler.
+"""Membership of workers in partitions: the only record of it, a plugin of the scheduler.
 
-The steward has the rules by partition, and a seat for each worker that says where it belongs.
-Clients ask it to change that (`division.py`), and workers that come and go do. Whatever
-happens, one loop for each worker (`Steward._settle`) brings three things into step with the seat:
+The steward has the rules by partition, and a seat for each worker with the worker's partition.
+Requests of clients (`division.py`) and workers that join and leave change it. After any change,
+one loop for each worker (`Steward._settle`) synchronises three things with the seat:
 
-1. what the worker itself declares, which a task that it gets must find there;
-2. what the scheduler places tasks by: less while a worker leaves a partition, so that it gets no
-   more of its tasks, and more only when the worker has declared it;
-3. which workers are behind a fence, from the moment in which they are meant to be.
+1. the resources that the worker declares, which its tasks must find there;
+2. the resources by which the scheduler places tasks: removed before a worker leaves a partition, so
+   that it gets no more of its tasks, and added only when the worker has declared them;
+3. the workers behind a fence, from the moment of the change.
 
-Nothing is written on nannies: a worker that its nanny starts again declares what it was started
-with, joins, and is settled anew. So it may be cut off anywhere, and undoing it leaves nothing.
+Nannies are not modified: a restarted worker declares its original resources, joins, and is settled
+again. So the loop may be interrupted anywhere, and dissolving leaves nothing behind.
 """
 
 from __future__ import annotations
@@ -46,37 +46,37 @@ logger = logging.getLogger(__name__)
 NAME = "poolpart-steward"
 HOLD_S = 30.0  # how long a worker's place is kept while its nanny starts it again
 LOOK_EVERY_S = 0.01
-_PLACE_EVERY_S = 0.1  # to ask all rules for a thousand workers takes as long
+_PLACE_EVERY_S = 0.1  # applying all rules to a thousand workers takes as long
 
 
 @dataclass(eq=False)
 class Seat:
-    """Where one worker belongs, also while its nanny starts it again.
+    """Partition and state of one worker, also during a restart by its nanny.
 
     Parameters
     ----------
     key
-        What identifies it, see `seat_key`.
+        Identifies the worker, see `seat_key`.
     info
-        What is known of it.
+        Description of the worker.
     nanny
         Address of its nanny, None for none.
     found
         Resources that it was started with.
     declared
-        What it declares now, as far as it was told.
+        Resources that it declares now, as far as known.
     being_told
-        It is being told to declare something, and may do so at any moment.
+        A request to declare resources is under way.
     partition
-        Where it belongs; None for nowhere.
+        Its partition; None for none.
     slots
-        How many of the partition's slots it has.
+        Its slots of the partition.
     unplaced
-        It joined after the cluster was divided, and no rule has wanted it yet.
+        It joined after the cluster was divided, and no rule has taken it yet.
     away
-        It has left, and its nanny may be starting it again.
+        It has left, and its nanny may be restarting it.
     gone
-        Nobody waits for it any more.
+        It is no longer expected.
     """
 
     key: Hashable
@@ -109,21 +109,21 @@ class Steward(SchedulerPlugin):
         self.scheduler = scheduler
         self.rules: dict[str, Rule] = {}  # by partition, in the order in which they choose
         self.seats: dict[Hashable, Seat] = {}  # by key
-        self.asked = 0  # questions of clients that are being answered
-        self._names: set[str] = set()  # of all partitions that there ever were
+        self.asked = 0  # requests of clients in progress
+        self._names: set[str] = set()  # of all partitions so far
         self._placing: asyncio.TimerHandle | None = None
         for worker in scheduler.workers.values():
             self._seat(worker)
 
-    # -- what should be ----------------------------------------------------------------
+    # -- membership --------------------------------------------------------------------
 
     def members(self, name: str, present: bool = False) -> list[Seat]:
-        """Seats of a partition, those only whose workers are there if `present`."""
+        """Seats of a partition; only of present workers if `present`."""
         members = (seat for seat in self.seats.values() if seat.partition == name)
         return [seat for seat in members if not (present and seat.away)]
 
     def free(self) -> list[Seat]:
-        """Workers that are there and belong to no partition, nor declare anything else."""
+        """Present workers without a partition or another resource."""
         return [
             seat
             for seat in self.seats.values()
@@ -131,18 +131,18 @@ class Steward(SchedulerPlugin):
         ]
 
     def remainder(self) -> str | None:
-        """Partition that has what the others leave, if there is one."""
+        """Partition that has the rest, if there is one."""
         return next((name for name, rule in self.rules.items() if isinstance(rule, Rest)), None)
 
     def wanted(self, seat: Seat) -> Resources:
-        """Resources that a worker should declare: those of its own, and its partition's."""
+        """Resources that a worker should declare: its own, and its partition's."""
         if seat.partition is None:
             return {r: q for r, q in seat.found.items() if r not in self.rules}
         own = {r: q for r, q in seat.found.items() if r not in self._names}
         return {**own, seat.partition: seat.slots}
 
     def put(self, seat: Seat, name: str | None, slots: float | None = None) -> None:
-        """Put a worker into a partition, or None; if not given, slots are as it was started."""
+        """Put a worker into a partition, or None; slots default to those it was started with."""
         seat.partition, seat.unplaced, seat.slots = name, False, 0
         if name is not None:
             rule = self.rules[name]
@@ -152,13 +152,13 @@ class Steward(SchedulerPlugin):
         self._place_soon()
 
     def enter(self, name: str, rule: Rule) -> None:
-        """Enter a partition, or change its rule. What takes the rest stays the last to choose."""
+        """Add a partition, or change its rule. The one that has the rest stays last."""
         self._names.add(name)
         rules = {**self.rules, name: rule}.items()
         self.rules = dict(sorted(rules, key=lambda item: isinstance(item[1], Rest)))
 
     def adopt(self, name: str) -> None:
-        """Enter a partition whose workers declare it by themselves.
+        """Add a partition whose workers declare it by themselves.
 
         Raises
         ------
@@ -170,23 +170,23 @@ class Steward(SchedulerPlugin):
         members = [s for s in self.seats.values() if s.partition is None and s.found.get(name)]
         if not members:
             raise PoolError(
-                f"There is no partition {name!r}: no worker declares it, and it has not been "
-                "made with Pool.partition or Pool.divide."
+                f"There is no partition {name!r}: no worker declares it, and it was not made "
+                "with Pool.partition or Pool.divide."
             )
         self.enter(name, Declared(minimum=0))
         for seat in members:
             self.put(seat, name, seat.found[name])
 
     def resize(self, name: str | None, change: int) -> None:
-        """Have a rule want more or fewer workers, where it is one that counts."""
+        """Change the number of workers of a rule, if it has one."""
         if name in self.rules and isinstance(rule := self.rules[name], Count):
             workers = rule.workers + change
             self.rules[name] = replace(rule, workers=workers, minimum=min(rule.minimum, workers))
 
-    # -- workers that come and go ------------------------------------------------------
+    # -- joining and leaving -----------------------------------------------------------
 
     def _seat(self, worker: Any) -> Seat:
-        """Seat of a worker that has come, or come back."""
+        """Seat of a worker that has joined, or returned."""
         key = seat_key(worker.name, worker.address, worker.nanny)
         info = WorkerInfo.from_identity(worker.address, worker.identity())
         seat = self.seats.setdefault(key, Seat(key, info))
@@ -198,14 +198,14 @@ class Steward(SchedulerPlugin):
         return seat
 
     def seat_at(self, address: str) -> Seat | None:
-        """Seat of the worker at an address; None if there is no such worker."""
+        """Seat of the worker at an address, or None."""
         worker = self.scheduler.workers.get(address)
         if worker is None:
             return None
         return self.seats[seat_key(worker.name, worker.address, worker.nanny)]
 
     def add_worker(self, scheduler: Any, worker: str) -> None:
-        """Give a worker that joins its partition: its own, the one it declares, or by rule."""
+        """Assign a worker that joins: to its former partition, a declared one, or by rule."""
         known = set(self.seats)
         seat = self._seat(scheduler.workers[worker])
         declared = [name for name in self.rules if seat.found.get(name)]
@@ -218,7 +218,7 @@ class Steward(SchedulerPlugin):
         self.settle([seat])
 
     def remove_worker(self, scheduler: Any, worker: str, **kwargs: Any) -> None:
-        """Note that a worker has left; its place is held for a while if it has a nanny."""
+        """Record that a worker has left; its place is kept for a while if it has a nanny."""
         for seat in list(self.seats.values()):
             if seat.info.address == worker and not seat.away:
                 seat.away = True
@@ -235,7 +235,7 @@ class Steward(SchedulerPlugin):
         self.remove_if_done()
 
     def valid_workers_downscaling(self, scheduler: Any, workers: list[Any]) -> list[Any]:
-        """Choose those that an adaptive cluster may stop: each partition keeps its minimum."""
+        """Choose workers that an adaptive cluster may stop: each partition keeps its minimum."""
         may_stop = {worker.address: worker for worker in workers}
         for name, rule in self.rules.items():
             members = self.members(name, present=True)
@@ -246,10 +246,10 @@ class Steward(SchedulerPlugin):
                 del may_stop[address]
         return list(may_stop.values())
 
-    # -- a place for workers that join -------------------------------------------------
+    # -- assigning workers that join ---------------------------------------------------
 
     def _place_soon(self) -> None:
-        """Try again to place workers that nobody wanted: rules or members have changed."""
+        """Try again to assign workers without a partition: rules or members have changed."""
         if self._placing is None:
             loop = asyncio.get_running_loop()
             self._placing = loop.call_later(_PLACE_EVERY_S, self._place_all)
@@ -257,12 +257,12 @@ class Steward(SchedulerPlugin):
     def _place_all(self) -> None:
         self._placing = None
         waiting = [s for s in self.seats.values() if s.unplaced and not s.away]
-        # One that is still being asked for its GPUs is placed when it has answered.
+        # A worker that is being asked for its GPUs is assigned when it has answered.
         waiting = [s for s in waiting if s.settling and s.settling.done()]
         self.settle([seat for seat in waiting if self._place(seat)])
 
     def _place(self, seat: Seat) -> bool:
-        """Find a partition for a worker that has none; whether there is one."""
+        """Find a partition for a worker without one; returns whether there is one."""
         groups = {name: [member.info for member in self.members(name)] for name in self.rules}
         name = partition_for(seat.info, self.rules, groups)
         if name is not None:
@@ -275,23 +275,23 @@ class Steward(SchedulerPlugin):
         try:
             facts = await call(self.scheduler, seat.info.address, probe_worker)
         except OSError as error:
-            logger.warning("Worker %s cannot tell about its GPUs: %s", seat.info.name, error)
+            logger.warning("Worker %s cannot list its GPUs: %s", seat.info.name, error)
             return
         seat.info = seat.info.with_gpus(facts["gpus"])
 
-    # -- bringing it about -------------------------------------------------------------
+    # -- settling workers --------------------------------------------------------------
 
     def settled(self, seat: Seat) -> bool:
-        """Whether a worker declares what it should, and the scheduler knows it."""
+        """Whether a worker declares its resources, and the scheduler knows them."""
         worker = self.scheduler.workers.get(seat.info.address)
         if worker is None or seat.being_told:
             return False
         return bool(worker.resources == seat.declared == self.wanted(seat))
 
     def settle(self, seats: Iterable[Seat]) -> None:
-        """Have workers declare what they should; `settled` tells when they do."""
+        """Let workers declare their resources; `settled` waits until they do."""
         for seat in seats:
-            # Where it is at work, it looks at what should be again before it ends.
+            # A running loop checks the seat again before it ends.
             if not seat.away and (seat.settling is None or seat.settling.done()):
                 seat.settling = asyncio.ensure_future(self._settle(seat, seat.info.address))
                 seat.settling.add_done_callback(self._ended)
@@ -311,19 +311,19 @@ class Steward(SchedulerPlugin):
             try:
                 if not await self._step(seat, worker, asked):
                     await asyncio.sleep(LOOK_EVERY_S)
-            except OSError as error:  # it is going, or the connection was bad
+            except OSError as error:  # it is leaving, or the connection was bad
                 logger.info("The worker at %s does not answer: %s", address, error)
                 await asyncio.sleep(10 * LOOK_EVERY_S)
-        # Somebody may have set the resource by hand before, which wakes nobody.
+        # A resource set by hand earlier has woken no tasks.
         if worker:
             wake(self.scheduler, worker)
 
     async def _step(self, seat: Seat, worker: Any, asked: set[Any]) -> bool:
-        """Bring a worker nearer to what it should declare; False if its tasks must end first."""
+        """Advance a worker towards its seat; False if its tasks must end first."""
         wanted = self.wanted(seat)
         leaving = {name for name, slots in seat.declared.items() if slots and name not in wanted}
         if leaving:
-            # No new tasks; those that it has end here or move. It declares the resource as long.
+            # No new tasks; its tasks end here or move. It keeps the resource until then.
             kept = {name: q for name, q in seat.declared.items() if name not in leaving}
             self._show(seat, worker, kept)
             hand_off(self.scheduler, worker, leaving, asked)
@@ -350,9 +350,9 @@ class Steward(SchedulerPlugin):
         expect(self.scheduler, worker, seat.partition)
 
     async def arrive(self, seats: Collection[Seat], timeout_s: float) -> list[Seat]:
-        """Wait until workers declare what they should; returns those that do not in time.
+        """Wait until workers declare their resources; returns those that do not in time.
 
-        Those whose nanny is starting them again are waited for; those that have left are not.
+        Restarting workers are waited for; those that have left are not.
         """
         self.settle(seats)
         deadline = time.monotonic() + timeout_s
@@ -375,7 +375,7 @@ class Steward(SchedulerPlugin):
                 task.cancel()
 
     def remove_if_done(self) -> None:
-        """Leave the scheduler, once there are no partitions and all workers are as they were."""
+        """Leave the scheduler once there are no partitions and all workers are restored."""
         here = [seat for seat in self.seats.values() if not seat.away]
         if not self.rules and not self.asked and all(map(self.settled, here)):
             self._stop()
@@ -384,11 +384,10 @@ class Steward(SchedulerPlugin):
 
 
 def seat_key(name: Hashable, address: str, nanny: str | None) -> Hashable:
-    """Name a worker for all its lives: by its name or, if it has none, by its nanny.
+    """Key of a worker that outlives restarts: its name or, without one, its nanny.
 
-    A worker that was given no name goes by its address, which is another after a restart. The
-    name is left as it is: to Dask 0, as `LocalCluster` has it, and "0", as from a command line,
-    are two workers.
+    The default name is the address, which changes with a restart. Names are not converted: to
+    Dask 0, from `LocalCluster`, and "0", from a command line, are two workers.
     """
     return name if name != address else nanny or address
 
@@ -400,7 +399,7 @@ def names_of(seats: Iterable[Seat]) -> str:
 
 @contextmanager
 def steward_of(scheduler: Any) -> Iterator[Steward]:
-    """Give the scheduler's steward, a new one if need be; one without partitions goes at once."""
+    """Return the scheduler's steward, or a new one; one without partitions leaves at once."""
     steward: Steward | None = scheduler.plugins.get(NAME)
     if steward is None:
         steward = Steward(scheduler)

@@ -1,4 +1,4 @@
-"""What a task needs of the worker that runs it: a client, and whether the worker is leaving."""
+"""The context of a task: its worker's client, and whether the worker is leaving."""
 
 from __future__ import annotations
 
@@ -18,14 +18,13 @@ _one_at_a_time = threading.Lock()
 def own_client() -> Client:
     """Client of this task's worker; elsewhere the current one.
 
-    `distributed.get_client` makes the worker's client when a task asks for it first, and that
-    fails, with an AssertionError that has no words, when the scheduler has something to tell
-    all clients in the moment in which it greets the new one: that a worker has died, say. What
-    was made by then stays the default, connected to nothing, and every later task gets it.
-    Besides, of several tasks that ask at the same moment each may make one.
+    `distributed.get_client` makes the worker's client on first use. That fails, with an
+    AssertionError without a message, if the scheduler broadcasts to all clients while it registers
+    the new one, for example that a worker has died. The unconnected client stays the default, and
+    every later task gets it. Besides, several tasks that ask at once may make a client each.
 
-    A coroutine, which runs in the worker's event loop, does not wait for a thread that is making
-    the client, since that needs the loop: both would wait for ever.
+    A coroutine in the worker's event loop must not wait for a thread that makes the client, which
+    needs the loop: both would wait for ever.
     """
     if in_event_loop():
         return get_client()
@@ -39,7 +38,7 @@ def own_client() -> Client:
 
 
 def in_event_loop() -> bool:
-    """Whether this runs in an event loop, which must not be held up, and not in a thread."""
+    """Whether this runs in an event loop, which must not block, and not in a thread."""
     try:
         asyncio.get_running_loop()
     except RuntimeError:
@@ -65,27 +64,25 @@ class WorkerLeft(RuntimeError):  # noqa: N818 - reads as what happened
 
 @contextmanager
 def telling_departure() -> Iterator[None]:
-    """Raise `WorkerLeft` in place of whatever is raised while the worker is leaving.
+    """Raise `WorkerLeft` instead of any error while the worker is leaving.
 
-    A worker that is retired, or started again by its nanny, closes its client under the tasks
-    that still run. What they get then is anything: CommClosedError, CancelledError, an
-    AttributeError from within Dask. Some get it soon enough for the scheduler to hear of it,
-    and to take it for an error of theirs.
+    A worker that is retired or restarted closes its client under the tasks that still run. They
+    fail with CommClosedError, CancelledError, an AttributeError from within Dask and others,
+    sometimes early enough for the scheduler to record the error as theirs.
 
     Use it as a decorator of the task, or around its body.
 
     Raises
     ------
     WorkerLeft
-        If the worker is leaving; errors pass through unchanged if not, and where there is no
-        worker.
+        If the worker is leaving; otherwise, and outside of a worker, errors pass unchanged.
     """
     try:
         yield
     except (Exception, asyncio.CancelledError) as error:
         if not _is_leaving():
             raise
-        # Without the cause: it travels to the client, and not everything can.
+        # Without the cause, which may not be picklable.
         raise WorkerLeft(f"the worker has left ({type(error).__name__}: {error})") from None
 
 

@@ -1,4 +1,4 @@
-"""What the scheduler knows of a partition now: its free slots, its tasks and silent workers."""
+"""Current state of a partition on the scheduler: free slots, tasks and silent workers."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from distributed import Client
 
 from .workers import on_scheduler
 
-SILENT_S = 20.0  # without a heartbeat; a stopped worker gives none, nor one whose GIL is held
+SILENT_S = 20.0  # without a heartbeat: stopped, or with its GIL held
 _BEATS = 3  # heartbeats that a worker may miss at least
 
 
 @dataclass(frozen=True)
 class TaskPlace:
-    """One task as the scheduler sees it.
+    """One task on the scheduler.
 
     Parameters
     ----------
     state
         Dask's name of its state: waiting, no-worker, queued, processing, memory, erred, ….
     workers
-        Addresses of those that run it, or have its result.
+        Addresses of workers that run it, or have its result.
     deaths
         Workers that died, unexpectedly, while the task was assigned to them.
     long_running
@@ -45,16 +45,16 @@ class Whereabouts:
     members
         Addresses of all workers of the partition.
     silent
-        Those of them that have sent no heartbeat for long: stopped, cut off or stuck. The
-        scheduler itself takes a worker for dead after its ``worker-ttl``, five minutes.
+        Members without a recent heartbeat: stopped, cut off or stuck. The scheduler itself
+        considers a worker dead after its ``worker-ttl``, five minutes.
     free
-        Slots that no task holds or waits for, by address of the worker; below 0 where more
-        tasks were given to a worker than it has slots for. Workers that take no tasks at the
-        moment, or are silent, are left out.
+        Slots that no task holds or waits for, by address of the worker; below 0 if a worker has
+        more tasks than slots. Workers that take no tasks at the moment, or are silent, are left
+        out.
     slots
         Slots of the workers that take tasks at the moment, free or not.
     tasks
-        {key: its place}, of those keys asked for that the scheduler knows.
+        {key: its location}, for requested keys that the scheduler knows.
     """
 
     members: frozenset[str] = frozenset()
@@ -64,7 +64,7 @@ class Whereabouts:
     tasks: dict[str, TaskPlace] = field(default_factory=dict)
 
     def out_of_reach(self, key: str) -> bool:
-        """Whether a task runs, or its result lies, on silent workers only."""
+        """Whether a task or its result is on silent workers only."""
         place = self.tasks.get(key)
         return place is not None and bool(place.workers) and self.silent.issuperset(place.workers)
 
@@ -76,10 +76,10 @@ class Whereabouts:
 def look_for_tasks(client: Client, partition: str, keys: Collection[str] = ()) -> Whereabouts:
     """Ask the scheduler about the slots of a partition and some tasks.
 
-    Dask places a task by a worker's total resources, not by what is free, and prefers the
-    worker with the least work ahead; one whose only slot is held by a task that has seceded
-    looks idle to it. A long-running task that lands there waits as long as the other runs.
-    Whoever starts several of them should choose their workers.
+    Dask places a task by a worker's total resources, not by the free ones, and prefers the
+    worker with the least work ahead; a worker whose only slot is held by a seceded task looks
+    idle. A second long-running task there waits as long as the first runs. So choose the
+    workers of long-running tasks yourself.
     """
     arguments = {"partition": partition, "keys": list(keys), "patience_s": SILENT_S}
     found: Whereabouts = on_scheduler(client, _look, **arguments)
@@ -104,10 +104,10 @@ def _look(
 
 def _silent_workers(scheduler: Any, patience_s: float) -> set[str]:
     """Addresses of workers without a heartbeat for so long."""
-    # The scheduler's own clock: where all have been silent for as long, it is the scheduler
-    # that was stopped or busy, and they are about to be heard.
+    # If all workers have been silent, the scheduler itself was stopped or busy, and will hear from
+    # them soon.
     now = max((ws.last_seen for ws in scheduler.workers.values()), default=0.0)
-    # As Dask has it: in a large cluster they are rare.
+    # Dask's interval, which is long in large clusters.
     patience_s = max(patience_s, _BEATS * (1 + len(scheduler.workers) / 100))
     return {ws.address for ws in scheduler.workers.values() if now - ws.last_seen > patience_s}
 
@@ -121,6 +121,6 @@ def _place(task: Any) -> TaskPlace:
 
 
 def _in_use(worker: Any, resource: str) -> float:
-    """Count what the tasks on a worker hold: Dask's own count is off once one was stolen."""
+    """Count the resources held on a worker: Dask's own count is wrong after stealing."""
     held = ((task.resource_restrictions or {}).get(resource, 0) for task in worker.processing)
     return float(sum(held))

@@ -1,4 +1,4 @@
-"""What is known of the workers of a cluster, and running functions there and on the scheduler."""
+"""Descriptions of workers, and running functions on workers and scheduler."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ class WorkerInfo:
     Parameters
     ----------
     name
-        The worker's name. One that it was given stays when a nanny restarts the worker; the
-        address does not, nor a name that Dask made of the address.
+        The worker's name. A given name outlives a restart by the nanny; the address, and a
+        default name made from it, do not.
     address, host
-        Where it listens, and on which host.
+        Its address, and its host.
     nthreads
         Its threads.
     memory
@@ -44,16 +44,16 @@ class WorkerInfo:
 
     @property
     def partitions(self) -> frozenset[str]:
-        """The partitions that it belongs to: the resources of which it has a slot."""
+        """Its partitions: the resources of which it has a slot."""
         return frozenset(name for name, slots in self.resources.items() if slots)
 
     def with_gpus(self, gpus: Iterable[str]) -> WorkerInfo:
-        """Describe the same worker with these GPUs."""
+        """Return a copy with these GPUs."""
         return replace(self, gpus=tuple(gpus))
 
     @classmethod
     def from_identity(cls, address: str, identity: Mapping[str, Any]) -> WorkerInfo:
-        """From what the scheduler says of a worker."""
+        """Make it from the scheduler's description of a worker."""
         return cls(
             name=str(identity["name"]),
             address=address,
@@ -78,22 +78,22 @@ def on_scheduler(client: Client, function: Callable[..., Any], **kwargs: Any) ->
     except ModuleNotFoundError as error:
         raise PoolError(
             f"The scheduler at {client.scheduler.address} has no module {error.name!r}: start "
-            "it in the environment that is used here."
+            "it in the same environment as this process."
         ) from error
 
 
 def check_client(client: Client) -> None:
-    """Say so where a client cannot be asked anything; PoolError.
+    """Raise PoolError if a client cannot be used.
 
-    What comes without this is a coroutine that nobody awaits, or an AttributeError.
+    Otherwise the result would be a coroutine that nobody awaits, or an AttributeError.
     """
     if client.asynchronous:
         raise PoolError(
             "poolpart needs a client that is not asynchronous: make one with Client(address), "
-            "and call it in a thread (asyncio.to_thread) where there is an event loop."
+            "and call it in a thread (asyncio.to_thread) if there is an event loop."
         )
     if client.status in ("closing", "closed"):
-        raise PoolError(f"The client is {client.status}: make another one, and the pool anew.")
+        raise PoolError(f"The client is {client.status}: make a new client and a new pool.")
 
 
 def worker_identities(client: Client) -> dict[str, dict[str, Any]]:
@@ -110,7 +110,7 @@ def worker_identities(client: Client) -> dict[str, dict[str, Any]]:
 
 
 def all_workers(client: Client) -> list[WorkerInfo]:
-    """Ask the scheduler for all its workers; their GPUs it does not know."""
+    """Ask the scheduler for all its workers, without their GPUs."""
     return [WorkerInfo.from_identity(a, i) for a, i in worker_identities(client).items()]
 
 
@@ -124,15 +124,15 @@ def ask_workers(
     client
         Client of their cluster.
     question
-        What `Client.run` is to run there.
+        Function for `Client.run`.
     addresses
         The workers.
 
     Returns
     -------
     dict
-        By address, what each returned, or the exception that it raised there. Workers that
-        have died before they answered are left out, as those that had died before.
+        By address, the result, or the exception raised there. Workers that died before they
+        answered are left out.
     """
     if not addresses:  # to Client.run that would be all workers
         return {}
@@ -144,5 +144,5 @@ def ask_workers(
 
 
 def _has_died(answer: Any, is_here: bool) -> bool:
-    # An OSError may also be what the question raised on a worker that is well.
+    # The function itself may also have raised an OSError.
     return isinstance(answer, CommClosedError) or (isinstance(answer, OSError) and not is_here)

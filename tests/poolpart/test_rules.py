@@ -58,11 +58,11 @@ def test_the_same_rules_again_make_the_same_partitions():
 
 def test_fewer_than_the_minimum():
     pool = [worker("a"), worker("b")]
-    message = "'Q' would have 0 workers, of the 1 that it needs: 0 of 2 are left"
+    message = "'Q' would have 0 of the 1 workers that it needs: 0 of 2 are left"
     with pytest.raises(PoolError, match=message):
         divide({"P": n_workers(2), "Q": per_host(1)}, pool)
     assert names({"P": n_workers(2), "Q": per_host(1, minimum=0)}, pool)["Q"] == []
-    with pytest.raises(PoolError, match="would have 2 workers, of the 3"):
+    with pytest.raises(PoolError, match="would have 2 of the 3 workers"):
         divide({"P": rest(minimum=3)}, pool)
 
 

@@ -58,7 +58,7 @@ def test_one_name(two, both, others):
         lambda: mine.partition("P", workers=["a", "b"])[0],
         lambda: theirs.partition("P", **others)[0],
     )
-    assert "a partition 'P' already" in (message := told(outcomes))
+    assert "Partition 'P' exists already" in (message := told(outcomes))
     assert "Pool.partitions()['P']" in message
     (part,) = (outcome for outcome in outcomes if isinstance(outcome, Partition))
     members = {worker.name for worker in part.workers}
@@ -75,7 +75,7 @@ def test_the_same_workers_under_different_names(two, both):
         lambda: mine.partition("P", n_workers=3, exclusive=True),
         lambda: theirs.partition("Q", n_workers=2, exclusive=True),
     )
-    assert "make the pool anew" in (message := told(outcomes)).lower(), message
+    assert "make a new pool" in (message := told(outcomes)).lower(), message
     taken = [names for names in declared(two[0]).values() if names]
     assert taken in ([{"P": 1}] * 3, [{"Q": 1}] * 2)
     # Nothing of the one that was refused is left, a fence least of all.
