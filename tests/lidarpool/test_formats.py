@@ -34,6 +34,7 @@ from lidarpool.base.open3d_module import load_open3d
 from lidarpool.base.vocabulary import FORMATS
 from lidarpool.columns.table import TABLE
 from lidarpool.export import threads
+from lidarpool.export.boxes import Boxes
 from lidarpool.export.cloud_file import CloudFile
 from lidarpool.export.formats import Format
 from lidarpool.export.sweeps import Sweeps
@@ -453,6 +454,21 @@ def test_boxes_of_kitti_hold_the_points_of_their_actors(traffic, tmp_path):
             centre = np.array(place) - [0, height / 2, 0]
             # It moves by 0.6 m or less while it is hit, and turns.
             assert inside_box(camera, centre, turn, (length, height, width), 0.45).all()
+
+
+def test_boxes_are_where_actors_are_though_a_sensor_pauses(scene):
+    """As one does that is carried on after a turn and a half; and one with a single sweep."""
+    track = Track([0, 9], [[0, 0, 0], [90, 0, 0]])
+    scene = replace(scene, actors=(Actor(box("Car", (4, 2, 1.5)), track),))
+    car = len(scene.names)
+    for steps, sweep, scan, when_s in ((54, 1, 45, 0.125), (54, 3, 99, 0.275), (36, 0, 9, 0)):
+        poses = [(0, 0, 0), (5, 0, 0)][: 1 + (steps == 54)]
+        survey = Survey(Sensor.grid(360, 4), poses, steps=steps)
+        sweeps = Sweeps.of(survey, scene)
+        points = Cloud(np.zeros((1, 3)), {"scan": [scan], "object": [car]})
+        boxes = Boxes.of(sweeps, sweep, points)
+        assert boxes.points.tolist() == [1]
+        np.testing.assert_allclose(boxes.centres, [[10 * when_s, 0, 0.75]], atol=0.02)
 
 
 def test_boxes_of_nuscenes_hold_the_points_of_their_actors(traffic, tmp_path):

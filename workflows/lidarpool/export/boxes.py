@@ -44,13 +44,18 @@ class Boxes:
         actor = points["object"].astype(np.int64) - len(sweeps.objects)
         rows = np.flatnonzero(actor >= 0)
         counts = np.bincount(actor[rows], minlength=count)
-        since = points["scan"][rows] + 0.5 - sweeps.scans[sweep]
-        passed = np.bincount(actor[rows], since, count) / np.maximum(counts, 1)
+        scans = points["scan"][rows] + 0.5 - sweeps.scans[sweep]
+        passed = np.bincount(actor[rows], scans, count) / np.maximum(counts, 1)
         # Poses are known where sweeps of the sensor begin; after the last as before it.
         own = np.flatnonzero(sweeps.sensor == sweeps.sensor[sweep])
         before = max(min(sweep, own[-1] - 1), own[0])
         pair = [before, min(before + 1, own[-1])]
-        share = sweep - before + passed[:, None] / np.diff(sweeps.scans)[own].max()
+        share = np.zeros((count, 1))
+        if len(own) > 1:
+            # Of all sweeps, one that no pause follows says how long a scan takes.
+            scan_ns = (np.diff(sweeps.begins_ns[own]) / np.diff(sweeps.scans)[own[:-1]]).min()
+            since, apart = sweeps.begins_ns[[sweep, pair[1]]] - sweeps.begins_ns[before]
+            share = (since + passed[:, None] * scan_ns) / apart
         places, turns = (
             np.array([getattr(pose, what)[pair] for pose in sweeps.actor_poses]).reshape(-1, 2, n)
             for what, n in (("positions", 3), ("quaternions", 4))
