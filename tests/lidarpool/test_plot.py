@@ -13,6 +13,7 @@ import pytest
 
 from lidarpool import Cloud, LidarpoolError, Mounted, Planning, Pose, Scene, Sensor, Survey, Track
 from lidarpool.cli.commands import cli
+from lidarpool.columns.storage import Storage
 from lidarpool.columns.table import Column
 from lidarpool.export.cloud_file import CloudFile
 from lidarpool.export.ply import save_cloud
@@ -197,6 +198,18 @@ def test_a_result_without_a_plan(unplanned, tmp_path):
     assert names(tmp_path / "out") == {"scene.png", "intensity.png", "cloud.png"}
     with pytest.raises(LidarpoolError, match=r"no picture 'path': its run planned no path"):
         plot(result, "--only", "path")
+
+
+def test_a_result_in_storage(result, tmp_path):
+    url = f"memory://{tmp_path.name}/result"
+    with pytest.raises(LidarpoolError, match=f"^{url} holds no whole result, which has a report"):
+        plot(url, "--only", "path")
+    for name in ("cloud.ply", PICTURE_FILE):
+        Storage.at(url).put(result / name, name)
+    Storage.at(url).write("report.json", b"{}")
+    plot(url, *SMALL, "--only", "path")
+    plot(url, *SMALL, "--only", "path", "--out", tmp_path / "here")
+    assert Storage.at(url).read("path.png") == (tmp_path / "here" / "path.png").read_bytes()
 
 
 @pytest.mark.parametrize("size", ["big", "480", "480x", "0x0", "479x480", "9000x9000", "1000x480"])

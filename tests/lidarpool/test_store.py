@@ -79,7 +79,7 @@ def test_a_run_from_its_beginning_to_its_end(folder):
 def test_without_a_folder_all_goes_with_the_last_user_of_the_points():
     store = RunStore(JOB)
     add(store, 0, 6)
-    points, folder = store.points(), store.folder
+    points, folder = store.points(), store.place
     del store
     gc.collect()
     assert len(points.load()) == 18

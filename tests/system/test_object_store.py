@@ -1,14 +1,21 @@
-"""Parts in an object store that speaks S3."""
+"""Parts, runs and results in an object store that speaks S3."""
 
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from hashlib import sha256
 from typing import Any
 
+import fsspec
 import pytest
+from fsspec.registry import _registry
 from tests.system.default_survey import DEFAULT_CLOUD_SHA256
+from tests.system.test_resume import DRIVERS, SCANS
+from tests.system.test_resume import SCENARIO as RESUMED
 
 from lidarpool.columns.parts import PartColumns, unpack
 from lidarpool.columns.storage import Storage
@@ -36,7 +43,8 @@ def environment() -> Iterator[dict[str, str]]:
     with pytest.MonkeyPatch.context() as patch:
         for name, value in environment.items():
             patch.setenv(name, value)
-        Storage.at(BUCKET).prepare()
+        fsspec.filesystem("s3").clear_instance_cache()
+        fsspec.filesystem("s3").mkdir("surveys")
         yield environment
     store.stop()
 
@@ -137,3 +145,118 @@ def test_a_bucket_that_the_workers_cannot_reach(run, check, monkeypatch):
     assert (done.code, done.err) == (0, "")
     (note,) = (n for n in check("far")["notes"] if "cannot see" in n)
     assert note.startswith(f"LIDAR of partition LIDAR cannot see {BUCKET}/far/run-")
+
+
+# -- runs and results ----------------------------------------------------------------------------
+
+
+def result_at(url: str) -> dict[str, Any]:
+    """Report of a whole result, which has left nothing of its run behind."""
+    out = Storage.at(url)
+    assert out.sizes().keys() >= {"cloud.ply", "report.json", "sweeps.npz"}
+    assert Storage.at(f"{url}/run").sizes() == Storage.at(f"{url}/run/parts").sizes() == {}
+    assert sha256(out.read("cloud.ply")).hexdigest() == DEFAULT_CLOUD_SHA256
+    return json.loads(out.read("report.json"))
+
+
+def test_a_result_goes_to_the_bucket(cluster, lidarpool, tmp_path, environment):
+    (tmp_path / "s.yaml").write_text(SCENARIO)
+    url = f"{BUCKET}/results/whole"
+    Storage.at(f"{url}/pcd").write("000000.pcd", b"of an earlier result")
+    Storage.at(url).write("path.png", b"of an earlier result")
+    arguments = ["run", tmp_path / "s.yaml", "--scheduler", cluster, "--out", url]
+    done = lidarpool(*arguments, "--only", "cloud", "--json", "-q")
+    assert (done.code, done.err) == (0, "")
+    report = result_at(url)
+    told = json.loads(done.out)
+    assert told["folder"] == url and told["files"]["cloud.ply"] == f"{url}/cloud.ply"
+    assert set(report["files"]) == Storage.at(url).sizes().keys()
+    assert not Storage.at(url).has("pcd")
+    assert environment["AWS_SECRET_ACCESS_KEY"] not in json.dumps(report)
+
+    exported = lidarpool("export", url, "--format", "pcd")
+    assert (exported.code, exported.out) == (0, f"{url}/pcd\n")
+    assert Storage.at(f"{url}/pcd").sizes()
+    again = lidarpool("export", url, "--format", "pcd")
+    assert again.code == 2 and f"{url}/pcd is there already" in again.err
+
+    Storage.at(url).remove(["report.json"])
+    for command in (["plot"], ["export", "--format", "pcd"], ["view"]):
+        half = lidarpool(*command, url)
+        assert half.code == 2 and f"{url} holds no whole result" in half.err
+
+
+@pytest.mark.parametrize(
+    ("url", "words"),
+    [
+        ("s3://nobody/x", "make the bucket first"),
+        ("s3://a:b@surveys/x", "holds a password: leave that out"),
+        ("s9://surveys/x", "Protocol not known: s9"),
+    ],
+)
+def test_a_result_that_cannot_go_there(url, words, lidarpool, environment):
+    refused = lidarpool("demo", "--out", url)
+    assert refused.code == 2 and words in refused.err
+    assert len(refused.err.splitlines()) == 1
+
+
+def test_without_the_package_that_opens_it(lidarpool, monkeypatch):
+    monkeypatch.setitem(sys.modules, "s3fs", None)
+    monkeypatch.delitem(_registry, "s3", raising=False)
+    refused = lidarpool("demo", "--out", f"{BUCKET}/x")
+    assert refused.code == 2 and 'pip install "lidarpool[s3]"' in refused.err
+    assert len(refused.err.splitlines()) == 1
+
+
+def test_without_credentials_or_rights(lidarpool, environment, monkeypatch, tmp_path):
+    monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.delenv(name)
+    fsspec.filesystem("s3").clear_instance_cache()
+    refused = lidarpool("demo", "--out", f"{BUCKET}/x")
+    fsspec.filesystem("s3").clear_instance_cache()
+    assert refused.code == 2 and "look at the credentials and rights" in refused.err
+    assert len(refused.err.splitlines()) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_drivers_are_killed_and_the_next_has_nothing_but_the_bucket(
+    cluster, environment, lidarpool, tmp_path
+):
+    url, here = f"{BUCKET}/results/killed", tmp_path / "here"
+    here.mkdir()
+    (here / "s.yaml").write_text(RESUMED)
+    whole = ["--out", tmp_path / "whole", "--only", "cloud", "-q", "--scheduler", cluster]
+    assert lidarpool("run", here / "s.yaml", *whole).code == 0
+    commit = 'before(RunDatabase, "commit", "COMMIT")'
+    put = 'before(lidarpool.cli.run_command.Storage, "put", "PUT")'
+    often = "\n    import lidarpool.run.remote as r, lidarpool.run.run as run"
+    often += "\n    r.COPY_EVERY_S = r.COPY_REST = run.SAVE_EVERY_S = 0"
+    script = DRIVERS.replace(commit, f"{commit}\n    {put}{often}")
+
+    def drive(*kills: tuple[str, int]) -> list[int]:
+        done = subprocess.run(
+            [
+                sys.executable, "-c", script,
+                json.dumps(["run", "s.yaml", "--out", url, "--resume", "--scheduler", cluster]),
+                json.dumps(kills),
+            ],
+            cwd=here,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+            capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        assert "Traceback" not in done.stderr, done.stderr
+        return [json.loads(line)[1] for line in done.stdout.splitlines() if '"ended"' in line]
+
+    moments = [("COMMIT", 1), ("driver.frame", 100), ("COMMIT", 4), ("OPEN", 1), ("SAVE", 1)]
+    assert drive(*moments, ("PUT", 3)) == [-9] * 6
+    assert "report.json" not in Storage.at(url).sizes()
+    assert drive(("REMOVE", 1), ("", 1)) == [-9, 0]
+    out = Storage.at(url)
+    assert out.read("cloud.ply") == (tmp_path / "whole" / "cloud.ply").read_bytes()
+    report = json.loads(out.read("report.json"))
+    assert report["resumed_scans"] == report["scans"] == SCANS
+    assert Storage.at(f"{url}/run").sizes() == Storage.at(f"{url}/run/parts").sizes() == {}
+    assert {path.name for path in here.iterdir()} == {"s.yaml"}

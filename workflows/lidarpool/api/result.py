@@ -51,7 +51,8 @@ class Result(RunResult):
         Parameters
         ----------
         folder
-            Made if it is not there. An earlier result of the same survey in it is replaced.
+            Made if it is not there; or a URL that fsspec opens. An earlier result of the same
+            survey in it is replaced.
         only_cloud
             Leave pictures and `report.html` out.
         formats
@@ -66,15 +67,19 @@ class Result(RunResult):
             If a file cannot be written, the folder holds the result of another survey, or a
             format lacks a package or column.
         """
-        from ..export.folder import result_folder
+        from ..columns.storage import Storage
+        from ..export.folder import output_place, result_folder
         from ..export.formats import Format
-        from ..report.output import refuse_to_replace, write_result
+        from ..report.output import refuse_to_replace, upload, write_result
 
+        place = output_place(folder)
         wanted = [Format.of(entry) for entry in formats if entry != "ply"]
-        with result_folder(Path(folder)):
+        with result_folder(place) as local:
             if not overwrite:
-                refuse_to_replace(Path(folder), lambda: self.identity)
-            write_result(Path(folder), self, only_cloud=only_cloud, formats=wanted)
+                refuse_to_replace(place, lambda: self.identity)
+            report = write_result(local, self, only_cloud=only_cloud, formats=wanted)
+            if isinstance(place, Storage):
+                upload(local, place, report["files"])
 
     def pictures(
         self,

@@ -92,7 +92,8 @@ def simulate(
         A folder to keep the run in, so that nothing is lost should this process or its machine
         die; the one that it lies in must exist. It stays there in the end: remove it with
         `remove_run` once the result is where it belongs. Without one, the points are in a
-        temporary folder as long as the result is in use.
+        temporary folder as long as the result is in use. It may be a URL that fsspec opens, such
+        as ``s3://bucket/run``: then the last seconds before this process died are done again.
     parts
         Where the points go, part by part: a folder that the workers see, or a URL that fsspec
         opens, such as ``s3://bucket/survey``. It takes a `folder`, whose database says which
@@ -100,7 +101,8 @@ def simulate(
     resume
         Go on from what an earlier run has left in `folder`; from the beginning if there is
         nothing. `on_frame` gets the frames that it has not had yet, but for those of the last
-        second before the earlier run died, which it gets again.
+        second before the earlier run died, of the last seconds where `folder` is a URL, which it
+        gets again.
 
     Returns
     -------
@@ -135,7 +137,7 @@ def simulate(
     own = client is None
     if own:
         check_backend_here(backend)
-    store = RunStore(job, None if folder is None else Path(folder), parts, resume=resume)
+    store = RunStore(job, folder, parts, resume=resume)
     with store.kept_on_error():
         if store.complete:
             store.db.unlock()

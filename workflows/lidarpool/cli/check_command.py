@@ -15,6 +15,7 @@ from ..base.errors import LidarpoolError
 from . import options
 
 if TYPE_CHECKING:
+    from ..columns.storage import Storage
     from ..run.connection import TlsFiles
     from ..run.job import Job
 
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 @click.option("--json", "as_json", is_flag=True, help="Print it as one JSON document.")
 def check(
     scenario: Path,
-    out: Path,
+    out: Path | Storage,
     scheduler: str | None,
     files: TlsFiles,
     cluster: Path | None,

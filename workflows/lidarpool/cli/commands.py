@@ -36,6 +36,7 @@ from .sensor_command import sensors
 from .view_command import view
 
 if TYPE_CHECKING:
+    from ..columns.storage import Storage
     from ..run.connection import TlsFiles
 
 PROGRAM = "lidarpool"
@@ -105,7 +106,7 @@ for _command in (init, import_, check, schema, scene, sensors, view, plot, expor
 @cli.command()
 @options.out
 @_shown
-def demo(out: Path, **shown: Any) -> None:
+def demo(out: Path | Storage, **shown: Any) -> None:
     """Run the default survey and plan a path, on this machine.
 
     \b

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from ..base.errors import LidarpoolError
 from ..base.vocabulary import FORMATS, LAYOUTS
+from .options import Place
+
+if TYPE_CHECKING:
+    from ..columns.storage import Storage
 
 
 @click.command()
-@click.argument("result", metavar="FOLDER", type=click.Path(path_type=Path))
+@click.argument("result", metavar="FOLDER", type=Place())
 @click.option(
     "--format",
     "-f",
@@ -30,12 +35,16 @@ from ..base.vocabulary import FORMATS, LAYOUTS
 )
 @click.option(
     "--out",
-    type=click.Path(path_type=Path, file_okay=False),
+    type=Place(file_okay=False),
     help="Folder for the files.  [default: FOLDER]",
 )
 @click.option("--overwrite", is_flag=True, help="Replace existing files.")
 def export(
-    result: Path, formats: tuple[str, ...], layout: str, out: Path | None, overwrite: bool
+    result: Path | Storage,
+    formats: tuple[str, ...],
+    layout: str,
+    out: Path | Storage | None,
+    overwrite: bool,
 ) -> None:
     """Write the cloud of a finished result in other formats.
 
@@ -44,33 +53,42 @@ def export(
       lidarpool export lidarpool-out --format laz
       lidarpool export lidarpool-out --format mcap --layout autoware --out bags
     """  # noqa: D301 - click wants the character, not its name
+    from ..columns.storage import Storage
     from ..export.cloud_file import CloudFile
-    from ..export.folder import result_folder
+    from ..export.folder import local_result, result_folder, send
     from ..export.formats import Format
     from ..export.sweeps import SWEEPS_FILE, Sweeps
 
     # The report of a result is moved into place last.
-    for name in ("cloud.ply", SWEEPS_FILE, "report.json"):
-        if not (result / name).exists():
-            raise LidarpoolError(
-                f"{result} holds no {name}: give the folder of a finished run (its --out); "
-                "lidarpool run --resume continues an unfinished one."
-            )
-    sweeps = Sweeps.load(result / SWEEPS_FILE)
-    cloud = CloudFile(result / "cloud.ply")
-    wanted = [Format(name, layout) for name in dict.fromkeys(formats)]
-    written: list[str] = []
-    with result_folder(result if out is None else out) as folder:
-        for one in wanted:  # before any is written, which may take long
-            one.check(folder / one.file, cloud, overwrite=overwrite)
-        try:
-            for one in wanted:
-                one.write(folder / one.file, cloud, sweeps, overwrite=overwrite)
-                written.append(click.format_filename(folder / one.file))
-                for note in one.notes(cloud):
-                    click.echo(f"note: {note}", err=True)
-                click.echo(written[-1])
-        except (LidarpoolError, KeyboardInterrupt) as error:
-            if written:
-                error.add_note(f"Written before: {', '.join(written)}.")
-            raise
+    needed = ("cloud.ply", SWEEPS_FILE, "report.json")
+    place = result if out is None else out
+    with local_result(result, needed) as made:
+        for name in needed:
+            if not (made / name).exists():
+                raise LidarpoolError(
+                    f"{result} holds no {name}: give the folder of a finished run (its --out); "
+                    "lidarpool run --resume continues an unfinished one."
+                )
+        sweeps = Sweeps.load(made / SWEEPS_FILE)
+        cloud = CloudFile(made / "cloud.ply")
+        wanted = [Format(name, layout) for name in dict.fromkeys(formats)]
+        written: list[str] = []
+        with result_folder(place) as folder:
+            for one in wanted:  # before any is written, which may take long
+                one.check(folder / one.file, cloud, overwrite=overwrite)
+                if isinstance(place, Storage) and not overwrite and place.has(one.file):
+                    raise LidarpoolError(
+                        f"{place.path(one.file)} is there already: give another place with --out, "
+                        "or --overwrite."
+                    )
+            try:
+                for one in wanted:
+                    one.write(folder / one.file, cloud, sweeps, overwrite=overwrite)
+                    written.append(click.format_filename(send(folder / one.file, place)))
+                    for note in one.notes(cloud):
+                        click.echo(f"note: {note}", err=True)
+                    click.echo(written[-1])
+            except (LidarpoolError, KeyboardInterrupt) as error:
+                if written:
+                    error.add_note(f"Written before: {', '.join(written)}.")
+                raise

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -21,6 +22,7 @@ from raybeam import available_backends
 from ..base.choice import one_of_each_part
 from ..base.errors import LidarpoolError
 from ..columns.cloud import CHUNK_POINTS
+from ..columns.storage import Storage
 from ..export.formats import Format
 from ..report.output import ROOM_BYTES, refuse_to_replace
 from ..run.checks import check_backend_here, find_workers, slots_needed
@@ -76,7 +78,7 @@ class Sample:
 def forecast(
     job: Job,
     pool: PoolSection,
-    out: Path,
+    out: Path | Storage,
     client: Client | None = None,
     formats: Sequence[Format] = (),
     file: ClusterFile | None = None,
@@ -86,7 +88,7 @@ def forecast(
     Parameters
     ----------
     job, out
-        What is to be run, and the folder of the result; the folder is only looked at.
+        What is to be run, and the place of the result; that is only looked at.
     pool
         Sizes of a cluster on this machine, which is not started.
     client
@@ -138,11 +140,15 @@ def forecast(
     points = sample.points if sample else job.survey.ray_count // job.survey.keep_every
     needed = _worker_bytes(job) if client or file else _machine_bytes(job, points, slots)
     parts, result = _disk_bytes(job, points, len(formats))
-    free = shutil.disk_usage(_existing(out)).free
-    if free < parts + result:
+    # What goes into storage is made in a folder for temporary files, but for the parts.
+    folder = Path(tempfile.gettempdir()) if isinstance(out, Storage) else out
+    needed_here = result if isinstance(out, Storage) else parts + result
+    free = shutil.disk_usage(_existing(folder)).free
+    if free < needed_here:
+        other = "TMPDIR" if isinstance(out, Storage) else "--out"
         reasons.append(
-            f"The disk of {out} has {format_bytes(free)} free, and the run needs about "
-            f"{format_bytes(parts + result)}: make room, name another folder with --out, or take "
+            f"The disk of {folder} has {format_bytes(free)} free, and the run needs about "
+            f"{format_bytes(needed_here)}: make room, name another folder with {other}, or take "
             "a larger keep_every."
         )
     if memory and memory < needed:
@@ -167,7 +173,7 @@ def forecast(
         "backend": backend,
         "slots": slots,
         "memory": {"needed": needed, "there": memory or None},
-        "disk": {"parts": parts, "result": result, "free": free, "folder": str(out)},
+        "disk": {"parts": parts, "result": result, "free": free, "folder": str(folder)},
     }
 
 
@@ -242,14 +248,22 @@ def _existing(out: Path) -> Path:
     return next(path for path in (out, *out.absolute().parents) if path.exists())
 
 
-def _look_at_folder(out: Path) -> tuple[list[str], list[str]]:
+def _look_at_folder(out: Path | Storage) -> tuple[list[str], list[str]]:
     """Return reasons why the result cannot be written there, and notes; changes nothing."""
-    reasons, there = [], _existing(out)
-    if not there.is_dir():
-        reasons.append(f"{there} is a file: give a folder for the results with --out.")
-    elif not os.access(there, os.W_OK | os.X_OK):
-        reasons.append(f"Cannot write to the folder {there}: give another with --out.")
-    if not (out / RUN_FOLDER / FILE).exists():
+    reasons = []
+    if isinstance(out, Storage):
+        try:
+            unfinished = FILE in Storage.at(f"{out}/{RUN_FOLDER}").sizes()
+        except (OSError, LidarpoolError) as error:
+            return [f"{out} cannot be looked at: {error}."], []
+    else:
+        there = _existing(out)
+        if not there.is_dir():
+            reasons.append(f"{there} is a file: give a folder for the results with --out.")
+        elif not os.access(there, os.W_OK | os.X_OK):
+            reasons.append(f"Cannot write to the folder {there}: give another with --out.")
+        unfinished = (out / RUN_FOLDER / FILE).exists()
+    if not unfinished:
         return reasons, []
     note = f"{out} holds an unfinished run: --resume continues it, --fresh deletes it"
     return reasons, [note]

@@ -13,12 +13,28 @@ from ..base.vocabulary import BACKENDS
 
 Command = Callable[..., None]
 
+
+class Place(click.Path):
+    """A folder or file, or the storage of a URL."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(path_type=Path, **options)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Give a Path, or a Storage."""
+        if "://" not in str(value):
+            return super().convert(value, param, ctx)
+        from ..columns.storage import Storage
+
+        return Storage.at(value)
+
+
 out = click.option(
     "--out",
-    type=click.Path(path_type=Path),
+    type=Place(),
     default=Path("lidarpool-out"),
     show_default=True,
-    help="Folder for the results; made if it does not exist.",
+    help="Folder for the results, made if it does not exist, or a URL such as s3://bucket/run.",
 )
 backend = click.option(
     "--backend",

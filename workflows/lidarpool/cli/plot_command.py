@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from ..base.errors import LidarpoolError
 from ..base.vocabulary import PICTURES
+from .options import Place
+
+if TYPE_CHECKING:
+    from ..columns.storage import Storage
 
 
 def _size(ctx: click.Context, param: click.Parameter, value: Any) -> tuple[int, int]:
@@ -22,7 +26,7 @@ def _size(ctx: click.Context, param: click.Parameter, value: Any) -> tuple[int, 
 
 
 @click.command()
-@click.argument("result", metavar="FOLDER", type=click.Path(path_type=Path))
+@click.argument("result", metavar="FOLDER", type=Place())
 @click.option(
     "--only",
     type=click.Choice(PICTURES),
@@ -39,7 +43,7 @@ def _size(ctx: click.Context, param: click.Parameter, value: Any) -> tuple[int, 
 )
 @click.option(
     "--out",
-    type=click.Path(path_type=Path, file_okay=False),
+    type=Place(file_okay=False),
     help="Folder for the pictures.  [default: FOLDER]",
 )
 @click.option(
@@ -50,7 +54,11 @@ def _size(ctx: click.Context, param: click.Parameter, value: Any) -> tuple[int, 
     help="Column to colour the points of the cloud by.",
 )
 def plot(
-    result: Path, only: tuple[str, ...], size: tuple[int, int], out: Path | None, colour: str
+    result: Path | Storage,
+    only: tuple[str, ...],
+    size: tuple[int, int],
+    out: Path | Storage | None,
+    colour: str,
 ) -> None:
     """Draw the pictures of a result again.
 
@@ -60,15 +68,19 @@ def plot(
       lidarpool plot lidarpool-out --only cloud --colour intensity --size 2400x1500 --out figures
     """  # noqa: D301 - click wants the character, not its name
     from ..base.fork_server import keep_freed_memory
+    from ..export.folder import local_folder, local_result, send
     from ..report.pictures import draw_pictures
     from ..run.picture_file import PICTURE_FILE, Pictured
 
-    if not (result / PICTURE_FILE).exists():
-        raise LidarpoolError(
-            f"{result} holds no {PICTURE_FILE}, the data of the pictures: give the "
-            "folder of a finished run (its --out)."
-        )
-    keep_freed_memory()
-    shown = Pictured.load(result / PICTURE_FILE)
-    for path in draw_pictures(shown, result / "cloud.ply", out or result, only, size, colour):
-        click.echo(click.format_filename(path))
+    place = result if out is None else out
+    with local_result(result, (PICTURE_FILE, "cloud.ply")) as made:
+        if not (made / PICTURE_FILE).exists():
+            raise LidarpoolError(
+                f"{result} holds no {PICTURE_FILE}, the data of the pictures: give the "
+                "folder of a finished run (its --out)."
+            )
+        keep_freed_memory()
+        shown, cloud = Pictured.load(made / PICTURE_FILE), made / "cloud.ply"
+        with local_folder(place) as folder:
+            for path in draw_pictures(shown, cloud, folder, only, size, colour):
+                click.echo(click.format_filename(send(path, place)))

@@ -13,12 +13,14 @@ from typing import TYPE_CHECKING, Any
 import click
 from distributed import Client
 
+from ..base.interrupts import deferred_interrupts
 from ..base.open3d_module import load_open3d
 from ..base.vocabulary import PATIENCE_S, WAIT_S
 from ..base.words import counted
-from ..export.folder import result_folder
+from ..columns.storage import Storage
+from ..export.folder import local_result, result_folder
 from ..export.formats import Format
-from ..report.output import CLOUD, refuse_to_replace, write_result
+from ..report.output import CLOUD, refuse_to_replace, upload, write_result
 from ..report.report import summary
 from ..run.checks import TooFewWorkersError, check_backend_here, slots_needed
 from ..run.cluster_file import ClusterFile
@@ -49,7 +51,7 @@ class RunOptions:
     page. `overwrite`: replace the result of another survey. `parts`: where to keep the parts.
     """
 
-    out: Path
+    out: Path | Storage
     scheduler: str | None = None
     cluster: ClusterFile | None = None
     files: TlsFiles | None = None
@@ -106,7 +108,8 @@ def run_scenario(scenario: Scenario, options: RunOptions) -> None:
         else:
             _tell(options.out, result, job, report)
         if live is not None and options.stay:
-            live.stay(options.out / CLOUD)
+            with local_result(options.out, [CLOUD]) as folder:
+                live.stay(folder / CLOUD)
 
 
 def _simulate(
@@ -124,14 +127,15 @@ def _simulate(
     for one in formats:
         one.check_installed()
     load_open3d()  # what writes the cloud in the end
-    with result_folder(options.out):
-        goes_on = options.resume and (options.out / RUN_FOLDER / FILE).exists()
+    out = options.out
+    with result_folder(out) as folder:
+        goes_on = options.resume and FILE in Storage.at(f"{out}/{RUN_FOLDER}").sizes()
         if not (options.overwrite or goes_on):
-            refuse_to_replace(options.out, lambda: identity_of(job))
+            refuse_to_replace(out, lambda: identity_of(job))
         store = _store(job, options)
 
         def in_place() -> None:
-            whole.enter_context(_noting_complete(options.out))
+            whole.enter_context(_noting_complete(out))
             store.remove()
 
         with store.kept_on_error():
@@ -146,13 +150,18 @@ def _simulate(
             what = "the cloud" if only_cloud else "the cloud, the pictures and the report"
             with shown_status(f"writing {what}", options.quiet):
                 report = write_result(
-                    options.out,
+                    folder,
                     result,
                     scenario,
-                    in_place,
+                    (lambda: None) if isinstance(out, Storage) else in_place,
                     only_cloud=only_cloud,
                     formats=formats,
                 )
+            if isinstance(out, Storage):
+                with shown_status(f"copying it to {out}", options.quiet):
+                    upload(folder, out, report["files"])
+                with deferred_interrupts():
+                    in_place()
     return result, report
 
 
@@ -162,7 +171,7 @@ def formats_of(scenario: Scenario) -> list[Format]:
 
 
 @contextmanager
-def _noting_complete(out: Path) -> Iterator[None]:
+def _noting_complete(out: Path | Storage) -> Iterator[None]:
     """Add a note to an error or interrupt that the result is complete."""
     try:
         yield
@@ -187,10 +196,10 @@ def _store(job: Job, options: RunOptions) -> RunStore:
     """Store of the run, with what an earlier run has left if it is to be resumed."""
     if not options.resumable:
         return RunStore(job)
-    path = options.out / RUN_FOLDER
+    place = f"{options.out}/{RUN_FOLDER}"
     if options.fresh:
-        remove_run(path)
-    store = RunStore(job, path, options.parts, resume=options.resume)
+        remove_run(place)
+    store = RunStore(job, place, options.parts, resume=options.resume)
     if options.resume and not store.kept:
         store.notes.append(f"there was nothing to resume in {options.out}")
     return store
@@ -254,7 +263,7 @@ def _local_client(scenario: Scenario, options: RunOptions, planning: bool) -> It
         yield client
 
 
-def _tell(out: Path, result: RunResult, job: Job, report: dict[str, Any]) -> None:
+def _tell(out: Path | Storage, result: RunResult, job: Job, report: dict[str, Any]) -> None:
     for note in report["notes"]:
         click.echo(f"note: {note}")
     if not result.hits:
@@ -277,4 +286,4 @@ def _tell(out: Path, result: RunResult, job: Job, report: dict[str, Any]) -> Non
             else "no path is possible, the obstacles leave no way"
         )
         click.echo(f"{found}; {possible} ({plan.trials} trials, {result.planning_seconds:.1f} s)")
-    click.echo(f"results in {click.format_filename(out)}: {', '.join(report['files'])}")
+    click.echo(f"results in {click.format_filename(str(out))}: {', '.join(report['files'])}")

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
+from .options import Place
+
+if TYPE_CHECKING:
+    from ..columns.storage import Storage
+
 
 @click.command()
-@click.argument("result", type=click.Path(path_type=Path))
+@click.argument("result", type=Place())
 @click.option(
     "--port",
     type=click.IntRange(0, 65_535),
@@ -17,7 +23,7 @@ import click
     help="Port on 127.0.0.1, or the next free one; 0 for any.",
 )
 @click.option("--no-browser", is_flag=True, help="Only print the address.")
-def view(result: Path, port: int, no_browser: bool) -> None:
+def view(result: Path | Storage, port: int, no_browser: bool) -> None:
     """Show a result or a cloud in the browser.
 
     \b
@@ -25,6 +31,9 @@ def view(result: Path, port: int, no_browser: bool) -> None:
       lidarpool view lidarpool-out
       lidarpool view lidarpool-out/cloud.ply --no-browser
     """  # noqa: D301 - click wants the character, not its name
-    from ..live.result_page import view_result
+    from ..export.folder import local_result
+    from ..live.result_page import CLOUD, view_result
+    from ..run.picture_file import PICTURE_FILE
 
-    view_result(result, port=port, browser=not no_browser)
+    with local_result(result, (CLOUD, PICTURE_FILE)) as made:
+        view_result(made, port=port, browser=not no_browser)

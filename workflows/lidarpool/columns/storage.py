@@ -1,4 +1,4 @@
-"""Where the parts of a run are: a folder, or whatever else fsspec opens.
+"""Where runs and results are kept: in a folder, or whatever else fsspec opens.
 
 A file is there whole or not at all: in a folder it is written under a temporary name and renamed,
 and an object store shows an object when it has been put.
@@ -20,6 +20,11 @@ from ..base.errors import LidarpoolError
 _TEMPORARY = ".tmp-"
 
 
+def is_url(place: str | Path) -> bool:
+    """Whether a place is a URL, not a path."""
+    return "://" in str(place)
+
+
 @dataclass(frozen=True)
 class Storage:
     """A folder of files, by path or URL; small when pickled.
@@ -39,15 +44,30 @@ class Storage:
 
     @classmethod
     def at(cls, place: str | Path, *, durable: bool = True) -> Storage:
-        """Storage at a path, made absolute, or a URL."""
+        """Storage at a path, made absolute, or a URL.
+
+        Raises
+        ------
+        LidarpoolError
+            If the URL holds a password, which would get into databases and reports.
+        """
         text = str(place)
-        url = text.rstrip("/") if "://" in text else str(Path(text).absolute())
-        return cls(url, durable)
+        if not is_url(text):
+            return cls(str(Path(text).absolute()), durable)
+        if ":" in text.partition("://")[2].partition("/")[0].rpartition("@")[0]:
+            raise LidarpoolError(
+                f"A URL for {text.partition(':')[0]} holds a password: leave that out, and give "
+                "it by the environment or the configuration of that storage's library."
+            )
+        return cls(text.rstrip("/"), durable)
+
+    def __str__(self) -> str:
+        return self.url
 
     @property
     def is_local(self) -> bool:
         """Whether it is a folder of a file system of this machine's."""
-        return "://" not in self.url
+        return not is_url(self.url)
 
     @cached_property
     def _remote(self) -> tuple[Any, str]:
@@ -55,9 +75,11 @@ class Storage:
         import fsspec
 
         try:
-            system, folder = fsspec.core.url_to_fs(self.url, skip_instance_cache=True)
+            system, folder = fsspec.core.url_to_fs(self.url)
         except (ImportError, ValueError) as error:
-            raise LidarpoolError(f"{self.url} cannot be opened: {error}.") from error
+            extra = 'pip install "lidarpool[s3]"' if self.url.startswith("s3://") else ""
+            hint = f": {extra}" if extra and isinstance(error, ImportError) else ""
+            raise LidarpoolError(f"{self.url} cannot be opened: {error}{hint}.") from error
         return system, folder
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -80,7 +102,32 @@ class Storage:
             return
         with suppress(FileExistsError), _as_os_error():
             system, folder = self._remote
-            system.makedirs(folder, exist_ok=True)
+            # An object store has no folders, and s3fs would make a bucket whose name is mistyped.
+            if folder.startswith("/"):
+                system.makedirs(folder, exist_ok=True)
+
+    def claim(self) -> None:
+        """Make the folder, and see that files can be written there and removed.
+
+        Raises
+        ------
+        LidarpoolError
+            If not; it says what to do.
+        """
+        name = f"{_TEMPORARY}{secrets.token_hex(4)}"
+        try:
+            self.prepare()
+            self.write(name, b"")
+            self.remove([name])
+        except FileNotFoundError as error:
+            raise LidarpoolError(
+                f"Cannot write to {self.url} ({error}): make the bucket first, or give another."
+            ) from error
+        except OSError as error:
+            raise LidarpoolError(
+                f"Cannot write to {self.url} ({error}): look at the credentials and rights that "
+                "its library finds, and at its address."
+            ) from error
 
     def write(self, name: str, data: Any) -> None:
         """Write a file, whole or not at all, and be sure that it stays.
@@ -138,6 +185,27 @@ class Storage:
             system, folder = self._remote
             return bytes(system.cat_file(f"{folder}/{name}"))
 
+    def put(self, path: Path, name: str) -> None:
+        """Copy a file of this machine, or a folder of files, into the storage.
+
+        Raises
+        ------
+        OSError
+            If that fails, as in `get`.
+        """
+        with _as_os_error():
+            system, folder = self._remote
+            for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
+                if file.is_file():
+                    below = file.relative_to(path).as_posix() if file != path else ""
+                    system.put_file(str(file), f"{folder}/{name}/{below}".rstrip("/"))
+
+    def get(self, name: str, path: Path) -> None:
+        """Copy a file of the storage to this machine."""
+        with _as_os_error():
+            system, folder = self._remote
+            system.get_file(f"{folder}/{name}", str(path))
+
     def sees(self, name: str, data: bytes) -> bool:
         """Whether a file is there with this content: whether this process sees the same place."""
         try:
@@ -180,6 +248,26 @@ class Storage:
                 with suppress(FileNotFoundError), _as_os_error():
                     system, folder = self._remote
                     system.rm_file(f"{folder}/{name}")
+
+    def has(self, name: str) -> bool:
+        """Whether there is a file or folder of this name; OSError if that cannot be told."""
+        with _as_os_error():
+            system, folder = self._remote
+            system.invalidate_cache()
+            return bool(system.exists(f"{folder}/{name}"))
+
+    def discard(self, name: str) -> None:
+        """Remove a file or folder of the storage with all that is in it, if it is there.
+
+        Raises
+        ------
+        OSError
+            If it cannot be removed.
+        """
+        with suppress(FileNotFoundError), _as_os_error():
+            system, folder = self._remote
+            system.invalidate_cache()
+            system.rm(f"{folder}/{name}", recursive=True)
 
     def remove_folder(self) -> None:
         """Remove the folder where nothing is in it any more."""

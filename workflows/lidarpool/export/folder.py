@@ -8,27 +8,41 @@ import os
 import secrets
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 from ..base.errors import LidarpoolError
+from ..columns.storage import Storage, is_url
 
+LAST_FILE = "report.json"  # of a result: whatever has it is whole
 _WRITING = ".writing-"  # folder of what is being made; one of a killed program goes at the next
 
 
+def output_place(text: str | Path) -> Path | Storage:
+    """Where a result is or goes: a folder, or storage where a URL is given."""
+    return Storage.at(text) if is_url(text) else Path(text)
+
+
 @contextmanager
-def result_folder(folder: Path) -> Iterator[Path]:
+def result_folder(place: Path | Storage) -> Iterator[Path]:
     """Claim a folder for a result or export: made if it is not there, writable, ours alone.
 
     What a killed run or export was writing there is removed; and, if the body ends without
-    leaving anything, folders that were made for it.
+    leaving anything, folders that were made for it. For storage it is a temporary folder, whose
+    files are to be put into the storage.
 
     Raises
     ------
     LidarpoolError
         If it is a file, cannot be made or written to, or another run or export uses it.
     """
+    if isinstance(place, Storage):
+        place.claim()
+        with local_folder(place) as folder:
+            yield folder
+        return
+    folder = place
     if folder.exists() and not folder.is_dir():
         raise LidarpoolError(f"{folder} is a file: give a folder with --out.")
     made = [path for path in (folder, *folder.parents) if not path.exists()]  # innermost first
@@ -54,6 +68,79 @@ def result_folder(folder: Path) -> Iterator[Path]:
             if path.exists() and not any(path.iterdir()):
                 path.rmdir()
         os.close(lock)
+
+
+@contextmanager
+def local_result(place: Path | Storage, names: Sequence[str]) -> Iterator[Path]:
+    """Give the folder of a result: for one in storage, a temporary copy of some of its files.
+
+    Raises
+    ------
+    LidarpoolError
+        If the storage cannot be read, or holds no whole result.
+    """
+    with local_folder(place) as folder:
+        if not isinstance(place, Storage):
+            yield folder
+            return
+        try:
+            there = place.sizes()
+            if LAST_FILE not in there:
+                raise LidarpoolError(
+                    f"{place.url} holds no whole result, which has a {LAST_FILE}: give the URL of "
+                    "a finished run (its --out); lidarpool run --resume continues an unfinished "
+                    "one."
+                )
+            for name in (*names, LAST_FILE):
+                if name in there:
+                    place.get(name, folder / name)
+        except OSError as error:
+            raise LidarpoolError(
+                f"{place.url} cannot be read: {error.strerror or error}."
+            ) from error
+        yield folder
+
+
+def send(path: Path, place: Path | Storage) -> str:
+    """Put what was made in the folder of a place into its storage, if it has one.
+
+    Parameters
+    ----------
+    path
+        A file or folder in the folder that `result_folder` gave.
+    place
+        The place of that folder; what it has of that name is replaced.
+
+    Returns
+    -------
+    Path or URL that it can be found at, for people.
+
+    Raises
+    ------
+    LidarpoolError
+        If the storage cannot be written to.
+    """
+    if not isinstance(place, Storage):
+        return str(path)
+    url = place.path(path.name)
+    try:
+        place.discard(path.name)
+        place.put(path, path.name)
+    except OSError as error:
+        raise LidarpoolError(f"{url} cannot be written: {error.strerror or error}.") from error
+    return url
+
+
+@contextmanager
+def local_folder(place: Path | Storage) -> Iterator[Path]:
+    """Give a folder itself, and for storage a temporary one with the last name of its URL."""
+    if not isinstance(place, Storage):
+        yield place
+        return
+    with tempfile.TemporaryDirectory(prefix="lidarpool-") as temporary:
+        folder = Path(temporary, place.url.rpartition("/")[2])
+        folder.mkdir()
+        yield folder
 
 
 def staging(folder: Path) -> Path:

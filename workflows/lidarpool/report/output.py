@@ -12,8 +12,8 @@ from typing import Any
 from ..base.errors import LidarpoolError
 from ..base.interrupts import deferred_interrupts
 from ..base.vocabulary import FORMATS, PICTURES
-from ..columns.storage import flush
-from ..export.folder import staging
+from ..columns.storage import Storage, flush
+from ..export.folder import LAST_FILE, staging
 from ..export.formats import Format, remove
 from ..export.ply import save_cloud
 from ..export.sweeps import SWEEPS_FILE, Sweeps
@@ -25,7 +25,7 @@ from .report import make_report
 
 ROOM_BYTES = 32 << 20  # room for pictures and report
 
-CLOUD, PAGE, REPORT = "cloud.ply", "report.html", "report.json"
+CLOUD, PAGE, REPORT = "cloud.ply", "report.html", LAST_FILE
 _OF_CLOUD = "cloud.png"  # is drawn from the cloud's file
 _IMAGES = tuple(f"{name}.png" for name in PICTURES)
 FILES = (CLOUD, *_IMAGES, PICTURE_FILE, SWEEPS_FILE, PAGE, REPORT)
@@ -33,13 +33,13 @@ _SURVEY = ("scene", "survey")  # what tells one from another
 EXPORTS = tuple(file for file, _ in FORMATS.values())
 
 
-def refuse_to_replace(folder: Path, identity: Callable[[], Mapping[str, str]]) -> None:
+def refuse_to_replace(place: Path | Storage, identity: Callable[[], Mapping[str, str]]) -> None:
     """Refuse a folder that holds the result of another survey.
 
     Parameters
     ----------
-    folder
-        Folder for the new result.
+    place
+        Place for the new result.
     identity
         Returns that of this result, see `RunResult.identity`; large scenes take a moment.
 
@@ -49,7 +49,8 @@ def refuse_to_replace(folder: Path, identity: Callable[[], Mapping[str, str]]) -
         If there is a result of another scene or survey, or one that cannot be read.
     """
     try:
-        report = json.loads((folder / REPORT).read_text("utf-8"))
+        storage = place if isinstance(place, Storage) else Storage.at(place)
+        report = json.loads(storage.read(REPORT))
         there = {name: report["identity"][name] for name in _SURVEY}
     except (FileNotFoundError, NotADirectoryError):
         return
@@ -58,7 +59,7 @@ def refuse_to_replace(folder: Path, identity: Callable[[], Mapping[str, str]]) -
     here = identity()
     if there != {name: here[name] for name in _SURVEY}:
         raise LidarpoolError(
-            f"{folder} holds the result of another survey: give another folder with --out, or "
+            f"{place} holds the result of another survey: give another folder with --out, or "
             "replace it with --overwrite (in Python overwrite=True)."
         )
 
@@ -155,3 +156,24 @@ def _publish(staged: Path, folder: Path, files: Collection[str]) -> None:
         if name in files:
             (staged / name).replace(folder / name)
     flush(folder)
+
+
+def upload(folder: Path, storage: Storage, files: Collection[str]) -> None:
+    """Put a whole result into storage, in the order of `_publish`.
+
+    Raises
+    ------
+    LidarpoolError
+        If that fails.
+    """
+    try:
+        for name in (REPORT, PAGE, *EXPORTS, *FILES):
+            if name in (REPORT, PAGE) or name in EXPORTS or name not in files:
+                storage.discard(name)
+        for name in (*EXPORTS, *FILES):
+            if name in files:
+                storage.put(folder / name, name)
+    except OSError as error:
+        raise LidarpoolError(
+            f"The result cannot be written to {storage.url} ({error.strerror or error})."
+        ) from error

@@ -14,6 +14,7 @@ import numpy as np
 
 from .._version import __version__
 from ..base.task_book import StageTotals, union
+from ..columns.storage import Storage
 from ..run.result import RunResult
 from ..run.trials import TRIAL
 from ..scan import COLLECT, GENERATE, INTERSECT, SORT
@@ -90,7 +91,7 @@ def make_report(
     }
 
 
-def summary(folder: Path, report: dict[str, Any]) -> dict[str, Any]:
+def summary(folder: Path | Storage, report: dict[str, Any]) -> dict[str, Any]:
     """Return what `--json` prints: main figures of a report, and where the files are.
 
     Parameters
@@ -103,7 +104,7 @@ def summary(folder: Path, report: dict[str, Any]) -> dict[str, Any]:
     planning = report["planning"]
     return {
         "folder": str(folder),
-        "files": {name: str(folder / name) for name in report["files"]},
+        "files": {name: f"{folder}/{name}" for name in report["files"]},
         **{name: report[name] for name in _FIGURES},
         "planning": planning and {name: planning[name] for name in _PLANNING},
     }

@@ -160,7 +160,7 @@ class Run:
             if isinstance(error, _CLUSTER_LOST) or (lost and isinstance(error, Exception)):
                 raise self._told_lost() from error
             raise
-        self.store.db.save_frames()
+        self.store.save(now=True)
         self.store.tidy()
         return make_result(
             self.store,
@@ -233,7 +233,7 @@ class Run:
             now = time.monotonic()
             if now - saved >= SAVE_EVERY_S:
                 saved = now
-                self.store.db.save_frames()
+                self.store.save()
             watch.look(now)
             if on_progress and (now - told >= PROGRESS_EVERY_S or len(times) == len(pumps)):
                 told = now

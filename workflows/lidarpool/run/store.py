@@ -1,4 +1,4 @@
-"""What a run keeps: its database and its parts, in a folder that a later run can go on from."""
+"""What a run keeps, in a folder or storage: database and parts, for a later run to go on from."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ..base.arguments import checked
 from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud
 from ..columns.parts import SUFFIX, StoredCloud, read_part, read_tally
-from ..columns.storage import Storage
+from ..columns.storage import Storage, is_url
 from ..export.sweeps import Sweeps
 from ..scan.database import FILE, RunDatabase, parts_place
 from ..scan.messages import Receipt, samples_of_scan, summary_type
@@ -27,6 +27,7 @@ from .checks import AUTO_TAKES
 from .identity import difference, identity_of
 from .job import Job
 from .progress import Progress
+from .remote import OWNER, RemoteRun, fetch_database
 
 PARTS = "parts"  # the folder of the parts, in the run's folder
 RUN_FOLDER = "run"  # the run's folder in that of the output, until the result is whole
@@ -44,9 +45,9 @@ class RunStore:
     ----------
     job
         What the run does.
-    folder
-        Where they are kept; None for a temporary folder that goes with the last user of the
-        points.
+    place
+        Where they are kept, a folder or a URL; None for a temporary folder that goes with the
+        last user of the points.
     parts
         Another place for the parts, a path or URL, in which they get a folder of their own. A
         run that is resumed goes on where its parts are.
@@ -58,32 +59,38 @@ class RunStore:
     LidarpoolError
         If it holds an unfinished run and that is not to be resumed, or cannot be: it is damaged,
         of another run, in use, or cast with another backend than is asked for; or if there are
-        `parts` without a `folder`, whose database says which parts there are.
+        `parts` without a `place`, whose database says which parts there are.
     """
 
     def __init__(
         self,
         job: Job,
-        folder: Path | None = None,
+        place: str | Path | None = None,
         parts: str | Path | None = None,
         *,
         resume: bool = False,
     ) -> None:
-        if parts is not None and folder is None:
+        if parts is not None and place is None:
             raise LidarpoolError(
                 "parts are given a place, and nothing would know of them afterwards: give a "
                 "folder for the run as well."
             )
         self.job = job
-        self.lasting = folder is not None
+        self.lasting = place is not None
         self.notes: list[str] = []  # what a user should know
         self.on_parts: Callable[[list[Receipt]], None] | None = None  # called with new ones
         self._gone = False
         self.identity = here = identity_of(job)
-        if folder is None:
+        self._remote = None
+        if place is None or is_url(place):
             folder = Path(tempfile.mkdtemp(prefix="lidarpool-"))
             weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
-        self.folder = folder
+            if place is not None:
+                self._remote = RemoteRun(Storage.at(place))
+        else:
+            folder = Path(place)
+        self.place = self._remote.storage.url if self._remote else folder  # for people
+        self._folder = folder  # of the database
         made = not folder.exists()
         try:
             folder.mkdir(exist_ok=True)
@@ -95,10 +102,13 @@ class RunStore:
         try:
             self.db = self._open(here, parts)
             try:
-                self.storage = _storage(folder, self.db.meta["parts"], durable=self.lasting)
+                durable = self.lasting
+                self.storage = _storage(self.place, self.db.meta["parts"], durable=durable)
                 sizes = self._sizes()  # also an error if the place cannot be opened
                 if self.kept:
                     self._go_on(here, resume, sizes)
+                if self._remote:
+                    self._remote.claim(self.db)
             except BaseException:
                 self.db.close()
                 raise
@@ -110,15 +120,25 @@ class RunStore:
 
     def _open(self, here: dict[str, str], parts: str | Path | None) -> RunDatabase:
         """Open the database, a new one unless something is committed in that which is there."""
-        path, count = self.folder / FILE, self.job.survey.scan_count
-        if path.exists():
-            db = RunDatabase(path, count, durable=self.lasting)
-            if db.scans_done or db.trials:
-                return db
-            db.close()
-        remove_run(self.folder)
-        self.folder.mkdir(exist_ok=True)
-        db = RunDatabase(path, count, durable=self.lasting)
+        path, count = self._folder / FILE, self.job.survey.scan_count
+        durable = self.lasting and self._remote is None
+        try:
+            if self._remote:
+                fetch_database(self._remote.storage, self._folder)
+            if path.exists():
+                db = RunDatabase(path, count, durable=durable)
+                if db.scans_done or db.trials:
+                    return db
+                db.close()
+        except LidarpoolError as error:  # the copy of a database is nobody's business
+            raise LidarpoolError(str(error).replace(str(self._folder), str(self.place))) from error
+        except OSError as error:
+            raise LidarpoolError(f"The run in {self.place} cannot be read: {error}.") from error
+        if self.lasting:
+            remove_run(self.place)
+        path.unlink(missing_ok=True)
+        self._folder.mkdir(exist_ok=True)
+        db = RunDatabase(path, count, durable=durable)
         place = "" if parts is None else f"{Storage.at(parts).url}/run-{secrets.token_hex(4)}"
         db.set(identity=json.dumps(here), parts=place)
         return db
@@ -127,17 +147,17 @@ class RunStore:
         """Check that this run may go on from what is there."""
         if other := difference(here, json.loads(self.db.meta["identity"])):
             raise LidarpoolError(
-                f"The run in {self.folder} cannot be continued, {other}. Drop it with {_DROP}, or "
+                f"The run in {self.place} cannot be continued, {other}. Drop it with {_DROP}, or "
                 "give another folder."
             )
         if not resume:
             raise LidarpoolError(
-                f"{self.folder} holds an unfinished run, {self.kept}: continue it with {_RESUME}, "
+                f"{self.place} holds an unfinished run, {self.kept}: continue it with {_RESUME}, "
                 f"or drop it with {_DROP}."
             )
         if self.job.backend not in ("auto", self.backend):
             raise LidarpoolError(
-                f"Backend {self.job.backend!r} is asked for, and the scans in {self.folder} were "
+                f"Backend {self.job.backend!r} is asked for, and the scans in {self.place} were "
                 f"cast with {self.backend!r}: continue with that, or drop them with {_DROP}."
             )
         absent = [p for p in self.db.ordered if sizes.get(p.name) != p.size]
@@ -189,7 +209,7 @@ class RunStore:
         if not self.resumed:
             return AUTO_TAKES
         return (
-            f"The scans in {self.folder} were cast with it: continue where it is to be had, or "
+            f"The scans in {self.place} were cast with it: continue where it is to be had, or "
             f"drop them with {_DROP}."
         )
 
@@ -266,6 +286,18 @@ class RunStore:
 
     # -- the end -----------------------------------------------------------------------------
 
+    def save(self, *, now: bool = False) -> None:
+        """Keep how many frames were handed out; where it is time or `now`, copy the database.
+
+        Raises
+        ------
+        LidarpoolError
+            If that fails, or another run has taken over.
+        """
+        self.db.save_frames()
+        if self._remote:
+            self._remote.save(self.db, now=now)
+
     def tidy(self) -> None:
         """Remove parts that are not of the result: their collectors died, or were not needed."""
         ours = {part.name for part in self.db.parts.values()}
@@ -274,9 +306,11 @@ class RunStore:
 
     def remove(self) -> None:
         """Remove all of it: the result is where it belongs."""
+        if self._remote:
+            self._remote.check()
         self._gone = True
         self.db.close()
-        remove_run(self.folder)
+        remove_run(self.place)
 
     @contextmanager
     def kept_on_error(self) -> Iterator[None]:
@@ -287,19 +321,21 @@ class RunStore:
             if self._gone or not self.lasting:
                 raise
             with suppress(LidarpoolError):  # the first error is the one to tell of
-                self.db.save_frames()
+                self.save(now=True)
             self.db.close()
+            if self._remote and self._remote.lost:
+                raise
             if not self.kept:
                 with suppress(LidarpoolError):
-                    remove_run(self.folder)
-            elif (self.folder / FILE).exists():
-                error.add_note(f"{self.kept} are kept in {self.folder}: continue with {_RESUME}.")
+                    remove_run(self.place)
+            elif (self._folder / FILE).exists():
+                error.add_note(f"{self.kept} are kept in {self.place}: continue with {_RESUME}.")
             raise
 
 
-def _storage(folder: Path, place: str, *, durable: bool = True) -> Storage:
-    """Where the parts of a run are: in its folder, or in a place of their own."""
-    return Storage.at(place or folder / PARTS, durable=durable)
+def _storage(place: str | Path, parts: str, *, durable: bool = True) -> Storage:
+    """Where the parts of a run are: below the run's place, or in a place of their own."""
+    return Storage.at(parts or f"{place}/{PARTS}", durable=durable)
 
 
 @checked
@@ -309,21 +345,24 @@ def remove_run(folder: str | Path) -> None:
     Parameters
     ----------
     folder
-        The run's folder.
+        The run's folder, or its URL.
 
     Raises
     ------
     LidarpoolError
         If it cannot be removed.
     """
-    folder = Path(folder)
-    storage = _storage(folder, parts_place(folder / FILE))
+    kept = Storage.at(folder)
     try:
+        with tempfile.TemporaryDirectory(prefix="lidarpool-") as temporary:
+            if not kept.is_local:
+                fetch_database(kept, Path(temporary))
+            parts = parts_place(Path(folder if kept.is_local else temporary) / FILE)
+        storage = _storage(folder, parts)
         storage.remove([name for name in storage.sizes() if SUFFIX in name])
         storage.remove_folder()
-        for name in (FILE, f"{FILE}-journal"):
-            (folder / name).unlink(missing_ok=True)
-        Storage.at(folder).remove_folder()
+        kept.remove([FILE, f"{FILE}-journal", OWNER])
+        kept.remove_folder()
     except OSError as error:
         raise LidarpoolError(
             f"The run in {folder} cannot be removed: {error.strerror or error}."

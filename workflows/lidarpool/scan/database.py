@@ -227,6 +227,11 @@ class RunDatabase:
             with self._transaction():
                 self._write_frames()
 
+    def copy(self) -> bytes:
+        """Content of the file, as it is after the last transaction."""
+        with self._explained():
+            return self._sql.serialize()
+
     def unlock(self) -> None:
         """Let others use the file; what is in it can still be read."""
         with self._explained():

@@ -1,0 +1,145 @@
+"""A run in storage: it goes on from the last copy of its database, by one driver at a time."""
+
+from __future__ import annotations
+
+import pytest
+from tests.lidarpool.test_store import JOB, OTHERS, add
+
+import lidarpool.run.remote
+from lidarpool import LidarpoolError, remove_run
+from lidarpool.columns.storage import Storage
+from lidarpool.run.store import RunStore
+
+
+@pytest.fixture
+def url(tmp_path, monkeypatch):
+    """URL of a run whose driver has no folder that stays."""
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    return f"memory://{tmp_path.name}/run"
+
+
+@pytest.fixture
+def unfinished(url):
+    """URL of a run whose driver died when two of six scans were in the copy of its database."""
+    store = RunStore(JOB, url)
+    store.backend = "numpy"
+    add(store, 0, 2)
+    store.save(now=True)
+    add(store, 3, 5)
+    store.db.close()
+    return url
+
+
+def left(url):
+    return {*Storage.at(url).sizes(), *Storage.at(f"{url}/parts").sizes()}
+
+
+def test_it_goes_on_from_the_last_copy(unfinished):
+    store = RunStore(JOB, unfinished, resume=True)
+    assert (store.resumed, store.backend, store.notes) == (2, "numpy", [])
+    assert store.db.missing(0, 6) == [(2, 6)]
+    assert add(store, 2, 6)
+    store.db.frames = 6
+    store.save(now=True)
+    store.tidy()
+    assert left(unfinished) == {"run.db", "run.owner", "0-0.npz", "2-0.npz"}
+    again = RunStore(JOB, unfinished, resume=True)
+    assert again.complete and len(again.points().load()) == 18
+    again.remove()
+    assert left(unfinished) == set()
+
+
+def test_it_is_refused_or_dropped(unfinished):
+    kept = f"{unfinished} holds an unfinished run, 2 of 6 scans: continue it with --resume"
+    with pytest.raises(LidarpoolError, match=kept):
+        RunStore(JOB, unfinished)
+    with pytest.raises(LidarpoolError, match=f"{unfinished} cannot be continued, .* another scene"):
+        RunStore(OTHERS["scene"], unfinished, resume=True)
+    remove_run(unfinished)
+    remove_run(unfinished)
+    assert left(unfinished) == set()
+    assert RunStore(OTHERS["scene"], unfinished).resumed == 0
+
+
+def test_one_of_another_format(unfinished, monkeypatch):
+    monkeypatch.setattr("lidarpool.scan.database.FORMAT", 99)
+    with pytest.raises(LidarpoolError, match=rf"^{unfinished}/run.db is damaged \(it is of format"):
+        RunStore(JOB, unfinished, resume=True)
+
+
+def test_copies_are_made_now_and_then(url, monkeypatch):
+    store = RunStore(JOB, url)
+    first = Storage.at(url).read("run.db")
+    add(store, 0, 2)
+    store.save()
+    assert Storage.at(url).read("run.db") == first
+    monkeypatch.setattr(store._remote, "_due", 0.0)
+    store.save()
+    assert Storage.at(url).read("run.db") != first
+
+
+def test_parts_elsewhere_are_found_and_go_too(url, tmp_path):
+    parts = f"memory://{tmp_path.name}/elsewhere"
+    store = RunStore(JOB, url, parts)
+    add(store, 0, 2)
+    store.save(now=True)
+    again = RunStore(JOB, url, resume=True)
+    assert again.resumed == 2 and again.storage.url.startswith(f"{parts}/run-")
+    remove_run(url)
+    assert left(url) == set() == again.storage.sizes().keys()
+
+
+@pytest.mark.parametrize("how", ["resumed", "dropped"])
+def test_a_run_that_is_taken_over_ends_and_leaves_all_to_the_other(how, url):
+    early = RunStore(JOB, url)
+    add(early, 0, 2)
+    early.save(now=True)
+    if how == "dropped":
+        remove_run(url)
+    late = RunStore(JOB, url, resume=True)
+    add(late, 2, 6)
+    late.save(now=True)
+    before = left(url)
+    with (
+        pytest.raises(LidarpoolError, match=f"goes on with what is in {url}") as caught,
+        early.kept_on_error(),
+    ):
+        early.save(now=True)
+    assert not hasattr(caught.value, "__notes__")
+    assert left(url) == before
+    late.save(now=True)
+    again = RunStore(JOB, url, resume=True)
+    assert again.resumed == (6 if how == "resumed" else 4)
+    with pytest.raises(LidarpoolError, match="this one has ended"), late.kept_on_error():
+        late.remove()
+    assert left(url) == before
+
+
+def test_an_error_tells_how_to_go_on(url):
+    store = RunStore(JOB, url)
+    with pytest.raises(KeyboardInterrupt) as caught, store.kept_on_error():
+        add(store, 0, 2)
+        raise KeyboardInterrupt
+    (note,) = caught.value.__notes__
+    assert note.startswith(f"2 of 6 scans are kept in {url}: continue with --resume")
+    assert RunStore(JOB, url, resume=True).resumed == 2
+
+
+def test_an_error_before_anything_was_kept_leaves_nothing(url):
+    store = RunStore(JOB, url)
+    with pytest.raises(ValueError, match="bad"), store.kept_on_error():
+        raise ValueError("bad")
+    assert left(url) == set()
+
+
+def test_storage_that_fails(url, monkeypatch):
+    store = RunStore(JOB, url)
+
+    def fail(*_):
+        raise OSError("it is full")
+
+    monkeypatch.setattr(lidarpool.run.remote.Storage, "write", fail)
+    with pytest.raises(LidarpoolError, match=rf"cannot be kept in {url} \(it is full\)"):
+        store.save(now=True)
+    with pytest.raises(LidarpoolError, match=rf"Cannot write to {url} \(it is full\)"):
+        RunStore(JOB, url, resume=True)

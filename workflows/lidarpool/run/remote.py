@@ -1,0 +1,104 @@
+"""The database of a run that is kept in storage which is no disk, such as an object store.
+
+SQLite writes to disks only, so the database is in a temporary folder of the driver, and a copy of
+it is put into the storage every few seconds. Whoever goes on from a copy casts again what was
+committed after it; the parts of that are in no database, and are removed in the end.
+"""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from ..base.errors import LidarpoolError
+from ..columns.storage import Storage
+from ..scan.database import FILE, RunDatabase
+
+OWNER = "run.owner"  # the mark of the run that may write the copy
+COPY_EVERY_S = 5.0
+COPY_REST = 20  # a copy that takes a second is followed by none for so many seconds
+
+
+class RemoteRun:
+    """A run in storage: copies of its database, and who may write them.
+
+    A run that goes on from what another has left takes it over. Should that be alive after all,
+    it finds out before its next copy, and ends.
+
+    Parameters
+    ----------
+    storage
+        Where the run is.
+
+    Raises
+    ------
+    LidarpoolError
+        If nothing can be written there; in all methods, if the storage fails.
+    """
+
+    def __init__(self, storage: Storage) -> None:
+        storage.claim()
+        self.storage = storage
+        self.lost = False  # whether another run has taken over
+        self._mark = secrets.token_hex(8).encode()
+        self._due = float("-inf")
+
+    def claim(self, db: RunDatabase) -> None:
+        """Take the run over, and put a first copy there."""
+        with self._explained():
+            self.storage.write(OWNER, self._mark)
+        self.save(db)
+
+    def save(self, db: RunDatabase, *, now: bool = False) -> None:
+        """Put a copy of the database into the storage, if it is time or `now`.
+
+        Raises
+        ------
+        LidarpoolError
+            If another run has taken over; or as above.
+        """
+        began = time.monotonic()
+        if began < self._due and not now:
+            return
+        self.check()
+        with self._explained():
+            self.storage.write(FILE, db.copy())
+        ended = time.monotonic()
+        self._due = ended + max(COPY_EVERY_S, COPY_REST * (ended - began))
+
+    def check(self) -> None:
+        """Check that the run is still this one's; LidarpoolError if another has taken over."""
+        with self._explained():
+            try:
+                self.lost = self.storage.read(OWNER) != self._mark
+            except FileNotFoundError:  # a later one was done with it
+                self.lost = True
+        if self.lost:
+            raise LidarpoolError(
+                f"Another run, which was started later, goes on with what is in {self.storage.url} "
+                "or has dropped it: this one has ended."
+            )
+
+    @contextmanager
+    def _explained(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise LidarpoolError(
+                f"The run cannot be kept in {self.storage.url} ({error.strerror or error})."
+            ) from error
+
+
+def fetch_database(storage: Storage, folder: Path) -> None:
+    """Copy the database of a run, if there is one, into a folder of this machine.
+
+    Raises
+    ------
+    OSError
+        If the storage cannot be read.
+    """
+    if FILE in storage.sizes():
+        storage.get(FILE, folder / FILE)
