@@ -128,7 +128,7 @@ def test_a_client_that_cannot_be_asked(_threads):
         part = Partition("A", client)
         assert len(part) == 2
     for ask in (part.stats, part.grow, lambda: len(part), lambda: part.map(twice, [1])):
-        with pytest.raises(PoolError, match="The client is closed: make another one"):
+        with pytest.raises(PoolError, match="The client is closed: make a new client"):
             ask()
     with pytest.raises(PoolError, match="The client is closed"):
         Pool.from_client(client)
