@@ -10,7 +10,7 @@ import pytest
 
 from lidarpool import LidarpoolError
 from lidarpool.sensor.models import load_sensor, model_names, read_model
-from lidarpool.sensor.rays import ListedSensor, PrismSensor
+from lidarpool.sensor.rays import ListedSensor, Prism, PrismSensor
 
 READY = [name for name in model_names() if not read_model(name).needs_calibration]
 
@@ -163,7 +163,8 @@ def test_refraction_is_that_of_the_scalar_law():
     def sine(ratio, degrees):
         return np.degrees(np.arcsin(ratio * np.sin(np.radians(degrees))))
 
-    sensor = PrismSensor(wedge_deg=18, index=1.5089, rpm=(0, 0), phase_deg=(90, 90))
+    back_to_back = (Prism(18, 1.5089, 0, 90), Prism(18, 1.5089, 0, 90, inclined_first=True))
+    sensor = PrismSensor(prisms=back_to_back)
     (_, y, z) = sensor.directions(np.array([0]))[0, 0]
     angle = 18 + sine(1.5089, 0 - 18)  # out of the inclined face of the first
     angle = -18 + sine(1 / 1.5089, angle + 18)  # into that of the second

@@ -4,7 +4,7 @@ from .beams import Beams, Head, Mirror, Spin
 from .materials import Material
 from .noise import Noise
 from .optics import Optics, Returns
-from .rays import ListedSensor, PrismSensor
+from .rays import ListedSensor, Prism, PrismSensor
 from .sensor import LineSensor, Sensor
 from .survey import Mounted, ScanSpec, Survey
 from .trajectory import Pose, Stations, Track, Trajectory
@@ -21,6 +21,7 @@ __all__ = [
     "Noise",
     "Optics",
     "Pose",
+    "Prism",
     "PrismSensor",
     "Returns",
     "ScanSpec",

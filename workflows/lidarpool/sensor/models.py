@@ -20,7 +20,7 @@ from ..base.words import did_you_mean
 from .beams import Beams, Mirror, Spin
 from .calibrations import Calibration, read_calibration, said
 from .optics import Optics
-from .rays import ListedSensor, PrismSensor
+from .rays import ListedSensor, Prism, PrismSensor
 from .sensor import LineSensor, Sensor
 
 _BUILT_IN = files("lidarpool.sensor") / "data"
@@ -79,13 +79,13 @@ class MirrorPart(_Part):
 
 
 class PrismPart(_Part):
-    """See `PrismSensor`."""
+    """See `Prism`."""
 
     wedge_deg: float
-    index: float
-    rpm: tuple[float, float]
-    phase_deg: tuple[float, float]
-    inclined_first: bool
+    index: Positive
+    rpm: float
+    phase_deg: float = 0.0
+    inclined_first: bool = False
 
 
 class OpticsPart(_Part):
@@ -112,7 +112,7 @@ class SensorModel(_Part):
     range_m: tuple[float, float] | None = None
     beams: BeamTable = BeamTable()
     mirror: MirrorPart | None = None
-    prisms: PrismPart | None = None
+    prisms: tuple[PrismPart, ...] = ()
     optics: OpticsPart = OpticsPart()
     listed: bool = False
 
@@ -260,9 +260,10 @@ def load_sensor(
     head = Spin(firings, step_deg, rate, described.clockwise, described.zero_deg)
     if unit is not None and (unit.rays is not None or described.listed or described.prisms):
         return _listed(described, unit, head, common)
-    if described.prisms is not None:
-        return PrismSensor(head=head, **described.prisms.model_dump(), **common)
     beams = described.beams.beams() if unit is None else _calibrated(described, unit)
+    if described.prisms:
+        prisms = tuple(Prism(**prism.model_dump()) for prism in described.prisms)
+        return PrismSensor(beams or Beams(np.zeros(1)), head, prisms=prisms, **common)
     if described.mirror is not None:
         mirror = described.mirror.model_dump()
         head = Mirror(firings, step_deg, rate, zero_deg=described.zero_deg, **mirror)

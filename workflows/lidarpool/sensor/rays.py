@@ -1,4 +1,4 @@
-"""Sensors whose rays lie on no cones about an axis: behind two prisms, or listed one by one."""
+"""Sensors whose rays lie on no cones about an axis: behind prisms, or listed one by one."""
 
 from __future__ import annotations
 
@@ -12,35 +12,49 @@ from .beams import Beams
 from .sensor import Sensor
 
 
-@dataclass(frozen=True, eq=False)
-class PrismSensor(Sensor):
-    """One beam along x through two wedge prisms that turn about x at rates of their own.
-
-    The head is only the clock. Directions follow exactly from Snell's law in vectors at each of
-    the four faces. The prisms stand back to back: where the first has its inclined face before
-    its flat one, the second has it behind. They are thin: all rays leave from the sensor's
-    centre. No turn of both together is short enough to be called a period.
+@dataclass(frozen=True)
+class Prism:
+    """A wedge prism that turns about x.
 
     Parameters
     ----------
     wedge_deg
-        Angle between the two faces of a prism.
+        Angle between its two faces.
     index
-        Refractive index of both.
+        Refractive index.
     rpm
-        Turns a minute of the first and the second prism, about x from y to z.
+        Turns a minute about x, from y to z.
     phase_deg
-        Where their thin edges are at time 0, likewise.
+        Where its thin edge is at time 0, likewise.
     inclined_first
-        Whether the beam enters the first prism by its inclined face.
+        Whether light enters by the inclined face; else by the flat one.
+    """
+
+    wedge_deg: float
+    index: float
+    rpm: float
+    phase_deg: float = 0.0
+    inclined_first: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class PrismSensor(Sensor):
+    """Beams along x through wedge prisms that turn about x at rates of their own.
+
+    The head is only the clock. Directions follow exactly from Snell's law in vectors at each
+    face. Prisms are thin: all rays leave from the sensor's centre. No turn of all together is
+    short enough to be called a period.
+
+    Parameters
+    ----------
+    beams
+        One along x by default; others enter the first prism askew.
+    prisms
+        In the order of the light's way.
     """
 
     beams: Beams = field(default_factory=lambda: Beams(np.zeros(1)))
-    wedge_deg: float = 18.0
-    index: float = 1.5
-    rpm: tuple[float, float] = (7294.0, -4664.0)
-    phase_deg: tuple[float, float] = (0.0, 0.0)
-    inclined_first: bool = False
+    prisms: tuple[Prism, ...] = (Prism(18, 1.5, 7294), Prism(18, 1.5, -4664, 0, True))
     cycle: ClassVar[str] = "frame"
 
     @property
@@ -51,30 +65,30 @@ class PrismSensor(Sensor):
     def directions(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
         """See `Sensor.directions`."""
         minutes = self.head.times_ns(firings) / 60e9
-        wedge, flat = np.radians(self.wedge_deg), np.array([[1.0], [0.0], [0.0]])
-        ray = np.zeros((3, len(firings)))
-        ray[0] = 1
-        for number, (rpm, phase) in enumerate(zip(self.rpm, self.phase_deg, strict=True)):
+        flat = np.array([1.0, 0, 0])[:, None, None]
+        ray = np.repeat(self.ahead.T[:, None, :], len(firings), axis=1)
+        for prism in self.prisms:
             # Within a turn first: the cosine of a large angle has lost digits.
-            angle = 2 * np.pi * ((rpm * minutes + phase / 360) % 1)
+            angle = 2 * np.pi * ((prism.rpm * minutes + prism.phase_deg / 360) % 1)
             # Normals along the way of the light; the faces part towards the thick edge.
-            inclined = np.empty_like(ray)
+            wedge = np.radians(prism.wedge_deg)
+            inclined = np.empty((3, len(firings), 1))
             inclined[0] = np.cos(wedge)
-            inclined[1], inclined[2] = np.sin(wedge) * np.cos(angle), np.sin(wedge) * np.sin(angle)
-            if self.inclined_first == (number == 0):
+            inclined[1:, :, 0] = np.sin(wedge) * np.stack([np.cos(angle), np.sin(angle)])
+            if prism.inclined_first:
                 inclined[1:] *= -1
-                ray = _refracted(_refracted(ray, inclined, 1 / self.index), flat, self.index)
-            else:
-                ray = _refracted(_refracted(ray, flat, 1 / self.index), inclined, self.index)
-        return np.ascontiguousarray(ray.T)[:, None, :]
+            faces = (inclined, flat) if prism.inclined_first else (flat, inclined)
+            for face, ratio in zip(faces, (1 / prism.index, prism.index), strict=True):
+                ray = _refracted(ray, face, ratio)
+        return np.ascontiguousarray(ray.transpose(1, 2, 0))
 
 
 def _refracted(
     rays: NDArray[np.float64], normals: NDArray[np.float64], ratio: float
 ) -> NDArray[np.float64]:
-    """Rays (3, k) behind a face, by Snell's law; `ratio` is the index before over that behind.
+    """Rays (3, k, c) behind a face, by Snell's law; `ratio` is the index before over that behind.
 
-    The normals (3, k), or (3, 1), point along the way of the light.
+    The normals (3, k, 1), or (3, 1, 1), point along the way of the light.
     """
     along = (rays * normals).sum(axis=0)
     behind = np.sqrt(1 - ratio**2 * (1 - along**2))

@@ -303,26 +303,33 @@ def _cone(scanner: Scanner, settings: dict[str, str], pulse_hz: float) -> Made:
 
 
 def _prisms(scanner: Scanner, settings: dict[str, str], pulse_hz: float) -> Made:
-    """Make two Risley prisms."""
-    angles = [scanner.number(f"angle{i}_deg") for i in (1, 2, 3)]
-    there = [i for i, angle in enumerate(angles, 1) if abs(angle) > 1e-6]
-    kinds = {(abs(angles[i - 1]), scanner.number(f"refrIndex{i}", 1)) for i in there}
-    if len(there) != 2 or len(kinds) != 1 or angles[there[0] - 1] * angles[there[1] - 1] > 0:
-        raise LidarpoolError(
-            f"{scanner.name} has {len(there)} prisms; only two that are alike and stand back to "
-            "back can be taken over."
-        )
-    if scanner.child("incidentBeam") is not None:
-        raise LidarpoolError(f"{scanner.name} has an <incidentBeam>, askew to its prisms.")
-    ((wedge, index),) = kinds
-    prisms = {
-        "wedge_deg": clean(wedge),
-        "index": clean(index / scanner.number("refrIndex_air", 1)),
-        "rpm": [clean(60 * scanner.number(f"rotorFreq{i}_Hz")) for i in there],
-        "phase_deg": [0, 0],
-        "inclined_first": angles[there[0] - 1] > 0,
+    """Make Risley prisms."""
+    air = scanner.number("refrIndex_air", 1)
+    prisms = [
+        {
+            "wedge_deg": clean(abs(angle)),
+            "index": clean(scanner.number(f"refrIndex{i}", 1) / air),
+            "rpm": clean(60 * scanner.number(f"rotorFreq{i}_Hz")),
+            "inclined_first": angle > 0,
+        }
+        for i in (1, 2, 3)
+        if abs(angle := scanner.number(f"angle{i}_deg")) > 1e-6
+    ]
+    if not prisms:
+        raise LidarpoolError(f"{scanner.name} has no prisms.")
+    made: dict[str, Any] = {
+        "firing_us": _us(1, pulse_hz),
+        "rate_hz": _FRAME_HZ,
+        "prisms": prisms,
     }
-    return {"firing_us": _us(1, pulse_hz), "rate_hz": _FRAME_HZ, "prisms": prisms}, _PRISM
+    if (incident := scanner.child("incidentBeam")) is not None:
+        x, y, z = _PRISM.T @ vector(incident)
+        elevation, azimuth = np.arctan2(z, np.hypot(x, y)), np.arctan2(y, x)
+        made["beams"] = {
+            "elevation_deg": [clean(np.degrees(elevation))],
+            "azimuth_deg": [clean(np.degrees(azimuth))],
+        }
+    return made, _PRISM
 
 
 _OPTICS: dict[str, Callable[[Scanner, dict[str, str], float], Made]] = {
