@@ -1,4 +1,4 @@
-"""What a ray casting engine must offer."""
+"""The interface of a ray casting engine."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .scan import Collector, Scan
 
 
 class BackendUnavailable(RuntimeError):  # noqa: N818 - a state, not a mishap
-    """The backend asked for cannot be used on this machine; the message says why."""
+    """The requested backend cannot be used on this machine; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -46,13 +46,13 @@ class Backend(ABC):
     """One engine, bound to one mesh.
 
     A backend is made with the mesh, the most CPU threads to use (None for its own choice) and
-    the number of the CUDA device (None for the current one); each ignores what it has no use
-    for. It must offer `closest`; `scan` may be overridden where the engine can do better.
+    the number of the CUDA device (None for the current one); it ignores those it does not need.
+    It must implement `closest`; it may override `scan` to be faster.
     """
 
     name: ClassVar[str]
-    # Rays given to `closest` at a time: bounds the memory in use. A ray's result does not
-    # depend on the chunk that it is in.
+    # Most rays of a call of `closest`: limits the memory. A ray's result does not depend on its
+    # chunk.
     chunk: ClassVar[int]
 
     @classmethod
@@ -81,7 +81,7 @@ class Backend(ABC):
         return hits
 
     def scan(self, scan: Scan) -> ScanReturns:
-        """Closest hits of a scan's rays: those that it keeps, and counts of all."""
+        """Closest hits of a scan's rays: the kept ones, and counts of all."""
         collector = Collector(scan, self._mesh.face_count)
         for start, stop in scan.chunks(self.chunk):
             found = self.closest(scan.rays(start, stop))

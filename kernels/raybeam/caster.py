@@ -1,4 +1,4 @@
-"""The ray caster that users see."""
+"""The public ray caster."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from .scan import check_scan
 class RayCaster:
     """Closest hits of rays with a triangle mesh.
 
-    Both sides of a triangle count. A ray that runs in a triangle's plane does not meet that
-    triangle. A ray through an edge or a corner meets every triangle there, so closed meshes
-    do not leak. The same ray gives the same bits in every batch.
+    Both sides of a triangle count. A ray in a triangle's plane does not hit that triangle. A
+    ray through an edge or a corner hits every triangle there, so closed meshes do not leak.
+    The same ray gives the same bits in every batch.
 
     Parameters
     ----------
     vertices
-        (v, 3) real numbers, metres. Large coordinates are fine: work is done near the mesh.
+        (v, 3) real numbers, metres. Large coordinates lose no precision: they are made local.
     faces
         (f, 3) integers, rows of `vertices`. A triangle without an area is never hit.
     backend
@@ -41,7 +41,7 @@ class RayCaster:
     ValueError
         If the mesh is not finite, of a wrong shape, has faces without vertices, or no area.
     BackendUnavailable
-        If the backend asked for cannot be used; the message says what to install.
+        If the requested backend cannot be used; the message says what to install.
 
     Examples
     --------
@@ -76,7 +76,7 @@ class RayCaster:
 
     @property
     def face_count(self) -> int:
-        """Number of triangles given, those without an area included."""
+        """Number of triangles given, including those without an area."""
         return self._mesh.face_count
 
     def cast(
@@ -102,8 +102,8 @@ class RayCaster:
         Raises
         ------
         ValueError
-            If a direction is zero, anything is NaN or infinite (the message names the first
-            such row), or the shapes do not fit.
+            If a direction is zero, a value is NaN or infinite (the message names the first such
+            row), or the shapes do not fit.
         """
         return self._engine.cast(check_rays(origins, directions, t_min, t_max))
 
@@ -124,40 +124,40 @@ class RayCaster:
     ) -> ScanReturns:
         """Cast a pattern of rays from one pose or from many: the fastest way for a lidar.
 
-        Rays are numbered from 0 at the window's start. `Pattern.rays` tells where they run.
+        Rays are numbered from 0 at the window's start. `Pattern.rays` returns the rays.
 
         Parameters
         ----------
         pattern
-            Rays in the sensor's axes, checked once; the cuda backend keeps them on the device
-            and turns them there.
+            Rays in the sensor's axes, checked once; the cuda backend keeps and rotates them on
+            the device.
         positions
-            (3,) or (k, 3), metres; or poses as `check_poses` makes them, with all that follows.
+            (3,) or (k, 3), metres; or poses from `check_poses`, which replace the next arguments.
         rotations
-            (3, 3) or (k, 3, 3) from the sensor's axes to the mesh's; None when they are the same.
+            (3, 3) or (k, 3, 3) from the sensor's axes to the mesh's; None if they are the same.
         window
-            Rows ``start <= row < stop`` of the pattern to cast; None for all. It may go past the
-            pattern's end, where the pattern starts over: row r is row ``r % len(pattern)``.
+            Rows ``start <= row < stop`` of the pattern to cast; None for all. Beyond its end the
+            pattern repeats: row r is row ``r % len(pattern)``.
         rays_per_pose
-            Ray i is cast from pose ``i // rays_per_pose``: the number of beams, when a moving
-            lidar has a pose for each firing. A single pose needs none, it is that of all rays.
+            Ray i is cast from pose ``i // rays_per_pose``: the number of beams, if a moving
+            lidar has a pose for each firing. A single pose applies to all rays.
         t_min, t_max
             As in `cast`.
         keep_every
-            Of the hits of each group, in ray order, keep the first and then every n-th.
+            Keep the first and then every n-th hit of each group, in ray order.
         groups
-            Ascending numbers of the rays at which groups begin, the first is 0: scans that are
-            cast together. None for one group.
+            Ascending numbers of the first rays of groups, beginning with 0: scans that are cast
+            together. None for one group.
         tally
-            Count the hits of each triangle, those that are not kept included.
+            Count the hits of each triangle, including those that are not kept.
         motion
-            How the lidar moves on within each pose, where its rays do not leave at one time.
+            How the lidar moves within each pose, if its rays have different delays.
 
         Raises
         ------
         ValueError
-            If a position is not finite, a rotation is none, the poses do not suffice for the
-            rays, the window's ends are no rows, or there are more than 2**32 rays.
+            If a position is not finite, a rotation is invalid, there are too few poses for the
+            rays, the window is not of rows, or there are more than 2**32 rays.
 
         Examples
         --------

@@ -23,25 +23,24 @@ from .scan import Collector, Scan
 
 _BLOCK = 128  # threads; the kernels are bound to it
 _STACK_STEP = 32
-_MOST_INT = (1 << 31) - 1  # rays of a pose, as intersect.cu is told: more than a chunk has
+_MOST_INT = (1 << 31) - 1  # rays of a pose for intersect.cu: more than a chunk has
 
 
 class CudaBackend(Backend):
-    """The walk of intersect.cu, one thread a ray; only hits come back from the device.
+    """The traversal of intersect.cu, one thread a ray; only hits leave the device.
 
-    Kernels and copies are in the order of the thread's current stream, and every call ends with
-    a copy to the host, for which CuPy waits: when it returns, the device has done with all that
-    the call used. What outlives a call, tables and patterns, is waited for when it is made, so
-    threads with streams of their own may use it. All calls switch to the caster's device and
-    back, whatever device the thread is on.
+    Kernels and copies use the thread's current stream, and every call ends with a copy to the
+    host, for which CuPy waits: when it returns, the device no longer uses the call's memory.
+    Tables and patterns outlive a call; their creation is waited for, so that threads with other
+    streams may use them. All calls switch to the caster's device and back.
 
-    The tree is NumPy's (layout.py). To build it on the device as well took as much code as the
-    walk, and spares a worker two seconds for each million triangles, once.
+    NumPy builds the tree (layout.py). Building it on the device took as much code as the
+    traversal, and saved a worker two seconds for each million triangles, once.
     """
 
     name: ClassVar[str] = "cuda"
-    # Rays: some 430 MB on the device. The grid, the sums of hits and the places in a chunk's
-    # arrays are far from 2**31 with it; only the number of a ray needs 64 bits.
+    # Rays: some 430 MB on the device. Grid, sums of hits and indices into a chunk's arrays stay far
+    # below 2**31; only the number of a ray needs 64 bits.
     chunk: ClassVar[int] = 1 << 22
 
     @classmethod
@@ -76,7 +75,7 @@ class CudaBackend(Backend):
         self._device = _device(cupy, device)
         made = lay_out(mesh)
         with self._device:
-            # In steps, so that scenes share what is compiled.
+            # In steps, so that scenes share compiled kernels.
             stack = -(-max(made.stack, 1) // _STACK_STEP) * _STACK_STEP
             self._module = _compiled(cupy, self._device.id, flags(stack))
             given = (made.nodes, made.triangles, made.corners, made.faces, made.frame)
@@ -87,7 +86,7 @@ class CudaBackend(Backend):
 
     @staticmethod
     def _library() -> Any:
-        """CuPy, loaded when it is needed; the tests put another in its place."""
+        """CuPy, loaded on first use; tests replace it."""
         import cupy
 
         return cupy
@@ -148,29 +147,29 @@ class CudaBackend(Backend):
         return cp.asarray(motion.delays), cp.asarray(np.ascontiguousarray(rates)), np.int32(1)
 
     def _resident(self, pattern: Pattern) -> tuple[Any, ...]:
-        """Directions and origins of a pattern on the device, (3, n) each, one row an axis."""
+        """Directions and origins of a pattern on the device, (3, n) each, one row for each axis."""
         kept = self._patterns.get(pattern)
         if kept is None:
             given = (pattern.directions, pattern.origins)
-            # Two threads may both come here: then the second copy is kept, and both are right.
+            # If two threads come here, the second copy is kept, and both are right.
             kept = self._patterns[pattern] = tuple(
                 _sent(self._cupy, table.T) for table in given if table is not None
             )
         return kept
 
     def _cast(self, kernel: str, n: int, rays: tuple[Any, ...]) -> tuple[Any, Any]:
-        """Local distance and place of the closest hit of each ray, on the device."""
+        """Local distance and table row of the closest hit of each ray, on the device."""
         t, place = self._cupy.empty(n), self._cupy.empty(n, np.int32)
         self._run(kernel, n, *self._scene, *rays, t, place)
         return t, place
 
     def _packed(self, distance: Any, place: Any, scale: float) -> tuple[Any, Any, Any]:
-        """Close up the results of a cast on the device; distances are divided by `scale`.
+        """Compact the results of a cast on the device; distances are divided by `scale`.
 
         Returns numbers of the rays that hit, distances, and the caller's triangles.
         """
         cp, n = self._cupy, len(place)
-        # Closed up by sums in ray order, not by atomics: the same bytes on every run.
+        # Compacted by sums in ray order, not by atomics: the same bytes on every run.
         ends = cp.cumsum(place >= 0, dtype=np.int32) if n else place
         hits = int(ends[-1]) if n else 0
         ray, metres, triangle = (cp.empty(hits, d) for d in (np.uint32, np.float64, np.int32))
@@ -179,7 +178,7 @@ class CudaBackend(Backend):
         return ray, metres, triangle
 
     def _run(self, kernel: str, threads: int, *arguments: Any) -> None:
-        """Launch a kernel with one thread an item; nothing happens when there are none.
+        """Launch a kernel with one thread for each item; does nothing without items.
 
         A grid has one dimension, of fewer than 2**31 blocks: room for 2**38 items.
         """
@@ -195,7 +194,7 @@ def source() -> str:
 
 
 def flags(stack: int) -> tuple[str, ...]:
-    """Compiler options of intersect.cu; `stack` is the most nodes that may wait in a walk."""
+    """Compiler options of intersect.cu; `stack` is the most nodes that wait in a traversal."""
     return "-std=c++17", "-fmad=false", f"-DSTACK={stack}"
 
 
@@ -208,19 +207,19 @@ def _compiled(cupy: Any, device: int, flags: tuple[str, ...]) -> Any:
 
 
 def _headers() -> bool:
-    """Whether CuPy will find the headers of CUDA, without which it refuses to compile anything.
+    """Whether CuPy will find the headers of CUDA, without which it compiles nothing.
 
-    A driver and a compiler may well be there without them, as in containers made for running.
+    Runtime containers have a driver and a compiler, but no headers.
     """
     try:
         from cuda.pathfinder import find_nvidia_header_directory
-    except ImportError:  # then this CuPy looks for them in another way
+    except ImportError:  # this version of CuPy finds them in another way
         return True
     return find_nvidia_header_directory("cudart") is not None
 
 
 def _device(cupy: Any, number: int | None) -> Any:
-    """Return the device of that number, or the current one; raises ValueError if it is none."""
+    """Return the device of that number, or the current one; ValueError if it does not exist."""
     count = cupy.cuda.runtime.getDeviceCount()
     if number is not None and not 0 <= number < count:
         raise ValueError(f"There is no CUDA device {number}: this process sees {count}, from 0.")
@@ -230,11 +229,11 @@ def _device(cupy: Any, number: int | None) -> Any:
 def _sent(cupy: Any, array: NDArray[Any]) -> Any:
     """Copy an array to the current device, and wait for that.
 
-    A device that reads ordinary memory itself, as Grace Hopper does, may still be about to read
-    when `set` returns: the caller may let go of the array once this has returned.
+    A device that reads ordinary memory itself, as Grace Hopper does, may still read after `set`
+    returns: hence the wait, after which the caller may release the array.
 
-    Not by `asarray`, which copies by way of page-locked memory as large as the array and keeps
-    that: right for the rays of a chunk, too much for a scene.
+    `asarray` would copy through page-locked memory as large as the array and keep it: fine for
+    the rays of a chunk, too much for a scene.
     """
     copy = cupy.empty(array.shape, array.dtype)
     if array.size:

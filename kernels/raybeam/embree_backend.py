@@ -21,19 +21,18 @@ from .workspace import Starts, Workspace
 
 Float = NDArray[np.float64]
 
-# Embree decides in float32, and may find again what refinement put just before the start. So the
-# start moves on, in local units: a little for most surfaces, and for those that a ray grazes, along
-# which float32 sees less sharply, as much as it takes.
+# Embree decides in float32, and may find a hit again that refinement put just before the start. So
+# the start moves on, in local units: a little for most surfaces, and as far as necessary for
+# surfaces that a ray grazes, where float32 is less accurate.
 _STARTS = (0.0, *(4.0**k * 2**-20 for k in range(6)))
 
-# A ray that starts farther from zero than this, in local units, is begun at the scene's box:
-# then float32 rounds by the scene's size, not by the way to it.
+# A ray that starts farther from zero than this, in local units, is started at the scene's box:
+# float32 then rounds by the scene's size, not by the distance to it.
 _NEAR = 2.0
 
-# Local units. A rough distance, in float32, that is farther than this from the limits decides by
-# itself whether the hit counts, so that only hits which are kept have to be refined. It is off by
-# more only where the cosine between ray and normal is below some 1e-4; then a refined distance
-# beyond a limit is not believed.
+# Local units. A float32 distance that is farther than this from the limits decides whether the hit
+# counts, so that only kept hits have to be refined. Its error is larger only if the cosine between
+# ray and normal is below some 1e-4; then a refined distance beyond a limit is ignored.
 _CLEAR = 2.0**-8
 
 _SHARE = 1 << 13  # rays that a thread takes at a time, where there are several
@@ -82,15 +81,15 @@ class _Hits:
 
 
 class EmbreeBackend(Backend):
-    """Embree's closest hits; the winner's distance is worked out again in float64.
+    """Embree's closest hits; their distances are recomputed in float64.
 
-    Embree decides in float32 which triangle is hit. Surfaces nearer to each other, or to the
-    ray's start, than about 1e-6 of the scene's size are not told apart. Casting takes as many
-    threads as it is given; Embree's tree is built by every core.
+    Embree decides in float32 which triangle is hit. It does not distinguish surfaces that are
+    nearer to each other, or to the ray's start, than about 1e-6 of the scene's size. Casting
+    uses the given number of threads; the tree is built by all cores.
     """
 
     name: ClassVar[str] = "embree"
-    # Smaller chunks, which stay in a core's level 2 cache, gain less there than more calls cost.
+    # Smaller chunks would fit a core's level 2 cache, but more calls cost more than that gains.
     chunk: ClassVar[int] = 1 << 16
 
     @classmethod
@@ -148,7 +147,7 @@ class EmbreeBackend(Backend):
 
     def _limits(self, t_min: float, t_max: float) -> _Limits:
         t_min, t_max = t_min * self._mesh.scale, t_max * self._mesh.scale
-        # Numbers of float32, so that distances in float32 and in float64 compare with them alike.
+        # Float32 numbers, so that float32 and float64 distances compare with them alike.
         with np.errstate(over="ignore"):
             rough = np.array([t_min + _CLEAR, t_max - _CLEAR, t_max + _CLEAR]).astype(np.float32)
         return _Limits(t_min, t_max, *rough.tolist())
@@ -185,7 +184,7 @@ class EmbreeBackend(Backend):
         starts: Starts,
         limits: _Limits,
     ) -> tuple[NDArray[np.intp], Float, NDArray[np.int32]]:
-        """Find the next hits, behind `t_min`, of rays that hit something before.
+        """Find the next hits, beyond `t_min`, of rays that hit something before it.
 
         Returns the rays that have one, in any order; refined distances; places.
         """
@@ -219,14 +218,14 @@ class EmbreeBackend(Backend):
             entry, _ = self._mesh.clip(points, unit.T)
             near = np.abs(points).max(axis=1) <= _NEAR
             ways = np.maximum(np.where(near, 0, entry), begin)
-            # From so far away that float64 cannot place the start, it stays near the scene.
+            # If the ray is too far away for float64 to place the start, it stays near the scene.
             starts = Starts(np.clip(points + ways[:, None] * unit.T, -_NEAR, _NEAR))
         t, place = self._trace(desk.start(n, starts))
         return t if ways is None else t + ways, place
 
     def _trace(self, rows: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
         """Closest hits of rows (n, 6), origins and directions; distances are inf for a miss."""
-        t = np.full(len(rows), np.inf, np.float32)  # how far to look; embreex writes hits to it
+        t = np.full(len(rows), np.inf, np.float32)  # longest distance; embreex writes hits to it
 
         def part(share: slice) -> NDArray[np.int32]:
             origins, directions = rows[share, :3], rows[share, 3:]
@@ -247,7 +246,7 @@ class EmbreeBackend(Backend):
         unit: Float,
         starts: Starts,
     ) -> Float:
-        """Distances of some rays in float64 accuracy; `rough` and `place` are theirs."""
+        """Distances of some rays in float64 accuracy, from their `rough` and `place`."""
         directions = _columns_of(unit, ray)
         return self._refine.distance(starts.of(ray), directions, place.astype(np.intp), rough)
 
@@ -256,7 +255,7 @@ class EmbreeBackend(Backend):
     ) -> tuple[Float, NDArray[np.intp]]:
         """Refined distances of some hits that count, and their places."""
         rough, place = hits.t.take(ray), hits.place.take(ray)
-        if 2 * len(ray) > len(hits.t):  # to choose directions and starts takes longer
+        if 2 * len(ray) > len(hits.t):  # selecting directions and starts takes longer
             every = hits.place.astype(np.intp)
             t = self._refine.distance(starts.points, unit, every, hits.t).take(ray)
         else:
@@ -270,7 +269,7 @@ _desks = threading.local()  # threads of one worker may cast at the same time
 
 
 def _desk(rays: int) -> Workspace:
-    """Workspace of this thread, for that many rays at least; its casters share it."""
+    """Workspace of this thread, for at least that many rays; its casters share it."""
     kept: Workspace | None = getattr(_desks, "desk", None)
     if kept is None or kept.size < rays:
         kept = _desks.desk = Workspace(rays)
@@ -278,7 +277,7 @@ def _desk(rays: int) -> Workspace:
 
 
 def _columns_of(unit: Float, ray: NDArray[np.intp]) -> Float:
-    """Take columns of (3, n); faster than `take` along the axis, which copies all of them first."""
+    """Select columns of (3, n); faster than `take` along the axis, which copies all columns."""
     out = np.empty((3, len(ray)))
     for row, axis in zip(unit, out, strict=True):
         row.take(ray, out=axis, mode="clip")  # the mode in which it writes straight to `out`

@@ -1,4 +1,4 @@
-"""What comes back from casting rays."""
+"""Results of casting rays."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class Hits:
     Attributes
     ----------
     distance
-        float64 (n,): metres from the ray's origin along its direction taken as a unit vector,
-        whatever length it was given with; inf for a miss.
+        float64 (n,): metres from the ray's origin, whatever the length of its direction; inf for
+        a miss.
     triangle
         int32 (n,): row of `faces`; -1 for a miss. Of triangles at exactly the same distance
         the lowest row is reported.
@@ -44,7 +44,7 @@ class Hits:
 
 @dataclass(frozen=True)
 class ScanReturns:
-    """What a scan found: the hits that are kept of it, in ray order, and counts of all hits.
+    """Result of a scan: the kept hits, in ray order, and counts of all hits.
 
     Attributes
     ----------
@@ -57,8 +57,7 @@ class ScanReturns:
     hits
         int64 (g,): number of hits of each group, kept or not.
     tally
-        int64 (face_count,): how many of all hits, kept or not, each triangle got; None if it
-        was not asked for.
+        int64 (face_count,): hits of each triangle, kept or not; None if not requested.
     """
 
     ray: NDArray[np.uint32]
@@ -72,7 +71,7 @@ class ScanReturns:
 
 
 def joined(parts: list[Part]) -> Part:
-    """Hits that were found part after part, in that order; a single part is not copied."""
+    """Join hits that were found in parts, in that order; a single part is not copied."""
     if len(parts) == 1:
         return parts[0]
     parts = [(np.zeros(0, np.uint32), np.zeros(0), np.zeros(0, np.int32)), *parts]

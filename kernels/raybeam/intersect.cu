@@ -1,24 +1,24 @@
-// Closest hits of rays with triangles: a walk through a four-wide bounding volume hierarchy.
+// Closest hits of rays with triangles: traversal of a four-wide bounding volume hierarchy.
 //
 // Compiled by NVRTC, which has no standard headers, so there are none here; the tests compile the
 // same text for the CPU. One thread a ray, blocks of 128 threads, a grid of one dimension.
-// STACK (a number) is defined on the command line: places for nodes that wait their turn.
+// STACK (a number) is defined on the command line: the most nodes that can wait.
 //
-// Threads know nothing of each other: no shared memory, no barriers, no votes of a warp, no
-// atomics, so it does not matter which of them run together. Offsets into tables are 64 bits wide;
-// what an int holds is bounded by layout: fewer than 2^28 triangles, so places shifted by LEAF_BITS
-// fit, and the greatest code of a leaf is not DONE. A chunk of rays is far below 2^31
+// Threads are independent: no shared memory, no barriers, no votes of a warp, no atomics, so it does
+// not matter which of them run together. Offsets into tables are 64 bits wide; an int is enough for
+// the rest: there are fewer than 2^28 triangles, so rows shifted by LEAF_BITS fit, and the greatest
+// code of a leaf is not DONE. A chunk of rays is far below 2^31
 // (cuda_backend.py).
 // Tables of float4 are allocations of their own, which the device aligns to 256 bytes.
 //
-// CuPy adds -ftz=true: what is not normal in float counts as zero. The bands below have room for
-// that (FLOOR of layout.py), and nodes never come near it: a box is as wide as its padding.
+// CuPy adds -ftz=true: subnormal floats are flushed to zero. The bands below allow for that (FLOOR
+// of layout.py), and nodes never come near it: a box is as wide as its padding.
 //
 // All lengths are local: coordinates within [-1, 1], see mesh.py. layout.py makes the tables:
 //   nodes      8 float4 (one 128-byte line) a node: low x, y, z of four children, then high x, y,
 //              z, then the children's codes as integer bits, then nothing. A code >= 0 is a
 //              node, a negative one ~(first << 3 | count - 1) the triangles of a leaf. An empty
-//              place holds a box turned inside out.
+//              slot has an inverted box.
 //   triangles  3 float4 a triangle, in the order of the leaves: corner and band of b, edge to
 //              the second corner and band of c, edge to the third and band of t.
 //   corners    9 doubles a triangle, in the same order.
@@ -26,10 +26,10 @@
 //   frame      10 doubles: centre (3), scale, low corner of the scene's box (3), high corner (3).
 //
 // Two tests a triangle. `may_hit` is Moeller and Trumbore (1997) in float, with bands as wide as
-// its rounding errors can be, so it never loses a hit; it sends nearly all triangles away.
+// its rounding errors can be, so it never loses a hit; it rejects nearly all other triangles.
 // `decide` is the watertight test of triangle.py in double, operation by operation: compiled
-// without fused multiply-add (-fmad=false) its results have the same bits as NumPy's. What fma
-// there is in the float part is written out.
+// without fused multiply-add (-fmad=false) its results have the same bits as NumPy's. The float
+// part has explicit fma.
 //
 // Comparisons are written so that one with NaN is false, and false means "no hit".
 
@@ -38,14 +38,14 @@ typedef long long Count;
 // Five blocks of 128 threads to a multiprocessor: aiming at more, nvcc spills registers for sm_90.
 #define KERNEL extern "C" __global__ void __launch_bounds__(128, 5)
 
-// What is counted when this runs on the CPU; on a device, nothing.
+// Counters for runs on the CPU; on a device, nothing.
 #ifndef SEEN
 #define SEEN(what)
 #endif
 
 #define LEAF_BITS 3
 #define DONE ((int)0x80000000)
-#define TINY 8.673617379884035e-19  // 2^-60: stands for a direction component of zero
+#define TINY 8.673617379884035e-19  // 2^-60: replaces a direction component of zero
 #define SLACK 9.5367431640625e-07f  // 2^-20: on limits in float, far more than their rounding
 #define ACROSS 4.0                  // more than the diagonal of any scene
 
@@ -95,7 +95,7 @@ struct TableRays {
     }
 };
 
-// Rays of a pattern of `rows` rays, each turned and moved by the pose that it belongs to. Ray i is
+// Rays of a pattern of `rows` rays, each rotated and moved by its pose. Ray i is
 // row (first + i) modulo rows. The first pose has `left` rays, each of the others `each`.
 struct PatternRays {
     const double* positions;   // 3 a pose
@@ -105,7 +105,7 @@ struct PatternRays {
     Count rows, first;
     int left, each;
     int turned, shifted;
-    // How the lidar moves on within a pose; neither is read where `moving` is 0.
+    // Motion of the lidar within a pose; neither is read where `moving` is 0.
     const double* delays;  // of each ray of a pose, seconds
     const double* rates;   // 6 a pose: metres a second, radians a second
     int moving;
@@ -118,7 +118,7 @@ struct PatternRays {
         c = (x * r[6] + y * r[7]) + z * r[8];
     }
 
-    // Turn a vector on: v + delay * cross(w, v).
+    // Rotate a vector by its delay: v + delay * cross(w, v).
     __device__ __forceinline__ static void drift(
         const double* w, double delay, double& x, double& y, double& z)
     {
@@ -133,8 +133,7 @@ struct PatternRays {
     __device__ __forceinline__ Ray load(const Scene& scene, Count i) const
     {
         Count row = first + i;
-        // A chunk's rays fit an int, see above. So does what is left after a turn, if that is more
-        // than a turn.
+        // A chunk's rays fit an int, see above; so does the rest after a turn, if there are more.
         if (row >= rows) row -= rows;
         if (row >= rows) row = (unsigned)row % (unsigned)rows;
         const int ray = (int)i;
@@ -210,7 +209,7 @@ __device__ __forceinline__ bool decide(const Scene& scene, const Ray& ray, int p
     return (above || below) && out.det != 0;
 }
 
-// ---- the walk ----
+// ---- traversal ----
 
 // The ray in float, from where it enters the scene's box.
 struct Walk {
@@ -219,10 +218,10 @@ struct Walk {
     float sx, sy, sz;              // start / direction
     int nx, ny, nz;                // which float4 of a node holds the planes met first
     double entry;                  // distance of the start from the origin
-    float from, to;                // hits before or behind these, from the start, are of no use
+    float from, to;                // hits outside of these, from the start, do not count
 };
 
-// A limit in float, counted from the start of the walk, that is never less than the exact one.
+// A limit in float, from the start of the traversal, that is never less than the exact one.
 __device__ __forceinline__ float limit(double t, double entry)
 {
     const double left = (t - entry) * (1.0 + SLACK) + SLACK;
@@ -239,8 +238,8 @@ __device__ __forceinline__ void clip(
     leave = fmin(leave, fmax(one, two));
 }
 
-// A coordinate of the walk's start. From so far away that double cannot place it, it stays near
-// the scene at least.
+// A coordinate of the traversal's start. If it is too far away for double to place it, it stays
+// near the scene.
 __device__ __forceinline__ float start(double o, double d, double entry)
 {
     return (float)fmin(fmax(o + entry * d, -2.0), 2.0);
@@ -251,7 +250,7 @@ __device__ __forceinline__ float reciprocal(float d)
     return 1.0f / (fabsf(d) < (float)TINY ? (d < 0.0f ? -(float)TINY : (float)TINY) : d);
 }
 
-// Prepare the walk; false when the ray does not meet the scene's box at all.
+// Prepare the traversal; false when the ray misses the scene's box.
 __device__ __forceinline__ bool begin(
     const Scene& scene, const Ray& ray, double t_min, double t_max, Walk& w)
 {
@@ -288,7 +287,7 @@ __device__ __forceinline__ bool begin(
     return true;
 }
 
-// Where the ray enters a child's box; a great number when it does not, or only behind `to`.
+// Where the ray enters a child's box; a large number when it does not, or only beyond `to`.
 __device__ __forceinline__ float enter(
     const Walk& w, float nx, float ny, float nz, float fx, float fy, float fz)
 {
@@ -311,14 +310,14 @@ __device__ __forceinline__ void order(float& t0, int& c0, float& t1, int& c1)
     c1 = c;
 }
 
-// A node that waits, and the distance at which the ray enters it.
+// A waiting node, and the distance at which the ray enters it.
 struct alignas(8) Waiting {
     int node;
     float t;
 };
 
-// The stack's top is a variable of its own: as a member beside the array it would live in local
-// memory, and every push would wait for it.
+// The stack's top is a separate variable: as a member beside the array it would be in local memory,
+// and every push would wait for it.
 __device__ __forceinline__ void push(Waiting* stack, int& top, int node, float t)
 {
     if (t < 1e30f) {
@@ -336,7 +335,7 @@ __device__ __forceinline__ int pop(const Waiting* stack, int& top, float to)
     return DONE;
 }
 
-// Test a node's children; the nearest that is met is next, the others wait.
+// Test a node's children; the nearest one hit is next, the others wait.
 __device__ __forceinline__ int descend(
     const float4* nodes, int node, const Walk& w, Waiting* stack, int& top)
 {
@@ -352,7 +351,7 @@ __device__ __forceinline__ int descend(
     int c0 = __float_as_int(codes.x), c1 = __float_as_int(codes.y);
     int c2 = __float_as_int(codes.z), c3 = __float_as_int(codes.w);
     const bool met0 = t0 < 1e30f, met1 = t1 < 1e30f, met2 = t2 < 1e30f, met3 = t3 < 1e30f;
-    // Most often one child is met, or none, by all rays of a warp: then there is nothing to sort.
+    // Most often all rays of a warp hit one child or none: then there is nothing to sort.
     if (met0 + met1 + met2 + met3 > 1) {
         order(t0, c0, t1, c1);
         order(t2, c2, t3, c3);
@@ -368,15 +367,15 @@ __device__ __forceinline__ int descend(
     return pop(stack, top, w.to);
 }
 
-// What the test in float knows of a triangle that the ray may hit: bounds of the distance from the
-// start of the walk, and whether the ray hits it within the limits for certain.
+// Result of the float test for a triangle that the ray may hit: bounds of the distance from the
+// start of the traversal, and whether the ray certainly hits it within the limits.
 struct Guess {
     float near, far;
     bool sure;
 };
 
-// Moeller and Trumbore in float: false only when the ray certainly misses the triangle, or meets
-// it outside [from, to].
+// Moeller and Trumbore in float: false only when the ray certainly misses the triangle, or hits it
+// outside [from, to].
 __device__ __forceinline__ bool may_hit(const float4* record, const Walk& w, Guess& guess)
 {
     SEEN(TRIANGLE);
@@ -408,18 +407,18 @@ __device__ __forceinline__ bool may_hit(const float4* record, const Walk& w, Gue
 
 // Finds the closest hit: local distance, and place in the tables (-1: none yet).
 //
-// The test that decides costs as much as several nodes, and the rays of a warp come to their
-// triangles at different times. So triangles that may be the closest wait until all rays of the
-// warp are done, or have no room left; a hit that is certain shortens the walk at once.
+// The test that decides costs as much as several nodes, and the rays of a warp reach their triangles
+// at different times. So triangles that may be the closest wait until all rays of the warp are done,
+// or have no room left; a certain hit shortens the traversal at once.
 struct Closest {
     double t;
     int place;
-    int one, two;              // triangles that wait, -1: none
-    float near_one, near_two;  // the least that their distances may be
+    int one, two;              // waiting triangles, -1: none
+    float near_one, near_two;  // lower bounds of their distances
 
     __device__ __forceinline__ Closest(double t_max) : t(t_max), place(-1), one(-1), two(-1) {}
 
-    // Take in a triangle; false when there is no room for another.
+    // Add a triangle; false when there is no room for another.
     __device__ __forceinline__ bool offer(int at, const Guess& guess, Walk& w)
     {
         if (guess.sure) w.to = fminf(w.to, guess.far);
@@ -435,7 +434,7 @@ struct Closest {
         return one < 0 || two < 0;
     }
 
-    // Decide on the triangles that wait.
+    // Decide on the waiting triangles.
     template <class Rays>
     __device__ __forceinline__ void settle(
         const Scene& scene, const Rays& rays, Count i, double t_min, Walk& w)
@@ -445,8 +444,8 @@ struct Closest {
             const int at = turn == 0 ? one : two;
             if (at < 0 || (turn == 0 ? near_one : near_two) > w.to) continue;
             Exact hit;
-            // The ray is loaded again: keeping it in double through the walk costs more
-            // registers than it saves time.
+            // Load the ray again: keeping it in double during the traversal costs more in
+            // registers than it saves in time.
             if (!decide(scene, rays.load(scene, i), at, hit) || !(hit.t >= t_min)) continue;
             const bool tie = hit.t == t && (place < 0 || scene.faces[at] < scene.faces[place]);
             if (hit.t < t || tie) {
@@ -459,9 +458,8 @@ struct Closest {
     }
 };
 
-// Offer all triangles that the ray may hit and that may still be of use. Nodes and
-// triangles have loops of their own (Aila and Laine, 2009), so that the rays of a warp do the same
-// work at a time.
+// Offer all triangles that the ray may hit and that may be the closest. Nodes and triangles have
+// separate loops (Aila and Laine, 2009), so that the rays of a warp do the same work at a time.
 template <class Rays>
 __device__ __forceinline__ void walk(
     const Scene& scene, const Rays& rays, Count i, double t_min, double t_max, Closest& best)
@@ -490,7 +488,7 @@ __device__ __forceinline__ void walk(
 
 // ---- kernels: scene, rays in, hits out ----
 
-// Closest hits of rays from memory: local distance and place in the tables; -1 for a miss, whose
+// Closest hits of rays from memory: local distance and row of the tables; -1 for a miss, whose
 // distance is not written.
 KERNEL cast_table(
     const float4* __restrict__ nodes, const float4* __restrict__ triangles,
@@ -510,7 +508,7 @@ KERNEL cast_table(
     if (best.place >= 0) distance[i] = best.t;
 }
 
-// Closest hits of a pattern's rays from one pose after another; the rest as in cast_table.
+// Closest hits of a pattern's rays from one pose after another; otherwise as cast_table.
 KERNEL cast_pattern(
     const float4* __restrict__ nodes, const float4* __restrict__ triangles,
     const double* __restrict__ corners, const int* __restrict__ faces,
@@ -552,10 +550,10 @@ KERNEL weigh_table(
     v[k] = hit.c / hit.det;
 }
 
-// ---- hits of a cast made smaller ----
+// ---- compaction of hits ----
 
-// Close up hits, in ray order: number of the ray, distance in metres, the caller's triangle.
-// `ends` are the sums of hits up to each ray, itself included.
+// Compact hits, in ray order: number of the ray, distance in metres, the caller's triangle.
+// `ends` are the inclusive sums of hits up to each ray.
 KERNEL pack(
     const int* __restrict__ faces, const double* __restrict__ distance,
     const int* __restrict__ place, const int* __restrict__ ends, Count count, double scale,

@@ -33,7 +33,7 @@ class Layout:
     frame
         float64 (10,).
     stack
-        Most nodes that can wait during a walk.
+        Most nodes that can wait during a traversal.
     """
 
     nodes: NDArray[np.float32]
@@ -67,7 +67,7 @@ def _nodes(tree: WideTree) -> NDArray[np.float32]:
 
 
 def _records(corners: NDArray[np.float64]) -> NDArray[np.float32]:
-    """First corner, two edges, and how far rounding can move the test's numbers.
+    """First corner, two edges, and bounds of the test's rounding errors.
 
     With u = 2**-24, coordinates within [-1, 1], unit directions d, edges e and g, and
     t = origin - corner, each of which is rounded to float32 first:
@@ -78,8 +78,8 @@ def _records(corners: NDArray[np.float64]) -> NDArray[np.float32]:
     - ``c = d . (t x e)`` by 45 u |e|, in the same way;
     - ``g . (t x e)`` by 40 u |e| |g|.
 
-    A comparison with `det` adds its error twice (its sign may come out wrong as well), times
-    the distance, at most 4, for the last one. The numbers below are these with some room.
+    A comparison with `det` adds its error twice (its sign may be wrong as well), times the
+    distance, at most 4, for the last one. The numbers below are these with some margin.
     """
     first = corners[:, 0]
     edge, other = corners[:, 1] - first, corners[:, 2] - first
@@ -93,9 +93,9 @@ def _records(corners: NDArray[np.float64]) -> NDArray[np.float32]:
 
 
 def _stack_need(tree: WideTree) -> int:
-    """Most nodes that wait on any way down: all children but one of each node above."""
+    """Most nodes that wait on any descent: all children but one of each node above."""
     used = (tree.low[:, 0] <= tree.high[:, 0]).sum(axis=1)
-    waiting = np.zeros(len(tree.child), np.int64)  # when each node's turn comes
+    waiting = np.zeros(len(tree.child), np.int64)  # in the order of processing
     level = np.array([0])
     most = 0
     while len(level):

@@ -12,23 +12,23 @@ from numpy.typing import ArrayLike, NDArray
 from .rays import finite_rows, real_rows, refuse_rows
 from .tree import PAD
 
-TINY = 2.0**-60  # stands for a direction component of zero, so that nothing becomes 0 * inf
+TINY = 2.0**-60  # replaces a direction component of zero, to avoid 0 * inf
 
-_BLOCK = 1 << 16  # triangles that are looked at together
+_BLOCK = 1 << 16  # triangles that are processed together
 
 
 @dataclass(frozen=True)
 class LocalMesh:
     """Triangles moved to the middle of their box and scaled into [-1, 1].
 
-    The move keeps coordinates of hundreds of kilometres exact enough for float32 to see a
-    wall; the scale is a power of two, so it rounds nothing, and makes every error bound of
-    the single-precision parts a plain number.
+    The translation makes coordinates of hundreds of kilometres accurate enough in float32; the
+    scale is a power of two, so it rounds nothing, and makes every error bound of the
+    single-precision parts a plain number.
 
     Attributes
     ----------
     centre
-        float64 (3,), metres: what was subtracted.
+        float64 (3,), metres: subtracted from the vertices.
     scale
         Local units in one metre, a power of two.
     points, rows
@@ -88,7 +88,7 @@ class LocalMesh:
 
 
 def local_mesh(vertices: ArrayLike, faces: ArrayLike) -> LocalMesh:
-    """Check a mesh and bring it into local coordinates; see `RayCaster` for what is raised.
+    """Check a mesh and convert it to local coordinates; `RayCaster` lists the errors.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ def local_mesh(vertices: ArrayLike, faces: ArrayLike) -> LocalMesh:
 
 
 def _solid(corners: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which triangles have an area."""
+    """Whether each triangle has an area."""
     edges = corners[:, 1:] - corners[:, :1]
     x, y, z = np.cross(edges[:, 0], edges[:, 1]).astype(np.bool_).T
     return x | y | z
@@ -135,7 +135,7 @@ def _check_faces(faces: ArrayLike, vertex_count: int) -> NDArray[np.int64]:
             "faces must be integers (rows of vertices) of shape (f, 3), at least one triangle, "
             f"not {given.dtype} {given.shape}."
         )
-    if len(given) >= 2**28:  # triangles' places in the tree are 31 bits, of which a leaf takes 3
+    if len(given) >= 2**28:  # positions in the tree have 31 bits, of which a leaf takes 3
         raise ValueError(f"{len(given)} triangles are too many: the limit is {2**28 - 1}.")
     bad = np.flatnonzero(((given < 0) | (given >= vertex_count)).any(axis=1))
     if len(bad):

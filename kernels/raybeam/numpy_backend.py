@@ -1,12 +1,11 @@
-"""Ray casting in NumPy: the reference that works wherever Python does.
+"""Ray casting in NumPy: the reference, which runs wherever Python does.
 
-Many rays walk a wide tree together. The unit of work is a pair of a ray and a node. A block of
+Many rays traverse a wide tree together. The unit of work is a pair of a ray and a node. A block of
 pairs is tested against the children's boxes in float32; pairs of a ray and an inner child make new
-blocks, pairs with a leaf are tested against its triangles. Blocks are taken last in, first out, and
-of a block that is too large the pairs that are nearest to their rays' starts go first: memory
-stays bounded whatever the scene, and hits found early spare later pairs the search behind them. To
-order the children of every node would test a sixth fewer boxes, but in many small blocks, which
-takes twice as long.
+blocks, pairs with a leaf are tested against its triangles. Blocks are processed last in, first out;
+in a block that is too large, the pairs nearest to their rays' starts go first. So memory is bounded
+for any scene, and early hits discard later pairs behind them. Ordering the children of every node
+would test a sixth fewer boxes, but in many small blocks, which takes twice as long.
 """
 
 from __future__ import annotations
@@ -29,9 +28,9 @@ Index = NDArray[np.intp]
 
 _WIDTH = 8
 _LEAF_SIZE = 4
-_BLOCK = 1 << 15  # pairs: a step's arrays take about 6 MiB; smaller ones cost more calls
+_BLOCK = 1 << 15  # pairs: a step's arrays take about 6 MiB; smaller ones need more calls
 _ACROSS = 4.0  # local units: more than the diagonal of any scene
-_SLACK = 2.0**-20  # on limits of distance in float32: far more than their rounding
+_SLACK = 2.0**-20  # margin of distance limits in float32: far more than their rounding
 
 
 @dataclass
@@ -46,20 +45,20 @@ class _Best:
 
 @dataclass(frozen=True)
 class _Bundle:
-    """Rays ready to walk, in local coordinates.
+    """Rays ready for traversal, in local coordinates.
 
     Attributes
     ----------
     entry
-        float64 (n,): where the ray enters the scene's box, 0 when it starts inside. The float32
-        part starts there, so that its rounding errors do not grow with the ray's way to the
+        float64 (n,): where the ray enters the scene's box, 0 if it starts inside. The float32
+        part starts there, so that its rounding errors do not grow with the distance to the
         scene.
     scaled_origin, inverse
         float32 (3, n): ``origin / direction`` and ``1 / direction``.
     near
         intp (3, n): 1 where the ray meets the upper plane of a box first, else 0.
     limit
-        float32 (n,): no hit farther than this from `entry` is of use; shrinks.
+        float32 (n,): hits farther than this from `entry` do not count; shrinks.
     sheared
         The rays for the exact test.
     """
@@ -81,14 +80,14 @@ class _Pairs:
     enter: Single
 
     def only(self, rows: Index) -> _Pairs:
-        """Return some of the pairs; as many rows as there are pairs mean all of them."""
+        """Select pairs; as many rows as there are pairs select all of them."""
         if len(rows) == len(self.ray):
             return self
         return _Pairs(self.ray.take(rows), self.node.take(rows), self.enter.take(rows))
 
 
 class NumpyBackend(Backend):
-    """Bounding volume hierarchy, walked by many rays at a time on one thread."""
+    """Bounding volume hierarchy, traversed by many rays at a time on one thread."""
 
     name: ClassVar[str] = "numpy"
     chunk: ClassVar[int] = 1 << 16
@@ -133,7 +132,7 @@ class NumpyBackend(Backend):
                 order = np.argpartition(pairs.enter, _BLOCK)
                 blocks.append(pairs.only(order[_BLOCK:]))
                 pairs = pairs.only(order[:_BLOCK])
-            # Since the block was made, hits may have been found in front of some of its boxes.
+            # Hits in front of some boxes may have been found since the block was made.
             pairs = pairs.only(np.flatnonzero(pairs.enter <= rays.limit.take(pairs.ray)))
             enter, meets = self._meets(rays, pairs.ray, pairs.node)
             met = np.flatnonzero(meets)
@@ -182,7 +181,7 @@ class NumpyBackend(Backend):
         order = order[np.diff(ray[order], prepend=-1) != 0]  # the closest of each ray
         ray, face, t = ray[order], face[order], t[order]
         old = best.triangle[ray]
-        # Of equals the lowest row wins; a ray without a hit yet has t_max, which counts as well.
+        # At equal distance the lowest row wins; a ray without a hit has t_max, which counts too.
         better = (t < best.t[ray]) | (old < 0) | (face < old)
         ray, ok = ray[better], ok[order][better]
         best.t[ray], best.triangle[ray] = t[better], face[better]
@@ -191,7 +190,7 @@ class NumpyBackend(Backend):
 
 
 def _bundle(origins: Float, directions: Float, entry: Float, t_max: float) -> _Bundle:
-    # From so far away that float64 cannot place the start, it stays near the scene at least.
+    # If the ray is too far away for float64 to place the start, it stays near the scene.
     start = np.clip(origins + entry[:, None] * directions, -2, 2).T.astype(np.float32)
     along = directions.T.astype(np.float32)
     along = np.where(np.abs(along) < TINY, np.copysign(np.float32(TINY), along), along)

@@ -10,21 +10,21 @@ from numpy.typing import ArrayLike, NDArray
 from .poses import Motion, Poses, check_poses
 from .rays import check_origins, unit_directions
 
-_BLOCK = 1 << 14  # rays that are made at a time: what that takes stays in a core's cache
+_BLOCK = 1 << 14  # rays that are made at a time: their arrays stay in a core's cache
 
 
 class Pattern:
     """Rays that are cast many times, for example one revolution of a lidar.
 
-    They are checked and normalised once; a backend may keep its own copy where it computes.
+    They are checked and normalised once; a backend may keep its own copy on its device.
 
     Parameters
     ----------
     directions
         (n, 3), any length but zero, in the sensor's axes.
     origins
-        (n, 3), metres, in the sensor's axes: where each ray starts, as seen from the sensor's
-        position; (3,) for all rays; None when all start at that position.
+        (n, 3), metres, in the sensor's axes: start of each ray relative to the sensor's position;
+        (3,) for all rays; None if all start at that position.
 
     Raises
     ------
@@ -64,7 +64,7 @@ class Pattern:
 
     @property
     def origins(self) -> NDArray[np.float64] | None:
-        """Where rays start (n, 3), metres, read-only and contiguous as `directions`; or None."""
+        """Starts of the rays (n, 3), metres, read-only and contiguous as `directions`; or None."""
         return None if self._origins is None else self._origins.T
 
     def rays(
@@ -79,13 +79,12 @@ class Pattern:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Origins and directions, in the mesh's axes, of some of the rays that a scan casts.
 
-        They have the bits of those that `RayCaster.scan` casts, in whatever batch they are asked
-        for.
+        They have the same bits as the rays that `RayCaster.scan` casts, in any batch.
 
         Parameters
         ----------
         numbers
-            (m,) whole numbers: rays as `ScanReturns` numbers them, from 0 at the window's start.
+            (m,) whole numbers: rays numbered as in `ScanReturns`, from 0 at the window's start.
         positions, rotations, rays_per_pose, motion
             Those given to `RayCaster.scan`.
         start
@@ -101,7 +100,7 @@ class Pattern:
         Raises
         ------
         ValueError
-            If the poses are none, or a ray has no pose or no row in the pattern.
+            If poses are invalid, or a ray has no pose or no row in the pattern.
         """
         ray = np.asarray(numbers).astype(np.int64, casting="same_kind")
         first = index(start)
@@ -119,8 +118,8 @@ class Pattern:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Make checked rays; see `rays`, of which `first` is the start.
 
-        What is in the mesh's axes is rotated, then moved: ``((x a + y b) + z c) + p``; and where
-        the lidar moves on within a pose, ``v + t (w x v)`` and ``p + t u`` come after each.
+        Vectors are rotated to the mesh's axes, then translated: ``((x a + y b) + z c) + p``; if the
+        lidar moves within a pose, ``v + t (w x v)`` and ``p + t u`` follow each step.
         """
         one = len(poses) == 1 and self._origins is None and poses.motion is None
         places, directions = np.empty((2, 3, len(ray)))

@@ -1,12 +1,12 @@
-"""A binary bounding volume hierarchy: agglomerated below, divided at the top.
+"""A binary bounding volume hierarchy: clustered below, swept at the top.
 
 Parallel locally-ordered clustering, Meister and Bittner (2018): boxes are sorted along a space
 filling curve; then each looks at its neighbours in that order, and pairs that are each other's
 best partner (least area of the common box) are merged. Every step is a few operations on whole
-arrays. Near the root there are few clusters left and the curve's neighbours are seldom the best:
-to go on until one is left cost rays a fifth to a half more nodes in cities. So the last ones are
-divided from the root down, by a full sweep with the surface area heuristic (sweep.py), which
-for so few takes a tenth of a second.
+arrays. Near the root, few clusters are left and neighbours on the curve are seldom the best:
+clustering to the end cost rays a fifth to a half more nodes in cities. So the last clusters are
+divided from the root down, by a full sweep with the surface area heuristic (sweep.py), which takes
+a tenth of a second for them.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from .sweep import divide
 
 _RADIUS = 8  # neighbours looked at on either side; twice as many gain 1 to 2 % of the tree's cost
-# Clusters that are left to the sweep: as many as that, but no more than an eighth of all boxes
-# where those are enough. Four times as many gain nothing, a quarter loses a twentieth.
+# Clusters that are left to the sweep: so many, but at most an eighth of all boxes if those are
+# enough. Four times as many gain nothing, a quarter loses a twentieth.
 _MOST, _ENOUGH = 1 << 14, 1 << 10
 _GRID_BITS = 21  # a coordinate; three of them fill 63 bits
 
@@ -108,7 +108,7 @@ def _crown(
     levels = divide(low, high, count.astype(np.float64))
     children = [np.zeros((0, 2), np.int32)]
     rounds: list[tuple[int, int]] = []
-    below = made  # where the level below begins
+    below = made  # start of the level below
     for nodes in reversed(levels):
         number = np.where(nodes >= 0, ids[nodes], below - 1 - nodes)
         children.append(number.astype(np.int32))
@@ -123,8 +123,8 @@ def _partners(
     """Pairs of positions that are each other's nearest, the lower one first."""
     n = low.shape[1]
     here = np.arange(n)
-    # Where all candidates are equally good, as among copies of one triangle, partners must still
-    # find each other: start from the pairs (0, 1), (2, 3), ... and leave them only for a better.
+    # If all candidates are equally good, as among copies of one triangle, partners must still
+    # match: start from the pairs (0, 1), (2, 3), ... and replace them only by better ones.
     best = np.minimum(here ^ 1, n - 1)
     cost = np.full(n, np.inf, np.float32)
     even = here[: n - 1 : 2]

@@ -1,4 +1,4 @@
-"""Where a sensor is while it fires: positions and rotations, each for a number of rays."""
+"""Poses of a sensor: positions and rotations, each for a number of rays."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ _SLACK = 2e-9  # on products of a rotation's rows
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """How a lidar moves on while the rays of a pose leave, one after the other.
+    """Motion of a lidar while it fires the rays of a pose one after the other.
 
     Parameters
     ----------
     delays
-        float64 (m,): how long after its pose's time each of the m rays of a pose leaves, seconds.
+        float64 (m,): delay of each of the m rays of a pose after the pose's time, seconds.
     velocities
         float64 (k, 3): of each pose, metres a second along the mesh's axes.
     rates
@@ -44,12 +44,12 @@ class Poses:
     positions
         float64 (k, 3), metres.
     rotations
-        float64 (k, 3, 3) from the sensor's axes to the mesh's; None when those are the same. In
-        memory the poses of each number lie together, as those of positions and motion do.
+        float64 (k, 3, 3) from the sensor's axes to the mesh's; None if those are the same. Each
+        matrix entry is contiguous over the poses, as are the components of positions and motion.
     rays
         Rays of a pose, at least 1: ray i belongs to pose ``i // rays``.
     motion
-        Within each pose; None where the lidar stands for all of its rays.
+        Within each pose; None if the lidar stands still for all of its rays.
     """
 
     positions: NDArray[np.float64]
@@ -61,7 +61,7 @@ class Poses:
         return len(self.positions)
 
     def of(self, ray: NDArray[np.int64], room: NDArray[np.float64]) -> RayPoses:
-        """Look up the poses of rays (m,); `room`, (18, m), is for what is found."""
+        """Look up the poses of rays (m,), into `room`, (18, m)."""
         pose = ray // self.rays
         delay, rates, velocities = np.zeros(1), None, None
         if self.motion is not None:
@@ -83,13 +83,13 @@ class Poses:
         if len(self) == 1:
             return columns
         for column, out in zip(columns, room, strict=True):
-            column.take(pose, out=out, mode="clip")  # in other modes by way of a buffer
+            column.take(pose, out=out, mode="clip")  # other modes use a buffer
         return room
 
 
 @dataclass(frozen=True, eq=False)
 class RayPoses:
-    """Poses of m rays, see `Poses`: (numbers, m), or (numbers, 1) where one is that of all."""
+    """Poses of m rays, see `Poses`: (numbers, m), or (numbers, 1) if all rays share one."""
 
     positions: NDArray[np.float64]
     rotations: NDArray[np.float64] | None
@@ -98,7 +98,7 @@ class RayPoses:
     rates: NDArray[np.float64] | None
 
     def turned(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Turn vectors (3, m) into the mesh's axes, with one fixed order of rounding.
+        """Rotate vectors (3, m) to the mesh's axes, with a fixed order of rounding.
 
         ``matrices @ vectors`` would do, but its last bit depends on the machine's BLAS.
         """
@@ -118,7 +118,7 @@ class RayPoses:
         return crosses
 
     def moved(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Move places (3, m), or (3, 1), on by as much as their rays are late."""
+        """Move positions (3, m), or (3, 1), by the delays of their rays."""
         if self.velocities is None:
             return places
         pairs = zip(places, self.velocities, strict=True)
@@ -132,9 +132,9 @@ def check_poses(
     rays: int,
     motion: Motion | None = None,
 ) -> Poses:
-    """Poses for so many rays; see `RayCaster.scan`, which tells what is what and what is raised.
+    """Check the poses for so many rays; `RayCaster.scan` describes arguments and errors.
 
-    `Poses` in place of positions have been checked before.
+    `Poses` instead of positions have been checked before.
     """
     if isinstance(positions, Poses):
         return positions
@@ -182,8 +182,8 @@ def _check_motion(motion: Motion, poses: int, rays: int) -> Motion:
 def _check_rotations(rotations: ArrayLike) -> NDArray[np.float64]:
     """Rotation matrices (k, 3, 3) in float64; raises ValueError for one that is not orthonormal."""
     matrices = by_number(real_rows("rotations", rotations, (3, 3)))
-    # Written out for all matrices at once: a product of matrices one by one takes longer than
-    # casting their rays. NaN compares as false.
+    # Written out for all matrices at once: products one by one take longer than casting their rays.
+    # NaN compares as false.
     rows = matrices.transpose(1, 2, 0)
     good = np.ones(len(matrices), np.bool_)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -202,6 +202,6 @@ def _check_rotations(rotations: ArrayLike) -> NDArray[np.float64]:
 
 
 def by_number(table: NDArray[Any]) -> NDArray[np.float64]:
-    """Table (k, ...) in float64, whose entries for each number lie together in memory."""
+    """Table (k, ...) in float64, each number contiguous over the k entries."""
     last = np.moveaxis(table, 0, -1)
     return np.moveaxis(np.ascontiguousarray(last, dtype=np.float64), -1, 0)

@@ -1,4 +1,4 @@
-"""Rays as they come from the caller: checked, in float64, with unit directions."""
+"""Rays from the caller: checked, in float64, with unit directions."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-# A squared length this close to 1 is a unit vector up to rounding and is left as it is, so that
-# directions which are normalised already are not moved by another last bit.
+# A vector with a squared length this close to 1 is a unit vector up to rounding, and is left as it
+# is, so that the last bits of normalised directions do not change.
 _UNIT_SLACK = 1e-14
 
-# Rows that are checked at a time: what is needed beside the rays does not grow with them.
+# Rows that are checked at a time, so that extra memory does not grow with the rays.
 _BLOCK = 1 << 18
 
 
@@ -40,10 +40,9 @@ class Rays:
         return len(self.directions)
 
     def part(self, start: int, stop: int) -> Rays:
-        """Rays `start` to `stop` as engines take them: in float64, directions as unit vectors.
+        """Rays `start` to `stop` for engines: in float64, directions as unit vectors.
 
-        This is done here and not for all rays at once, so that a part's memory is all that a
-        cast needs however many rays there are.
+        They are converted part by part, so that a cast needs memory for one part only.
         """
         origins = self.origins if len(self.origins) == 1 else self.origins[start:stop]
         directions = _float64(self.directions[start:stop])
@@ -51,7 +50,7 @@ class Rays:
 
 
 def check_rays(origins: ArrayLike, directions: ArrayLike, t_min: float, t_max: float) -> Rays:
-    """Rays as they were given; raises ValueError for those that are none.
+    """Check the rays given; raises ValueError for invalid ones.
 
     Parameters
     ----------
@@ -67,7 +66,7 @@ def check_rays(origins: ArrayLike, directions: ArrayLike, t_min: float, t_max: f
 
 
 def check_origins(origins: ArrayLike, rays: int) -> NDArray[Any]:
-    """Origins (n, 3) as given, or one (1, 3); raises ValueError for what is neither."""
+    """Origins (n, 3) as given, or one (1, 3); ValueError for other shapes."""
     start = real_rows("origins", origins)
     if len(start) not in (1, rays):
         raise ValueError(
@@ -92,8 +91,8 @@ def check_interval(t_min: float, t_max: float) -> tuple[float, float]:
 def unit_directions(directions: ArrayLike) -> NDArray[np.float64]:
     """Directions as new float64 unit vectors (n, 3); raises ValueError for zero, NaN and inf.
 
-    Their memory is in columns, so that the transposed array is contiguous, one row an axis.
-    Each row's result depends on that row alone, so that batches may be cut anywhere.
+    Their memory is in columns, so that the transposed array is contiguous.
+    Each row's result depends only on that row, so that batches may be cut anywhere.
     """
     table = _check_directions(directions)
     out = np.empty((3, len(table))).T
@@ -103,17 +102,19 @@ def unit_directions(directions: ArrayLike) -> NDArray[np.float64]:
 
 
 def _normalised(table: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Make unit vectors of checked directions; returns the same array if they are that already."""
+    """Normalise checked directions; returns the same array if they are unit vectors already."""
     x, y, z = table.T
-    # No einsum or norm: those may fuse multiply and add, and then the last bit would depend on
-    # the machine.
+    # No einsum or norm: those may fuse multiply and add, so the last bit would depend on the
+    # machine.
     with np.errstate(over="ignore", under="ignore"):
         squared = (x * x + y * y) + z * z
     off = np.abs(squared - 1) > _UNIT_SLACK
     if not off.any():
         return table
     rows = table[off]
-    rows = rows / np.abs(rows).max(axis=1, keepdims=True)  # squares of 1e200 or 1e-200 are lost
+    rows = rows / np.abs(rows).max(
+        axis=1, keepdims=True
+    )  # squares of 1e200 or 1e-200 overflow or underflow
     x, y, z = rows.T
     out = table.copy()
     out[off] = rows / np.sqrt((x * x + y * y) + z * z)[:, None]
@@ -121,7 +122,7 @@ def _normalised(table: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def real_rows(name: str, values: ArrayLike, shape: tuple[int, ...] = (3,)) -> NDArray[Any]:
-    """Real numbers (n, *shape), copied only if they are no array; a single row may do without n."""
+    """Real numbers (n, *shape), copied only if they are no array; a single row may omit n."""
     given = np.asarray(values)
     if given.shape == shape:
         given = given[None]
@@ -135,7 +136,7 @@ def real_rows(name: str, values: ArrayLike, shape: tuple[int, ...] = (3,)) -> ND
 
 
 def finite_rows(block: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which rows (n, 3) have finite numbers only: (n,)."""
+    """Whether each row (n, 3) has only finite numbers: (n,)."""
     x, y, z = np.isfinite(block).T
     return x & y & z
 

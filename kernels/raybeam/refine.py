@@ -12,7 +12,7 @@ from .mesh import LocalMesh
 
 Float = NDArray[np.float64]
 
-# Local units: a float32 distance is off by about a tenth of this where the ray does not graze.
+# Local units: ten times the error of a float32 distance, unless the ray grazes.
 _TRUST = 2.0**-19
 
 
@@ -24,8 +24,8 @@ class Refiner:
         first = mesh.corners[:, 0]
         normal = np.cross(mesh.corners[:, 1] - first, mesh.corners[:, 2] - first)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        # One column a triangle: unit normal, and the plane's distance from zero along it. Rays
-        # beside each other meet the same triangles, or such as lie together.
+        # One column for each triangle: unit normal, and the plane's distance from zero. Near rays
+        # hit the same or near triangles.
         self._planes = np.stack([*normal.T, (normal * first).sum(axis=1)])
 
     def distance(
@@ -35,18 +35,18 @@ class Refiner:
         place: NDArray[np.intp],
         rough: NDArray[np.floating[Any]],
     ) -> Float:
-        """Distances at which rays meet given triangles.
+        """Distances at which rays hit given triangles.
 
         Parameters
         ----------
         origins
             (m, 3) or (1, 3).
         directions
-            (3, m): one row an axis, which is what makes this fast.
+            (3, m): one row for each axis, which makes this fast.
         place
             (m,): rows of the mesh's corners.
         rough
-            (m,): distances in float32 accuracy; inf for a ray that meets nothing.
+            (m,): distances in float32 accuracy; inf for a miss.
         """
         x, y, z, offset = (column.take(place, mode="clip") for column in self._planes)
         ox, oy, oz = origins.T
@@ -61,7 +61,7 @@ class Refiner:
             t = np.divide(offset, x, out=offset)
         far = np.flatnonzero(~(np.abs(t - rough) <= _TRUST) & (rough < np.inf))
         if len(far):
-            # A grazing ray: the plane alone may be met anywhere, the triangle is not.
+            # A grazing ray may meet the plane anywhere, but not the triangle.
             at = origins if len(origins) == 1 else origins[far]
             t[far] = self._grazing(at, directions[:, far].T, place[far], rough[far])
         return t

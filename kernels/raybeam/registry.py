@@ -1,4 +1,4 @@
-"""Which engines there are, and choosing one."""
+"""The list of engines, and choosing one."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from .cuda_backend import CudaBackend
 from .embree_backend import EmbreeBackend
 from .numpy_backend import NumpyBackend
 
-# In the order in which "auto" tries them. A new backend is added here and nowhere else.
+# In the order in which "auto" tries them. Add new backends here.
 _BACKENDS: tuple[type[Backend], ...] = (CudaBackend, EmbreeBackend, NumpyBackend)
 
 
 def available_backends() -> dict[str, str]:
-    """Backends by name, fastest first: "" for one that can be used here, else why not.
+    """Backends by name, fastest first: "" for a usable one, else why it is not usable.
 
     Examples
     --------

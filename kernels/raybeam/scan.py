@@ -1,4 +1,4 @@
-"""Scans: which rays of a pattern, from which poses; what is kept of their hits and counted."""
+"""Scans: rays of a pattern, their poses, and which hits are kept and counted."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from .pattern import Pattern
 from .poses import Motion, Poses, check_poses
 from .rays import Rays, check_interval
 
-_MOST_RAYS = 1 << 32  # of a scan, for their numbers in `ScanReturns` to fit
+_MOST_RAYS = 1 << 32  # of a scan, so that `ScanReturns` can number them
 
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """What `RayCaster.scan` is asked for, checked.
+    """Checked arguments of `RayCaster.scan`.
 
     Attributes
     ----------
     pattern
         Rays in the sensor's axes.
     first
-        The pattern's row of ray 0; after its last row the pattern starts over.
+        The pattern's row of ray 0; after its last row the pattern repeats.
     count
         Number of rays.
     poses
@@ -35,11 +35,11 @@ class Scan:
     t_min, t_max
         Hits nearer or farther than this are not reported, metres; both ends count.
     keep_every
-        Of each group's hits, those are kept whose number is a multiple of this.
+        Keep the hits of each group whose number is a multiple of this.
     groups
         int64 (g,): numbers of the rays at which groups begin; ascending, the first is 0.
     tally
-        Whether hits are counted by triangle.
+        Whether to count hits by triangle.
     """
 
     pattern: Pattern
@@ -61,7 +61,7 @@ class Scan:
             yield start, min(start + size, self.count)
 
     def rays(self, start: int, stop: int) -> Rays:
-        """Rays `start` to `stop`, made as `Pattern.rays` makes them."""
+        """Rays `start` to `stop`, with the bits of `Pattern.rays`."""
         ray = np.arange(start, stop, dtype=np.int64)
         return Rays(*self.pattern.made(self.first, ray, self.poses), self.t_min, self.t_max)
 
@@ -80,7 +80,7 @@ def check_scan(
     tally: bool = False,
     motion: Motion | None = None,
 ) -> Scan:
-    """Check the arguments of `RayCaster.scan`, which tells what they are and what is raised."""
+    """Check the arguments of `RayCaster.scan`, which describes them and the errors."""
     start, stop = (0, len(pattern)) if window is None else map(index, window)
     if not 0 <= start <= stop or (stop > start and not len(pattern)):
         raise ValueError(
@@ -108,12 +108,12 @@ def check_scan(
 
 
 class Collector:
-    """Takes the hits of a scan, chunk after chunk in ray order.
+    """Collects the hits of a scan, chunk after chunk in ray order.
 
     Parameters
     ----------
     scan
-        Tells what to keep and what to count.
+        Says what to keep and what to count.
     face_count
         Number of the mesh's triangles.
 
@@ -135,7 +135,7 @@ class Collector:
     def keep(
         self, ray: NDArray[np.integer[Any]], start: int, stop: int
     ) -> slice | NDArray[np.intp]:
-        """Count the hits of rays `start` to `stop` and choose those to keep.
+        """Count the hits of rays `start` to `stop` and select those to keep.
 
         Parameters
         ----------
@@ -144,7 +144,7 @@ class Collector:
 
         Returns
         -------
-        What selects the kept ones: rows of `ray`, or all.
+        The selection of kept hits: rows of `ray`, or all.
         """
         first = int(np.searchsorted(self._groups, start, side="right")) - 1
         last = int(np.searchsorted(self._groups, stop, side="left"))
@@ -156,7 +156,7 @@ class Collector:
         self._hits[groups] += counts
         if self._every == 1:
             return slice(None)
-        # Of each group: the row of the first one kept, and how many are.
+        # Of each group: the row of the first kept hit, and the number of kept hits.
         leave = -before % self._every
         if len(counts) == 1:
             return np.arange(leave[0], len(ray), self._every)
@@ -167,7 +167,7 @@ class Collector:
         return rows
 
     def tally(self, triangle: NDArray[np.int32]) -> None:
-        """Count all hits of a chunk by triangle, if that was asked for."""
+        """Count all hits of a chunk by triangle, if requested."""
         if self._tally is not None:
             np.add.at(self._tally, triangle.astype(np.intp), 1)
 
@@ -178,10 +178,10 @@ class Collector:
         distance: NDArray[np.float64],
         triangle: NDArray[np.int32],
     ) -> None:
-        """Take kept hits of a chunk, whose rays are counted from `start`."""
+        """Add kept hits of a chunk, whose rays are counted from `start`."""
         number = ray.astype(np.uint32, copy=False)
         self._kept.append((number + np.uint32(start) if start else number, distance, triangle))
 
     def result(self) -> ScanReturns:
-        """Everything that was taken and counted."""
+        """Return the result of all chunks."""
         return ScanReturns(*joined(self._kept), self._hits, self._tally)

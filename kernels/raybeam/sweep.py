@@ -1,9 +1,9 @@
 """A binary hierarchy by a full sweep with the surface area heuristic.
 
-From the root down, every node is divided where the heuristic is least, over all places between
-its boxes in order along each of the three axes. No way of building from boxes alone gives better
-trees in general; bins, as in Embree, come a few per cent near. All nodes of a level are divided
-together, in some tens of operations on whole arrays.
+From the root down, every node is divided where the heuristic is least, over all positions between
+its boxes sorted along each of the three axes. No builder that uses only boxes gives better trees in
+general; bins, as in Embree, are a few per cent worse. All nodes of a level are divided together, in
+some tens of operations on whole arrays.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ Single = NDArray[np.float32]
 Float = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-_APART = 8.0  # more than boxes within [-2, 2] can be from each other
-# Levels that are divided by the heuristic; deeper ones by halves. Boxes that shrink along a line
-# would be split off one by one, and as many nodes would wait in a walk.
+_APART = 8.0  # more than the distance of boxes within [-2, 2]
+# Levels that are divided by the heuristic; deeper ones are halved. Boxes that shrink along a line
+# would be split off one by one, and as many nodes would wait in a traversal.
 _LEVELS = 32
 
 
@@ -30,9 +30,9 @@ class _Level:
     Attributes
     ----------
     orders
-        Three times (m,): the boxes, node by node, by their middles along each axis.
+        Three times (m,): the boxes, node by node, sorted by their middles along each axis.
     start, stop
-        (k,): where each node's boxes are in them.
+        (k,): range of each node's boxes in them.
     """
 
     orders: list[Index]
@@ -48,7 +48,7 @@ def divide(low: Single, high: Single, weight: Float) -> list[Index]:
     low, high
         float32 (3, n): least and greatest coordinates, within [-2, 2]; n at least 1.
     weight
-        (n,): what it costs to test a box's contents, a whole number such as that of triangles.
+        (n,): cost to test a box's contents, a whole number such as that of triangles.
 
     Returns
     -------
@@ -82,7 +82,7 @@ def _cheapest(
         least = np.minimum.reduceat(cost, level.start)
         found = np.flatnonzero(cost == least[node])
         place = found[np.searchsorted(found, level.start)]
-        # Boxes that are all alike cost the same wherever they are divided: then by halves.
+        # Equal boxes cost the same wherever they are divided: halve them.
         dearest = np.maximum.reduceat(np.where(np.isinf(cost), -np.inf, cost), level.start)
         place = np.where(dearest <= least, (level.start + level.stop) // 2 - 1, place)
         better = least < best
@@ -105,7 +105,7 @@ def _costs(low: Single, high: Single, weight: Float, level: _Level, node: Index)
 
 def _areas(low: Single, high: Single, node: Index) -> Float:
     """Half the surface of the box around each place's box and those of its node before it."""
-    # Moved apart node by node, so that one pass over all of them starts anew at each.
+    # Shifted apart node by node, so that one pass over all nodes restarts at each.
     shift = _APART * node
     x, y, z = (
         np.maximum.accumulate(b + shift) - shift - (np.minimum.accumulate(a - shift) + shift)

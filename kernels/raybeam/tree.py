@@ -1,4 +1,4 @@
-"""The tree that rays walk: a binary hierarchy made wide and flat.
+"""The tree for traversal: a binary hierarchy made wide and flat.
 
 Boxes are rounded and padded outwards, so that a test of a ray against them in float32 never
 loses a triangle that the ray meets in exact arithmetic:
@@ -6,7 +6,7 @@ loses a triangle that the ray meets in exact arithmetic:
 With u = 2**-24, local coordinates and origins within [-1, 1] and unit directions, a plane's
 parameter is computed from an origin that is off by u, a reciprocal direction that is off by 2u
 relative, and with up to three more roundings of values up to 2. Expressed as a shift of the
-plane that is at most 12 u. Boxes are padded by 20 u, of which storing them in float32 takes
+plane, this is at most 12 u. Boxes are padded by 20 u, of which storing them in float32 takes
 at most u.
 """
 
@@ -30,8 +30,8 @@ class WideTree:
     Attributes
     ----------
     low, high
-        float32 (m, 3, width): the children's boxes, padded by `PAD`; an empty place holds a
-        box turned inside out, which no ray meets.
+        float32 (m, 3, width): the children's boxes, padded by `PAD`; an empty slot has an
+        inverted box, which no ray hits.
     child
         int32 (m, width): number of a node, or ``~(first << LEAF_BITS | count - 1)`` for a leaf
         that holds the triangles ``order[first : first + count]``; 0 in an empty place.
@@ -70,9 +70,9 @@ def build_tree(corners: NDArray[np.float64], width: int, leaf_size: int) -> Wide
 
 
 def _leaves(tree: ploc.BinaryTree, leaf_size: int) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
-    """Triangles under each node, and the nodes that are better kept as one leaf.
+    """Triangles under each node, and whether it is cheaper as one leaf.
 
-    By the surface area heuristic, a triangle test taken to cost as much as a box test.
+    By the surface area heuristic, with equal costs of triangle and box tests.
     """
     area = tree.area
     count = np.ones(len(area), np.int32)

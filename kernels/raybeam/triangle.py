@@ -1,14 +1,13 @@
-"""The test that decides whether a ray meets a triangle, in float64.
+"""The test that decides whether a ray hits a triangle, in float64.
 
 It is the watertight test of Woop, Benthin and Wald (2013), "Watertight Ray/Triangle
 Intersection": corners are taken relative to the ray's origin and sheared so that the ray runs
-along one axis; three signed areas in the plane across it then tell whether the ray passes
-inside. A corner is sheared without regard to the triangle it belongs to, and the sign of
-``a * b - c * d`` is right or zero in floating point as long as no multiply-add is fused. With
-zero counting as inside, triangles that share an edge or a corner leave no gap between them,
-however the numbers round. (Signed volumes of Plücker coordinates are consistent along an edge
-too, but round independently for the edges around one corner, so a ray at a corner can slip
-through.)
+along one axis; three signed areas in the plane across it then show whether the ray passes inside.
+Shearing a corner does not depend on its triangle, and the sign of ``a * b - c * d`` is right or
+zero in floating point as long as no multiply-add is fused. Because zero counts as inside, triangles
+that share an edge or a corner leave no gap, whatever the rounding. (Signed volumes of Plücker
+coordinates are consistent along an edge too, but round independently for the edges around one
+corner, so a ray at a corner can slip through.)
 
 intersect.cu does the same operations in the same order, so its distances have the same bits.
 """

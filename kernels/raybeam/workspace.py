@@ -1,4 +1,4 @@
-"""Where the rays of a chunk are made for an engine that reads them in float32."""
+"""Makes the rays of a chunk for an engine that reads them in float32."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from .scan import Scan
 
 Float = NDArray[np.float64]
 
-# Rays that are turned together: what that takes stays in a core's level 2 cache.
+# Rays that are rotated together: their arrays stay in a core's level 2 cache.
 _BLOCK = 1 << 14
 _ORDERS = 8  # that are kept; 1 MiB each
-# Numbers in a buffer of NumPy's. Since 2.3 it copies what is broadcast to buffers if they hold
-# several rows, which makes a product of a row and a column take three times as long.
+# Numbers in a buffer of NumPy's. Since 2.3 it copies broadcast operands to buffers if they hold
+# several rows, which makes a product of a row and a column three times as slow.
 _BUFFER = 16
 
 
 class Order:
-    """Blocks of a chunk's rays, and in which order rays lie in them.
+    """Blocks of a chunk's rays, and the order of rays in them.
 
-    Each block has rays of one pose, or all rays of some poses. Its rays lie as they are numbered,
-    pose by pose; but if it has more poses than a pose has rays, beam by beam: first ray 0 of all
-    poses, then ray 1. So NumPy's loops run along many poses, not along a few rays of each.
+    Each block has rays of one pose, or all rays of some poses. Its rays are in order of number,
+    pose by pose; but if it has more poses than a pose has rays, they are beam by beam: first ray 0
+    of all poses, then ray 1. So NumPy's loops run along many poses, not along a few rays of each.
 
     Parameters
     ----------
@@ -39,12 +39,12 @@ class Order:
     each
         Rays of a pose.
     plain
-        Rays lie as they are numbered in all blocks.
+        Whether rays are in order of number in all blocks.
 
     Attributes
     ----------
     blocks
-        Of each the first ray, how many there are, the first pose, and how many.
+        For each block the first ray, the number of rays, the first pose, the number of poses.
 
     Examples
     --------
@@ -59,7 +59,7 @@ class Order:
         self.blocks = list(_blocks(skip, skip + rays, each))
 
     def by_beam(self, length: int, poses: int) -> bool:
-        """Whether a block of so many rays and poses lies so."""
+        """Whether a block of so many rays and poses is in order of number."""
         return not self._plain and 1 < poses >= length // poses
 
     def view(self, slots: NDArray[Any], poses: int) -> NDArray[Any]:
@@ -70,7 +70,7 @@ class Order:
 
     @cached_property
     def slots(self) -> NDArray[np.intp] | None:
-        """Where each ray lies, (rays,); None if as they are numbered."""
+        """Slot of each ray, (rays,); None if in order of number."""
         if not any(self.by_beam(length, poses) for _, length, _, poses in self.blocks):
             return None
         table = np.arange(self._rays)
@@ -78,23 +78,23 @@ class Order:
         return np.concatenate(parts)
 
     def of(self, ray: NDArray[np.intp]) -> NDArray[np.intp]:
-        """Where some rays lie."""
+        """Slots of some rays."""
         return ray if self.slots is None else self.slots.take(ray)
 
     def by_ray(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Put values (rays,) from their slots into the order of rays."""
+        """Reorder values (rays,) from slots to ray numbers."""
         return values if self.slots is None else values.take(self.slots)
 
 
 class Starts:
-    """Where the rays of a chunk start, in local units.
+    """Starts of the rays of a chunk, in local units.
 
     Parameters
     ----------
     points
-        (n, 3): one for each slot; or (1, 3), that of all.
+        (n, 3): one for each slot; or (1, 3) for all.
     reach
-        No coordinate is farther from zero than this; by default it is looked up.
+        Largest absolute coordinate; by default computed.
     """
 
     def __init__(self, points: Float, reach: float | None = None) -> None:
@@ -104,11 +104,11 @@ class Starts:
         self.reach = reach
 
     def of(self, slot: NDArray[np.intp]) -> Float:
-        """Look up where some rays start: (len(slot), 3), or (1, 3) when one is that of all."""
+        """Select starts of some rays: (len(slot), 3), or (1, 3) if all rays share one."""
         if len(self.points) == 1:
             return self.points
-        # One axis at a time: `take` along an axis copies all points first where they are
-        # transposed, which took as long as half of Embree's cast.
+        # One axis at a time: `take` along an axis first copies all transposed points, which took
+        # half as long as Embree's cast.
         out = np.empty((3, len(slot)))
         for axis in range(3):
             self.points[:, axis].take(slot, out=out[axis], mode="clip")
@@ -118,8 +118,8 @@ class Starts:
 class Workspace:
     """Arrays for a chunk of rays, made once and used for chunk after chunk.
 
-    Fresh pages of memory for every chunk would cost a quarter of what casting it does. A part
-    that is never used takes no memory: the system hands out pages when they are written to.
+    Fresh pages for every chunk would take a quarter of the casting time. Unused parts take no
+    memory, because the system assigns pages when they are written.
 
     Parameters
     ----------
@@ -130,20 +130,19 @@ class Workspace:
     def __init__(self, size: int) -> None:
         self.size = size
         self._rows = np.empty((size, 6), np.float32)
-        # One row an axis: of a pattern's directions and origins that are not in one piece, and
-        # both turned.
+        # One row for each axis: wrapped directions and origins of a pattern, and both rotated.
         self._given, self._turned = np.empty((2, 2, 3, size))
         self._product = np.empty(min(size, _BLOCK))
         self._crosses = np.empty((3, min(size, _BLOCK)))  # of a lidar that moves within a pose
-        self._started: Starts | None = None  # where rows start, if each by itself
-        self._origin: Float | None = None  # where the first rows start, if at one point
-        self._alike = 0  # how many
+        self._started: Starts | None = None  # starts of rows, if they differ
+        self._origin: Float | None = None  # common start of the first rows
+        self._alike = 0  # their number
         self._orders: dict[tuple[int, ...], Order] = {}  # of the last few shapes of chunks
 
     def start(self, n: int, starts: Starts) -> NDArray[np.float32]:
-        """Write where n rays start, and return their rows as an engine reads them.
+        """Write the starts of n rays, and return their rows for an engine.
 
-        Nothing is written when they start where the last ones did.
+        Nothing is written if they equal the last ones.
 
         Returns
         -------
@@ -172,22 +171,22 @@ class Workspace:
     ) -> tuple[Order, Float, Starts]:
         """Make the rays `start` to `stop` of a scan, and write their directions to the rows.
 
-        They are turned in float64, with the operations of `Pattern.rays` and so to the same
-        bits, and rounded when they are written.
+        They are rotated in float64, with the operations of `Pattern.rays` and so the same bits,
+        and rounded when written.
 
         Parameters
         ----------
         mesh
-            In whose local units the rays start.
+            The mesh of the local units.
 
         Returns
         -------
         order
-            In which they lie: in all that follows, a ray stands at its slot.
+            Order of the rays: the following arrays are by slot.
         unit
-            (3, n) float64, valid until the next call: directions, one row an axis.
+            (3, n) float64, valid until the next call: directions, one row for each axis.
         starts
-            Where they start; as `unit`, valid until the next call.
+            Starts of the rays; also valid until the next call.
         """
         before = np.setbufsize(_BUFFER)
         try:
@@ -246,7 +245,7 @@ class Workspace:
 
     def _order(self, start: int, rays: int, poses: Poses) -> Order:
         """Order of a chunk, made once for those of one shape."""
-        plain = poses.rotations is None and poses.motion is None  # nothing is worked out
+        plain = poses.rotations is None and poses.motion is None  # nothing is computed
         key = (start % poses.rays, rays, poses.rays, plain)
         if key not in self._orders:
             if len(self._orders) >= _ORDERS:
@@ -256,9 +255,9 @@ class Workspace:
 
     @staticmethod
     def _rays(scan: Scan, table: Float, start: int, room: Float) -> Float:
-        """Rows of a pattern (3, n) that are cast; where each pose casts all of it, (3, rays).
+        """Rows of a pattern (3, n) that are cast; (3, rays) if each pose casts all of it.
 
-        Those of one pose stay in a core's cache, however many poses there are.
+        The rows of one pose stay in a core's cache, however many poses there are.
         """
         alike = table.shape[1] == scan.poses.rays and not scan.first
         turned = scan.poses.rotations is not None or scan.poses.motion is not None
@@ -269,9 +268,9 @@ class Workspace:
     def _turn(
         self, given: Float, poses: Poses, start: int, order: Order, out: Float, *, written: bool
     ) -> Float:
-        """Turn vectors of the rays from `start` on, see `_rays`; `written` to the rows as well.
+        """Rotate vectors of the rays from `start` on, see `_rays`; also `written` to the rows.
 
-        Returns them by slot, (3, n): `out`, or `given` where there is nothing to turn.
+        Returns them by slot, (3, n): `out`, or `given` if there is no rotation.
         """
         n = out.shape[1]
         if poses.rotations is None and poses.motion is None:
@@ -314,7 +313,7 @@ class Workspace:
 
 
 def _drift(vectors: Float, rates: Float, delays: Float, crosses: Float, product: Float) -> None:
-    """Turn vectors of a block on, in place; with the operations of `Poses.drifted`."""
+    """Rotate vectors of a block by their delays, in place, as `Poses.drifted` does."""
     x, y, z = vectors
     a, b, c = _factors(rates)
     pairs = ((b, z, c, y), (c, x, a, z), (a, y, b, x))
@@ -326,21 +325,21 @@ def _drift(vectors: Float, rates: Float, delays: Float, crosses: Float, product:
 
 
 def _delays(motion: Motion, each: int, ray: int, count: int) -> Float:
-    """Delays of the rays from `ray` on that are of its pose, at most `count`."""
+    """Delays of the rays from `ray` on in its pose, at most `count`."""
     first = ray % each
     return motion.delays[first : first + count]
 
 
 def _factors(rows: Float) -> Any:
-    """Three columns of (count, 3), as numbers where there is one row."""
+    """Three columns of (count, 3), as numbers if there is one row."""
     return rows[0].tolist() if len(rows) == 1 else rows.T[:, :, None]
 
 
 def _columns(table: Float, first: int, room: Float) -> Float:
     """Columns of a table (3, m) from `first` on, as many as `room` (3, n) has.
 
-    After its last column the table starts over. Returns a part of the table if it is in one
-    piece, else `room` with the columns in it.
+    After its last column the table repeats. Returns a view of the table if it does not wrap,
+    else `room` with the columns in it.
     """
     (_, n), length = room.shape, table.shape[1]
     first %= length
@@ -348,7 +347,7 @@ def _columns(table: Float, first: int, room: Float) -> Float:
         return table[:, first : first + n]
     done = length - first
     room[:, :done] = table[:, first:]
-    turn = done  # from here on the table as a whole, over and over
+    turn = done  # from here on, repeat the whole table
     more = min(length, n - done)
     room[:, done : done + more] = table[:, :more]
     done += more
@@ -362,8 +361,8 @@ def _columns(table: Float, first: int, room: Float) -> Float:
 def _blocks(start: int, stop: int, each: int) -> Iterator[tuple[int, int, int, int]]:
     """Cut a range of rays so that each block has rays of one pose, or all rays of some poses.
 
-    Yields the block's first ray, counted from `start`, how many it has, its first pose and how
-    many poses.
+    Yields the block's first ray, counted from `start`, its number of rays, its first pose and its
+    number of poses.
 
     Examples
     --------
