@@ -29,6 +29,8 @@ pytestmark = pytest.mark.slow
 
 SCHEDULER = {"host": LOOPBACK, "port": 0, "dashboard_address": f"{LOOPBACK}:0"}
 FEWER = {"planning": {"trials": 10}}  # beside the default survey
+# A minute of casting, by NumPy on two cores.
+MINUTE = {"sensor": {"rays_per_revolution": 3600, "layers": 32, "step_deg": 1}, "steps": 1440}
 LONG = {"steps": 100_000, "planning": {"trials": 100_000}}  # hours of work
 
 
@@ -83,16 +85,18 @@ class Command:
     """The command with a cluster file, in a process group of its own, as a shell starts it."""
 
     def __init__(
-        self, folder: Path, cluster: dict[str, Any], scenario: dict[str, Any] = FEWER
+        self, folder: Path, cluster: dict[str, Any] | None, scenario: dict[str, Any] = FEWER
     ) -> None:
         (folder / "s.yaml").write_text(yaml.safe_dump(scenario))
         (folder / "cluster.yaml").write_text(yaml.safe_dump(cluster))
-        self.out, self.log = folder / "out", folder / "said"
+        place = ["--cluster", "cluster.yaml"] if cluster else []
+        self.out = folder / ("out" if cluster else "local")
+        self.log = self.out.with_suffix(".log")
         with self.log.open("wb") as log:
             self.process = subprocess.Popen(
                 [
-                    *(sys.executable, "-m", "lidarpool", "run", "s.yaml"),
-                    *("--cluster", "cluster.yaml", "--out", "out", "--only", "cloud"),
+                    *(sys.executable, "-m", "lidarpool", "run", "s.yaml", "--out", self.out),
+                    *("--backend", "numpy", "--only", "cloud", *place),
                 ],
                 cwd=folder,
                 stdout=log,
@@ -110,12 +114,17 @@ class Command:
     def said(self) -> str:
         return self.log.read_text()
 
-    def assert_default_result(self) -> None:
-        """Wait for the end, and check that the result is that of the default survey."""
-        assert self.process.wait(300) == 0, self.said
-        assert sha256((self.out / "cloud.ply").read_bytes()).hexdigest() == DEFAULT_CLOUD_SHA256
+    def result(self) -> tuple[str, dict[str, Any]]:
+        """Wait for the end; returns the cloud's checksum and the report."""
+        assert self.process.wait(600) == 0, self.said
         report = json.loads((self.out / "report.json").read_text())
         assert report["placement_violations"] == 0
+        return sha256((self.out / "cloud.ply").read_bytes()).hexdigest(), report
+
+    def assert_default_result(self) -> None:
+        """Wait for the end, and check that the result is that of the default survey."""
+        checksum, report = self.result()
+        assert checksum == DEFAULT_CLOUD_SHA256
         assert report["tasks"]["GPU"].keys() == {"intersect"}
         assert report["tasks"]["LIDAR"].keys() == {"generate", "sort", "collect"}
         assert report["tasks"]["OTHER"] == {"trial": 10}
@@ -141,6 +150,20 @@ def test_a_run_waits_for_its_jobs_and_takes_them_with_it(empty_queue, tmp_path):
     assert empty_queue.jobs()["gpu"][1] == "PENDING"
     empty_queue.ask("scontrol", "release", "jobname=gpu")
     run.assert_default_result()
+    assert empty_queue.jobs() == {}
+
+
+@needs_slurm
+def test_jobs_that_are_cancelled_during_a_run_of_the_command(empty_queue, tmp_path):
+    expected, _ = Command(tmp_path, None, MINUTE).result()
+    run = Command(tmp_path, slurm_file(tmp_path), MINUTE)
+    run.wait_for(r"survey +[1-9]")
+    lost = {name: number for name, (number, _) in empty_queue.jobs().items()}
+    empty_queue.ask("scancel", lost["gpu"], lost["lidar"])
+    run.wait_for("waiting for workers of partition LIDAR")  # another job is on its way
+    checksum, report = run.result()
+    assert checksum == expected
+    assert report["tasks"]["LIDAR"].keys() == {"generate", "sort", "collect"}
     assert empty_queue.jobs() == {}
 
 
