@@ -13,6 +13,7 @@ from .looking import Eye, Filter
 
 VIEW_POINTS = 500_000  # of all in a browser, and as many of what is seen from near
 BLOCK = 1 << 15  # rows that are read at a time
+_KEPT = 0.8  # of the points, as often as they are too many
 Search = Generator[float, None, tuple[Cloud, int]]
 
 
@@ -80,9 +81,9 @@ class Blocks:
             kept.append(piece.part(rows))
             held += len(rows)
             while held > most:
-                thin /= 2
+                thin *= _KEPT
                 cloud = Cloud.joined(kept)
-                kept = [cloud.part(np.flatnonzero(random.random(len(cloud)) < 0.5))]
+                kept = [cloud.part(np.flatnonzero(random.random(len(cloud)) < _KEPT))]
                 held = len(kept[0])
             yield (number + 1 - numbers.start) / len(numbers)
         return Cloud.joined(kept or [empty]), found

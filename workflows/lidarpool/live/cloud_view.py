@@ -31,6 +31,7 @@ ENOUGH_SEEN = 0.5  # of the points are in the picture: it shows the whole
 # As shares of the scene's diagonal. Points can be seen where there are few, and told apart where
 # there are many.
 _POINT, _POINT_OF_MANY = 0.0035, 0.6
+_POINT_FROM_NEAR = 0.002  # of the distance of those at the front: some two pixels
 _SMALLEST = 0.1  # of the size of points that are seen from afar
 _MOST_NAMES = 2000  # in a menu
 _NS = 1e9
@@ -248,6 +249,10 @@ class CloudView:
             kept &= cloud.positions[:, 2] - self._origin[2] <= cut
         return kept
 
+    def _point_m(self) -> float:
+        """Width of a point that all browsers see."""
+        return min(_POINT, _POINT_OF_MANY / len(self._base()) ** 0.5) * self._size_m
+
     def _scale(self) -> None:
         """Spread the colours over what the filter keeps."""
         name = self.colour.value
@@ -271,8 +276,7 @@ class CloudView:
         values = values_of(cloud, self.colour.value)[rows]
         colours = as_bytes(self._colouring.paint(values))
         places = (cloud.positions[rows] - self._origin).astype(np.float32)
-        share = min(_POINT, _POINT_OF_MANY / len(self._base()) ** 0.5)
-        size *= share * self._size_m * self._point_size.value
+        size *= self._point_m() * self._point_size.value
         if node is None:
             return scene.add_point_cloud(
                 "/cloud",
@@ -356,8 +360,10 @@ class CloudView:
         """Show a browser what was found, and outside its picture what all see."""
         base = self._base()
         seen = near.eye.tiles(base.positions - self._origin) >= 0
-        near.size = max((np.count_nonzero(seen) / max(len(found), 1)) ** 0.5, _SMALLEST)
-        near.size = min(near.size, 1.0)
+        if len(found):
+            away = np.linalg.norm(found.positions - self._origin - near.eye.position, axis=1)
+            size = _POINT_FROM_NEAR * float(np.percentile(away, 20)) / self._point_m()
+            near.size = float(np.clip(size, _SMALLEST, 1.0))
         near.cloud = Cloud.joined([base.part(np.flatnonzero(~seen)), found])
         near.version += 1
 
