@@ -65,12 +65,15 @@ class Blocks:
         numbers = range(low // BLOCK, -(-high // BLOCK))
         empty = self.file.piece(0, 0)
         for number in numbers:
-            if eye is not None and not self._may_be_seen(number, eye):
+            if not self._may_be_seen(number, eye):
                 continue
+            yield (number - numbers.start) / len(numbers)
             start = number * BLOCK
             piece = self.file.piece(max(low, start), min(high, start + BLOCK))
             if low <= start and high >= min(start + BLOCK, len(self.file)) and len(piece):
                 self._boxes[number] = piece.bounds - self._origin
+                if not self._may_be_seen(number, eye):
+                    continue
             rows = np.flatnonzero(wanted.keeps(piece))
             share = np.full(len(rows), thin)
             if eye is not None and shares is not None:
@@ -85,9 +88,8 @@ class Blocks:
                 cloud = Cloud.joined(kept)
                 kept = [cloud.part(np.flatnonzero(random.random(len(cloud)) < _KEPT))]
                 held = len(kept[0])
-            yield (number + 1 - numbers.start) / len(numbers)
         return Cloud.joined(kept or [empty]), found
 
-    def _may_be_seen(self, number: int, eye: Eye) -> bool:
+    def _may_be_seen(self, number: int, eye: Eye | None) -> bool:
         box = self._boxes[number]
-        return bool(np.isnan(box[0, 0])) or eye.may_see(box)
+        return eye is None or bool(np.isnan(box[0, 0])) or eye.may_see(box)

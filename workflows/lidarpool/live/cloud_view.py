@@ -94,6 +94,7 @@ class CloudView:
         self._version = 0  # of what is drawn from
         self.filter = Filter()
         self.trail = Filter()  # of the time that is played
+        self._counted = (-1, Filter(), 0)  # points of a version that a filter keeps
         self._colouring: Colouring | None = None
         self._scaled: Hashable = None  # what the colours were made of
         self._drawn: Hashable = None
@@ -374,10 +375,13 @@ class CloudView:
             return ["reading the points …"]
         whole = len(self._even) if self.blocks is None else len(self.blocks.file)
         base = self._base()
-        shown = np.count_nonzero(self.filter.keeps(base))
+        if self._counted[:2] != (self._version, self.filter):
+            kept = np.count_nonzero(self.filter.keeps(base))
+            self._counted = self._version, self.filter, int(kept)
+        shown = self._counted[2]
         count = self._count
         if count is None:
-            count = int(shown) if self.filter.limits else whole
+            count = shown if self.filter.limits else whole
         words = "all shown" if shown == count else f"{shown:,} shown"
         lines = [f"{count:,} of {whole:,} points, {words}"]
         if self._search is not None or any(near.search for near in self._near.values()):

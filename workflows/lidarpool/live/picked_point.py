@@ -121,7 +121,7 @@ def measured(start: NDArray[Any], end: NDArray[Any]) -> list[tuple[str, str]]:
     way = end.astype(np.float64) - start
     return [
         ("distance", f"{np.linalg.norm(way):,.3f} m"),
-        ("level", f"{np.hypot(way[0], way[1]):,.3f} m"),
+        ("horizontal", f"{np.hypot(way[0], way[1]):,.3f} m"),
         *(
             (f"Δ{axis}", f"{metres:+,.3f} m")
             for axis, metres in zip("xyz", way.tolist(), strict=True)
