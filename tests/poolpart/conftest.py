@@ -7,29 +7,16 @@ import uuid
 from contextlib import ExitStack
 
 import pytest
-from distributed import Client, Nanny, Scheduler, SpecCluster, Worker
+from distributed import Client, Nanny, Scheduler
+from tests.clusters import QUIET, cluster_of
 
 from poolpart import Pipe, Pool, local_cluster
 from poolpart.internals import FixedCluster
 
-QUIET = 50  # logging level: the workers that tests kill are not news
-
 
 def thread_cluster(workers):
-    """Cluster in this process; `workers` gives options by name."""
-    spec = {
-        name: {"cls": Worker, "options": {"nthreads": 1, "dashboard": False, **options}}
-        for name, options in workers.items()
-    }
-    scheduler = {
-        "cls": Scheduler,
-        "options": {
-            "protocol": "inproc://",
-            "dashboard": False,
-            "dashboard_address": "127.0.0.1:0",
-        },
-    }
-    return SpecCluster(workers=spec, scheduler=scheduler, silence_logs=QUIET)
+    """Cluster in this process, whose tasks get the objects that tests have; options by name."""
+    return cluster_of(workers, {"protocol": "inproc://"})
 
 
 @pytest.fixture

@@ -168,7 +168,8 @@ def test_a_script_needs_no_main_guard_and_what_it_defines_reaches_the_workers(tm
     body = "print(client.submit(defined_here, 20).result(), file=sys.stderr)"
     driver = script(tmp_path, body, call="def defined_here(x): return 2 * x + 2\n\nmain()")
     output, errors = driver.communicate(timeout=120)
-    assert (driver.returncode, errors) == (0, "42\n")
+    assert driver.returncode == 0
+    assert "42" in errors.splitlines()  # Dask may log the end of a busy machine's workers beside it
     assert len(output.splitlines()) == 1  # that of the driver: no worker has run the script
 
 

@@ -313,3 +313,8 @@ def test_the_installed_command_says_the_same(place):
     )
     check_refusal(ended.returncode, ended.stdout, ended.stderr)
     assert content(place) == before
+
+
+def test_a_run_without_open3d_ends_before_it_starts(place, refused, monkeypatch):
+    monkeypatch.setitem(sys.modules, "open3d.pybind", None)
+    refused(["run", "good.yaml"], "Clouds are written through Open3D, which does not load")
