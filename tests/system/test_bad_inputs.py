@@ -44,14 +44,14 @@ FILES: dict[str, tuple[str, bytes | None, str]] = {
 # {content of a scenario: what the message says}
 RETURNS: dict[str, str] = {
     "materials: [{objects: V*, reflectance: 0.3}]": "no entry names the object",
-    "materials: [{objects: ['*', Vace]}]": "no object is called so. Did you mean 'Vase'?",
-    "materials: [{objects: '*'}, {objects: Q*}]": "'Q*', and no object is called so. There are ",
+    "materials: [{objects: ['*', Vace]}]": "no object has that name. Did you mean 'Vase'?",
+    "materials: [{objects: '*'}, {objects: Q*}]": "'Q*', but no object has that name. There are ",
     "materials: [{objects: '*', reflectance: 1.2}]": "materials[0].reflectance is 1.2",
     "materials: [{objects: '*', class: tree}]": "materials[0].class is 'tree'",
     "materials: [{reflectance: 0.5}]": "materials[0].objects is missing",
     "materials: [{objects: '*', transparent: glass}]": "'none', 'pass' or 'mirror'",
     "returns: {mode: best}": "'strongest', 'first', 'last', 'dual' or 'all'",
-    "returns: {subrays: 19}": "the sensor states no divergence: give returns.divergence_mrad",
+    "returns: {subrays: 19}": "the sensor has no divergence: give returns.divergence_mrad",
     "noise: {range_m: -0.01}": "noise.range_m is -0.01",
     "weather: {fog: thick}": "weather.fog is not a field",
     "cloud: {columns: [intensities]}": "Did you mean 'intensity'?",

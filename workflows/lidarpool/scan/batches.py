@@ -1,4 +1,4 @@
-"""Batches under way: consecutive scans that are not committed yet, and who has them."""
+"""Batches under way: consecutive uncommitted scans, and where they are."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from enum import Enum
 
 from distributed import Future
 
-PIECES = 16  # a batch in which something is wrong is divided into so many
+PIECES = 16  # a failing batch is divided into so many
 
 
 class Place(Enum):
-    """Where a batch is."""
+    """State of a batch."""
 
     WAITING = "waiting"  # to be offered to a GPU worker
     CASTING = "casting"  # offered to one
     CAST = "cast"  # its columns are on that worker
-    COLLECTING = "collecting"  # a collector was told of them
+    COLLECTING = "collecting"  # assigned to a collector
 
 
 @dataclass(eq=False)
@@ -30,7 +30,7 @@ class Batch:
     first, stop
         Its scans.
     number
-        Batches that were taken before: bounds how far the last is ahead of the first.
+        Number of earlier batches: limits how far the last is ahead of the first.
     """
 
     first: int
@@ -41,9 +41,9 @@ class Batch:
     worker: str = ""  # address of the GPU worker
     collector: str = ""  # name of the task of stage 4
     future: Future | None = None
-    since: float = 0.0  # when it came to where it is
+    since: float = 0.0  # since when it is in its state
     deaths: Counter[str] = field(default_factory=Counter)  # {stage: workers that died with it}
-    kills: Counter[str] = field(default_factory=Counter)  # {stage: of them, with nothing else}
+    kills: Counter[str] = field(default_factory=Counter)  # {stage: those with no other batch}
     suspects: set[str] = field(default_factory=set)  # stages whose workers it may have killed
 
     @property
@@ -53,12 +53,12 @@ class Batch:
 
     @property
     def name(self) -> str:
-        """Its scans, for people."""
+        """Its scans, for messages."""
         last = self.stop - 1
         return f"scan {last}" if self.first == last else f"scans {self.first} to {last}"
 
     def to(self, place: Place, now: float) -> None:
-        """Note that it has come somewhere."""
+        """Record its new state."""
         self.place, self.since = place, now
 
 
@@ -85,7 +85,7 @@ class Batches:
         return self._taken - min(numbers) if numbers else 0
 
     def at(self, *places: Place) -> list[Batch]:
-        """Batches at some places."""
+        """Batches in some states."""
         return [batch for batch in self._batches.values() if batch.place in places]
 
     def add(self, first: int, stop: int) -> Batch:
@@ -96,7 +96,7 @@ class Batches:
         return batch
 
     def remove(self, batch: Batch) -> None:
-        """Let go of a batch; its result is not needed any more."""
+        """Release a batch; its result is no longer needed."""
         if batch in self:
             del self._batches[batch.first]
         batch.future = None
@@ -106,7 +106,7 @@ class Batches:
         return [b for b in self._batches.values() if first <= b.first and b.stop <= stop]
 
     def split(self, batch: Batch) -> list[Batch]:
-        """Divide a batch into smaller ones, as suspect as it was."""
+        """Divide a batch into smaller ones, which inherit its suspicion."""
         self.remove(batch)
         size = -(-(batch.stop - batch.first) // PIECES)
         pieces = []
@@ -118,6 +118,6 @@ class Batches:
         return pieces
 
     def clear(self) -> None:
-        """Let go of all."""
+        """Release all batches."""
         for batch in self:
             self.remove(batch)

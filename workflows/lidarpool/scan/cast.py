@@ -1,4 +1,4 @@
-"""Stage 2: what becomes of a batch on a GPU worker: its rays are cast, and its columns made."""
+"""Stage 2: casts the rays of a batch on a GPU worker, and makes its columns."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from .rig import rig_of
 
 @dataclass(frozen=True)
 class CastBatch:
-    """What stage 2 makes of a batch.
+    """Result of stage 2 for a batch.
 
     Parameters
     ----------

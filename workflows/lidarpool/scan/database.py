@@ -1,8 +1,8 @@
 """The database of a run: which parts and trials belong to the result.
 
-One SQLite file. A batch belongs to the result from the moment its receipt is in here; before that
-anything may be lost or done twice, after that a second receipt is dropped. What is not in here is
-offered again: that is all of recovery, and of resuming.
+One SQLite file. A batch belongs to the result once its receipt is in here; before that anything may
+be lost or done twice, after that a second receipt is dropped. Recovery and resuming offer all other
+batches again.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ CREATE TABLE trials (trial INTEGER PRIMARY KEY, data TEXT NOT NULL);
 
 
 class RunDatabase:
-    """What has been committed of one run.
+    """Committed parts and trials of one run.
 
     Parameters
     ----------
     path
-        The file; made where there is none.
+        The file; made if it does not exist.
     scan_count
         Scans of the survey.
     durable
-        Whether what is committed must survive a power cut.
+        Whether commits must survive a power failure.
 
     Raises
     ------
@@ -76,7 +76,7 @@ class RunDatabase:
                 raise
 
     def _open(self) -> None:
-        # The lock is held as long as the database is open: no second run writes to it.
+        # The lock is held while the database is open, so that no second run writes to it.
         self._sql.execute("PRAGMA locking_mode = EXCLUSIVE")
         self._sql.execute(f"PRAGMA synchronous = {'FULL' if self._durable else 'OFF'}")
         self._sql.execute("BEGIN IMMEDIATE")
@@ -100,7 +100,7 @@ class RunDatabase:
         trials = self._sql.execute("SELECT data FROM trials ORDER BY trial")
         self.trials = [_trial_of(json.loads(data)) for (data,) in trials]
 
-    # -- what there is -------------------------------------------------------------------
+    # -- reading -------------------------------------------------------------------------
 
     @property
     def complete(self) -> bool:
@@ -114,7 +114,7 @@ class RunDatabase:
 
     @property
     def cells(self) -> NDArray[np.int64] | None:
-        """Lowest and highest cell of all points, (2, 3); None where there are none."""
+        """Lowest and highest cell of all points, (2, 3); None without points."""
         found = [part.cells for part in self.parts.values() if part.cells]
         if not found:
             return None
@@ -122,12 +122,12 @@ class RunDatabase:
         return np.stack([table[:, 0].min(axis=0), table[:, 1].max(axis=0)])
 
     def unframed(self) -> list[Receipt]:
-        """Parts that hold scans which were not handed out as frames, in order."""
+        """Parts with scans that were not handed out as frames, in order."""
         at = max(0, bisect.bisect_right(self._firsts, self.frames) - 1)
         return [p for first in self._firsts[at:] if (p := self.parts[first]).stop > self.frames]
 
     def forget_summaries(self, part: Receipt) -> None:
-        """Drop the summaries of a part from memory: all of them were handed out."""
+        """Drop the summaries of a part from memory, because all were handed out."""
         self.parts[part.first] = replace(part, summaries=b"", records=())
 
     def summaries_of(self, scans: Sequence[int]) -> list[tuple[int, bytes]]:
@@ -142,7 +142,7 @@ class RunDatabase:
         return sorted(found.items())
 
     def part_of(self, scan: int) -> Receipt:
-        """Part that holds a scan which is committed; KeyError where it is not."""
+        """Part of a committed scan; KeyError if it is not committed."""
         at = bisect.bisect_right(self._firsts, scan) - 1
         part = self.parts[self._firsts[at]] if at >= 0 else None
         if part is None or scan >= part.stop:
@@ -155,10 +155,10 @@ class RunDatabase:
         cuts = np.flatnonzero(np.diff(absent) > 1) + 1
         return [(int(run[0]), int(run[-1]) + 1) for run in np.split(absent, cuts) if len(run)]
 
-    # -- what comes in -------------------------------------------------------------------
+    # -- writing -------------------------------------------------------------------------
 
     def set(self, **values: str) -> None:
-        """Keep some values.
+        """Store some values.
 
         Raises
         ------
@@ -171,9 +171,9 @@ class RunDatabase:
         self.meta |= values
 
     def commit(self, receipts: Sequence[Receipt]) -> list[Receipt]:
-        """Enter parts in one transaction; returns those that were new.
+        """Commit parts in one transaction; returns those that were new.
 
-        One that has a scan which is committed already is left out as a whole.
+        A part with a scan that is committed already is left out.
         """
         new: list[Receipt] = []
         taken: set[int] = set()
@@ -198,7 +198,7 @@ class RunDatabase:
         return new
 
     def drop(self, receipts: Sequence[Receipt]) -> None:
-        """Forget parts that are not in storage any more: their scans are offered again."""
+        """Remove parts that are missing in storage, so that their scans are offered again."""
         with self._transaction():
             self._sql.executemany(
                 "DELETE FROM parts WHERE first = ?", [(p.first,) for p in receipts]
@@ -212,7 +212,7 @@ class RunDatabase:
             self.hits -= part.hits
 
     def add_trial(self, trial: Trial) -> None:
-        """Keep a planning trial."""
+        """Store a planning trial."""
         with self._transaction():
             self._sql.execute(
                 "INSERT OR IGNORE INTO trials VALUES (?, ?)",
@@ -222,24 +222,24 @@ class RunDatabase:
         self.trials.append(trial)
 
     def save_frames(self) -> None:
-        """Keep how many frames were handed out; they go along with each commit anyway."""
+        """Store how many frames were handed out; each commit does so anyway."""
         if self.frames != self._frames_written:
             with self._transaction():
                 self._write_frames()
 
     def copy(self) -> bytes:
-        """Content of the file, as it is after the last transaction."""
+        """Content of the file after the last transaction."""
         with self._explained():
             return self._sql.serialize()
 
     def unlock(self) -> None:
-        """Let others use the file; what is in it can still be read."""
+        """Release the lock of the file; it can still be read."""
         with self._explained():
             self._sql.execute("PRAGMA locking_mode = NORMAL")
             self._sql.execute("SELECT count(*) FROM meta").fetchone()  # the lock goes with a read
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._sql.close()
 
     def _enter(self, part: Receipt) -> None:
@@ -272,7 +272,7 @@ class RunDatabase:
 
     @contextmanager
     def _explained(self) -> Iterator[None]:
-        """Say of an error of SQLite what it means."""
+        """Translate an error of SQLite."""
         try:
             yield
         except sqlite3.OperationalError as error:
@@ -295,7 +295,7 @@ def _trial_of(data: dict[str, Any]) -> Trial:
 
 
 def parts_place(path: Path) -> str:
-    """Where a run has put its parts, as its database says; empty where that cannot be read."""
+    """Place of a run's parts, from its database; empty if that cannot be read."""
     with (
         suppress(sqlite3.Error),
         closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as sql,

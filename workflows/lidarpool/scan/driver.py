@@ -1,9 +1,9 @@
 """The driver's side of the survey: it offers batches, commits parts and hands out frames.
 
-Everything happens in `step`, called over and over from one thread; nothing in it waits for long.
-There is one rule of recovery: what is not committed is offered again, and what is not handed out
-is sorted again, whatever was lost. Only so many batches are under way at a time, and the last is
-only so far ahead of the first: that bounds every queue, the sorter's memory and the workers'.
+Everything happens in `step`, called repeatedly from one thread; nothing in it waits for long. There
+is one rule of recovery: uncommitted batches are offered again, and frames that were not handed out
+are sorted again, whatever was lost. The number of batches under way, and the distance of the last
+to the first, are limited: that bounds every queue, and the memory of sorter and workers.
 """
 
 from __future__ import annotations
@@ -50,15 +50,15 @@ from .workers import CastingWorkers
 
 BATCH_SECONDS = 0.2  # casting time that makes a batch worth its overhead
 BATCH_RAYS = 1_000_000  # bounds a batch's memory
-BATCHES_LEAST = 16  # for each slot, so that none idles for long in the end
-AHEAD = 2  # batches that a worker is offered for each of its slots: it need not wait for the next
+BATCHES_LEAST = 16  # batches for each slot, so that none idles for long at the end
+AHEAD = 2  # batches offered to a worker for each of its slots, so that it need not wait
 COLLECTING = 3  # batches that a collector is given at a time
 SPAN = 8  # batches that the newest may be ahead of the oldest, for each that may be under way
 SUSPECT_DEATHS = 2  # workers that may die with a batch before it is tried alone
 KILLS_MOST = 3  # workers that a single scan may kill, alone
 LATE_S = 60.0  # a batch is late when it takes so long at one place, and
 LATE_FACTOR = 20.0  # so much longer than others
-STALL_S = 60.0  # without news of what was given to be sorted; then it is given again
+STALL_S = 60.0  # without news from the sorter; then it gets its summaries again
 LAST_WORDS_S = 3.0  # for the stages to end after everything was committed
 PUT_S = 30.0  # for a pipe that is never full
 
@@ -75,11 +75,11 @@ class SurveyDriver:
     plan
         Scene, survey and backend.
     db
-        What is committed; scans that are in it are not made again.
+        Committed parts; their scans are not cast again.
     storage
         Where parts go.
     read
-        Reads the points of a scan that is committed.
+        Reads the points of a committed scan.
     on_frame
         Called with each frame, in scan order, in the driver's thread.
     on_parts
@@ -115,19 +115,19 @@ class SurveyDriver:
         self.book = TaskBook()
         self.batches = Batches()
         self.workers = CastingWorkers(client, self._gpu, self.run_id, plan)
-        self.generated = 0  # scans that were taken from stage 1, from the first on
+        self.generated = 0  # scans taken from stage 1, from the first on
         self.cast = 0  # scans that stage 2 has finished
         self.offered_again = 0
         self.duplicates_dropped = 0
         self._offers: dict[int, Batch] = {}  # {number of an offer: its batch}
         self._offer_count = 0
-        self._seconds: deque[float] = deque(maxlen=64)  # that batches took to be cast
+        self._seconds: deque[float] = deque(maxlen=64)  # casting times of batches
         self._condemned: list[str] = []  # why scans cannot be done
-        # Named as parts are: what a driver that was killed leaves goes with those of no receipt.
+        # Named like parts: leftovers of a killed driver are removed with parts without a receipt.
         self._probe = (f".probe-{self.run_id}{SUFFIX}", secrets.token_bytes(16))
         self._hidden: list[str] = []  # names of LIDAR workers that do not see the storage
         self._summary = summary_type(samples_of_scan(self.survey.scan_count))
-        self._sorter = -1  # number of the attempt that is heard
+        self._sorter = -1  # number of the current attempt
         self._sorted_at = time.monotonic()  # when the last frames came
         self._scans = self._pipe("scans", queue_capacity)
         self._receipts = self._pipe("receipts", 64)
@@ -142,7 +142,7 @@ class SurveyDriver:
         self.stages = LongStages(
             client, self._lidar, self.run_id, commands, self._stage_died, patience_s
         )
-        self._inbox: dict[str, list[Any]] = {}  # {name of a pipe: what has come by it}
+        self._inbox: dict[str, list[Any]] = {}  # {name of a pipe: items taken from it}
         self._closed_at: float | None = None  # when all was committed and the pipes were closed
 
     # -- the long stages -------------------------------------------------------------------
@@ -158,7 +158,7 @@ class SurveyDriver:
         return generate, (fields, self.survey, self._scans, self.generated)
 
     def _sort(self, number: int) -> Work:
-        """Start a sorter with a pipe of its own, and everything that was not handed out in it."""
+        """Start a sorter with its own pipe, which has all summaries not handed out yet."""
         self._sorter = number
         self._sorted_at = time.monotonic()
         inlet = self._new_inlet(SORT, number)
@@ -182,26 +182,26 @@ class SurveyDriver:
         return command
 
     def _new_inlet(self, name: str, number: int) -> Pipe:
-        """Make the pipe of one start of a stage; that of an earlier one ends with it."""
+        """Make the pipe for one start of a stage; delete that of an earlier start."""
         if (earlier := self._inlets.pop(name, None)) is not None:
             forget_pipes(self.client, [earlier.name])
         pipe = self._inlets[name] = self._pipe(f"{name}-{number}", 1_000_000).create()
         return pipe
 
     def _have_sorted(self, parts: list[Receipt]) -> None:
-        """Tell the sorter of parts; one that is not there is told when it is started."""
+        """Send parts to the sorter; an absent one gets them when it is started."""
         if SORT in self._inlets and parts:
             items = [{"first": part.first, "data": part.summaries} for part in parts]
             self._trace("handon", SORT, [s for p in parts for s in range(p.first, p.stop)])
             self._put(self._inlets[SORT], items)
 
     def _put(self, pipe: Pipe, item: list[dict[str, Any]]) -> None:
-        """Put into a pipe whose length is bounded by what is under way."""
-        with suppress(PipeFailed):  # its stage is being replaced, and is told all of it then
+        """Put into a pipe whose length is bounded by the batches under way."""
+        with suppress(PipeFailed):  # its stage is being replaced, and gets all of it then
             pipe.put(item, timeout_s=PUT_S, unbounded=True)
 
     def _stage_died(self, name: str) -> None:
-        """Take back what a collector had; a sorter is told everything when it is started."""
+        """Take back a collector's batches; a sorter gets everything when it is started."""
         for batch in self.batches.at(Place.COLLECTING):
             if batch.collector == name:
                 alone = len(self.batches.at(Place.COLLECTING)) == 1
@@ -209,7 +209,7 @@ class SurveyDriver:
                 self._count_again(batch, f"the worker of {name} died")
                 self._note_death(batch, COLLECT, alone)
 
-    # -- how far it is ---------------------------------------------------------------------
+    # -- state -----------------------------------------------------------------------------
 
     def start(self) -> None:
         """Make the pipes and start the stages; after this `stop` and `finish` must be called."""
@@ -231,7 +231,7 @@ class SurveyDriver:
 
     @property
     def finished(self) -> bool:
-        """True once all stages have exited, or the time for their last words has elapsed."""
+        """True once all stages have exited, or the shutdown timeout has elapsed."""
         if self._closed_at is None:
             return False
         return self.stages.done or time.monotonic() - self._closed_at > LAST_WORDS_S
@@ -243,19 +243,19 @@ class SurveyDriver:
 
     @property
     def notes(self) -> list[str]:
-        """What a user should know of how it went."""
+        """Notes on the survey for the user."""
         notes = [*self.stages.notes, *self.workers.notes]
         if self._hidden:
             notes.append(
                 f"{', '.join(sorted(set(self._hidden)))} of partition {LIDAR} cannot see "
-                f"{self._storage.url}: parts came to it through the driver"
+                f"{self._storage.url}: the driver wrote their parts"
             )
         return notes
 
-    # -- one turn --------------------------------------------------------------------------
+    # -- one step --------------------------------------------------------------------------
 
     def step(self) -> bool:
-        """Do what can be done now; returns whether anything was.
+        """Do what can be done now; returns whether there was anything to do.
 
         Raises
         ------
@@ -263,7 +263,7 @@ class SurveyDriver:
             If a task of the survey has failed, naming stage and scans.
         """
         moved = self._take_receipts() | self._take_frames()
-        if self._closed_at is not None:  # last words only
+        if self._closed_at is not None:  # only receive last messages
             return moved
         moved |= self._see_to_casts()
         self._look()
@@ -279,9 +279,9 @@ class SurveyDriver:
         return moved
 
     def wait(self, seconds: float) -> None:
-        """Wait until there may be something to do, but no longer than so.
+        """Wait until there may be something to do, at most so long.
 
-        All that came is taken by the same request: each costs driver and scheduler a millisecond.
+        The same request takes all items: each request costs driver and scheduler a millisecond.
         """
         pipes = [self._receipts.name, self._frames.name]
         if self._room > 0 and self._closed_at is None:
@@ -298,7 +298,7 @@ class SurveyDriver:
         trace(f"driver.{event}", run=self.run_id, stage=stage, scans=list(scans), **more)
 
     def _look(self) -> None:
-        """See, once in a while, to workers and stages."""
+        """Check workers and stages from time to time."""
         if self.workers.due:
             self.workers.look()
             self._leave_lost_workers()
@@ -328,7 +328,7 @@ class SurveyDriver:
     def _take_scans(self) -> bool:
         items = self._inbox.pop(self._scans.name, [])
         for first, stop in items:
-            # A generator that was started again describes what is here already.
+            # A restarted generator repeats scans that are here already.
             new = max(first, self.generated)
             if new > first:
                 self._drop_duplicates(GENERATE, range(first, min(new, stop)))
@@ -352,7 +352,7 @@ class SurveyDriver:
         if not waiting or not self.workers.slots:
             return False
         load = dict.fromkeys(self.workers.slots, 0)
-        alone: set[str] = set()  # workers that have a suspect
+        alone: set[str] = set()  # workers with a suspect batch
         for batch in self.batches.at(Place.CASTING):
             if batch.worker in load:
                 load[batch.worker] += 1
@@ -369,7 +369,7 @@ class SurveyDriver:
             }
             address = min(rooms, key=lambda a: (rooms[a], a), default="")
             if not address or rooms[address] >= 1:
-                if suspect:  # the others must not keep every worker from it
+                if suspect:  # the others must not occupy all workers
                     break
                 continue
             if cast + sum(load.values()) >= self._most:
@@ -416,7 +416,7 @@ class SurveyDriver:
         return moved
 
     def _leave_lost_workers(self) -> None:
-        """Offer again what is on workers that have gone, or give no sign of life."""
+        """Offer batches again whose workers have gone or are silent."""
         seen = self.workers.seen
         for batch in self.batches.at(Place.CASTING, Place.CAST):
             if batch.worker not in seen.members:
@@ -435,7 +435,7 @@ class SurveyDriver:
             self._note_death(batch, INTERSECT, alone)
 
     def _leave_late(self) -> None:
-        """Offer again what takes far longer than other batches."""
+        """Offer batches again that take far longer than others."""
         now = time.monotonic()
         usual = statistics.median(self._seconds) if self._seconds else 0.0
         late = max(LATE_S, LATE_FACTOR * usual)
@@ -445,7 +445,7 @@ class SurveyDriver:
                 self._again(batch, "it is late")
 
     def _again(self, batch: Batch, reason: str) -> None:
-        """Have a batch cast once more."""
+        """Return a batch to be cast again."""
         if batch.future is not None:
             batch.future.cancel()
             batch.future = None
@@ -456,14 +456,14 @@ class SurveyDriver:
         self.offered_again += 1
         self._trace("replay", INTERSECT, batch.scans, reason=reason)
 
-    # -- a batch that kills its workers ------------------------------------------------------
+    # -- poison batches ----------------------------------------------------------------------
 
     def _note_death(self, batch: Batch, stage: str, alone: bool) -> None:
-        """Count the death of a worker against a batch that was there.
+        """Count the death of a worker against its batches.
 
-        What was there at two deaths is tried alone. An innocent batch passes; one whose worker
-        dies again is divided, down to single scans, and a scan is to blame when worker after
-        worker has died of it alone.
+        A batch with two deaths is tried alone. An innocent batch succeeds; one whose worker dies
+        again is divided, down to single scans. A scan is the cause if several workers in a row
+        die with it alone.
         """
         batch.deaths[stage] += 1
         if stage not in batch.suspects:
@@ -481,7 +481,7 @@ class SurveyDriver:
             self.batches.remove(batch)
             where = self._gpu if stage == INTERSECT else self._lidar
             self._condemned.append(
-                f"{batch.name} kills the worker that runs stage {stage}: {KILLS_MOST} of them "
+                f"{batch.name} kills the worker that runs stage {stage}: {KILLS_MOST} workers "
                 "died, one after the other, with no other scan in that stage"
                 f"{words_on_memory(self.client, [batch.worker])}. Look into the logs of the "
                 f"{where.name} workers."
@@ -490,7 +490,7 @@ class SurveyDriver:
     # -- stage 4: collecting -----------------------------------------------------------------
 
     def _hand_on(self) -> bool:
-        """Tell collectors of batches that were cast."""
+        """Assign batches that were cast to collectors."""
         ready = self.batches.at(Place.CAST)
         if not ready:
             return False
@@ -507,7 +507,7 @@ class SurveyDriver:
             ready = suspects[:1]
             if busy:
                 return False
-        told: dict[str, list[dict[str, Any]]] = {}  # {collector: what it is told}
+        told: dict[str, list[dict[str, Any]]] = {}  # {collector: its message}
         for batch in ready:
             room = [name for name in names if load[name] < COLLECTING]
             if not room:
@@ -521,7 +521,7 @@ class SurveyDriver:
         return bool(told)
 
     def _collect(self, batch: Batch, name: str) -> dict[str, Any]:
-        """Give a batch to a collector; returns what to tell it."""
+        """Assign a batch to a collector; returns the message to it."""
         assert batch.future is not None
         batch.collector = name
         batch.to(Place.COLLECTING, time.monotonic())
@@ -537,7 +537,7 @@ class SurveyDriver:
         }
 
     def _under_way(self, offer: int) -> Batch | None:
-        """Batch of an offer, None where it is committed or was divided."""
+        """Batch of an offer; None if it is committed or was divided."""
         batch = self._offers.get(offer)
         return batch if batch is not None and batch in self.batches else None
 
@@ -551,7 +551,7 @@ class SurveyDriver:
                 self._hidden.append(answer["hidden"])
                 continue
             if "lost" in answer:
-                # A collector that was replaced may tell of what another has committed since.
+                # A replaced collector may report a batch that another has committed.
                 batch = self._under_way(answer["lost"])
                 if batch is not None and batch.place is Place.COLLECTING:
                     self._again(batch, "its columns could not be fetched")
@@ -565,7 +565,7 @@ class SurveyDriver:
         return bool(answers)
 
     def _fetch_held(self, receipt: Receipt) -> bool:
-        """Write a part that a worker holds, which does not see the storage."""
+        """Write a part from a worker that does not see the storage."""
         data = take_held(self.client, receipt.held_at, receipt.name)
         if data is None:
             if (batch := self._under_way(receipt.offer)) is not None:
@@ -591,7 +591,7 @@ class SurveyDriver:
                 self._trace("points", COLLECT, scans)
             else:
                 self._drop_duplicates(COLLECT, scans)
-                with suppress(OSError):  # what is left there is removed in the end
+                with suppress(OSError):  # leftovers there are removed at the end
                     self._storage.remove([receipt.name])
         for receipt in new:
             self._learn(receipt.records)
@@ -603,7 +603,7 @@ class SurveyDriver:
             self._on_parts(new)
 
     def _learn(self, records: Sequence[TaskRecord]) -> None:
-        """Enter tasks of stage 2, and tell stage 1 how many scans to put into one item."""
+        """Record tasks of stage 2, and advise stage 1 on the scans in one item."""
         for record in records:
             self.book.add(record)
             if record.stage == INTERSECT:
@@ -611,7 +611,7 @@ class SurveyDriver:
                 self._scans.advise(self._wished_scans(record))
 
     def _wished_scans(self, last: TaskRecord) -> int:
-        """Say how many scans an item should have: at most twice as many as the last."""
+        """Choose how many scans an item should have: at most twice as many as the last."""
         rays_per_scan = max(1, self.survey.ray_count // self.survey.scan_count)
         slots = self.workers.slot_count
         most = min(BATCH_RAYS // rays_per_scan, self.survey.scan_count // (BATCHES_LEAST * slots))
@@ -651,7 +651,7 @@ class SurveyDriver:
         )
         self._trace("frame", SORT, [scan])
         self._on_frame(frame)
-        # Only now: a frame that the caller failed on is handed to them again.
+        # Only now: after an error of the caller the frame is handed out again.
         self._db.frames = scan + 1
         part = self._db.part_of(scan)
         if scan + 1 == part.stop:
@@ -665,14 +665,14 @@ class SurveyDriver:
         return [self._scans, self._receipts, self._frames, *self._inlets.values()]
 
     def stop(self, reason: str) -> None:
-        """End every stage at once; `finish` does the rest."""
+        """End all stages at once; `finish` does the rest."""
         self.client.cancel([batch.future for batch in self.batches if batch.future is not None])
         for pipe in self._pipes:
             with suppress(PipeFailed):  # not made yet, or gone already
                 pipe.fail(reason)
 
     def finish(self) -> None:
-        """Wait a moment for the stages to end, and leave nothing on the scheduler."""
+        """Wait a moment for the stages to end, and clean up the scheduler."""
         try:
             deadline = (self._closed_at or time.monotonic()) + LAST_WORDS_S
             while not self.stages.done and time.monotonic() < deadline:
@@ -681,7 +681,7 @@ class SurveyDriver:
         finally:
             forget_pipes(self.client, [pipe.name for pipe in self._pipes])
             self.stages.forget_lock()
-            # In one message: a client that leaves right behind a second is missed by the answer.
+            # In one message: the answer to a second one could miss a client that leaves.
             self.client.cancel([*self.stages.futures.values(), *self.workers.futures])
             self.workers.release()
             self.batches.clear()
@@ -689,7 +689,7 @@ class SurveyDriver:
                 self._storage.remove([self._probe[0]])
 
     def _take_last_records(self) -> None:
-        """Take the stages' own records; those whose worker cannot be reached are done without."""
+        """Collect the stages' records; those of unreachable workers are left out."""
         ended = [f for f in self.stages.futures.values() if f.status == "finished"]
         found = fetch_available(self.client, [future.key for future in ended])
         for future in ended:

@@ -1,7 +1,7 @@
-"""What comes back of a pulse: beams of several rays, materials, and noise.
+"""Returns of a pulse: sub-rays, materials, and noise.
 
-It takes the place of the ray caster's `scan` where a survey has any of these. Random numbers
-follow from scan, ray and return, so nothing depends on how scans are batched.
+Replaces the ray caster's `scan` if a survey has any of these. Random numbers depend only on scan,
+ray and return, so the batches do not matter.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from .motion import Clock, Poses
 from .surfaces import Surfaces
 from .world import World
 
-PATTERN_RAYS = 20_000_000  # of a period of the head that are kept; 24 bytes each
+PATTERN_RAYS = 20_000_000  # sub-rays of a head's period that are kept; 24 bytes each
 CHUNK_RAYS = 1 << 18  # sub-rays that are cast at a time
-BLOCK_RAYS = 1 << 14  # rays whose sub-rays are made at a time, within a cache
-PASSES_MOST = 16  # surfaces that light meets one after the other, before it is given up
+BLOCK_RAYS = 1 << 14  # rays whose sub-rays are made at a time, to fit a cache
+PASSES_MOST = 16  # surfaces that light passes before it is dropped
 
 Whole = NDArray[np.int64]
 Rays = NDArray[np.integer[Any]]
@@ -32,7 +32,7 @@ Real = NDArray[np.float64]
 
 
 class Hits(NamedTuple):
-    """Where light came back from, in the order of rays: arrays (n,)."""
+    """Points that light returned from, in the order of rays: arrays (n,)."""
 
     ray: Whole
     distance: Real
@@ -40,27 +40,27 @@ class Hits(NamedTuple):
     energy: Real
 
     def take(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Hits:
-        """Return some of them."""
+        """Select some of them."""
         return Hits(self.ray[rows], self.distance[rows], self.triangle[rows], self.energy[rows])
 
 
 def joined(parts: list[Hits]) -> Hits:
-    """Put hits one after the other."""
+    """Concatenate hits."""
     return Hits(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 @dataclass(frozen=True)
 class Echoes(ScanReturns):
-    """Returns in the order of rays and distances, perhaps several of a ray.
+    """Returns in the order of rays and distances, possibly several for a ray.
 
     Attributes
     ----------
     energy
         float64 (k,): received, see `Surfaces.energy`.
     number, returns
-        uint8 (k,): which of the reported returns of its pulse, from 1, and of how many.
+        uint8 (k,): number among the reported returns of its pulse, from 1, and their count.
     reported
-        float64 (k,): distance with noise; `distance` is without.
+        float64 (k,): distance with noise; `distance` has none.
     """
 
     energy: Real
@@ -71,7 +71,7 @@ class Echoes(ScanReturns):
 
 @dataclass(frozen=True)
 class Keys:
-    """What random numbers of a ray follow from.
+    """Keys of the random numbers of rays.
 
     Parameters
     ----------
@@ -91,14 +91,14 @@ class Keys:
 
 
 class EchoCaster:
-    """A ray caster that knows beams, materials and noise.
+    """A ray caster with sub-rays, materials and noise.
 
     Parameters
     ----------
     caster
         Casts single rays.
     scene, survey, surfaces
-        What is scanned and how.
+        The scene, the survey, and the scene's surfaces.
     """
 
     def __init__(self, caster: World, scene: Scene, survey: Survey, surfaces: Surfaces) -> None:
@@ -106,19 +106,19 @@ class EchoCaster:
         self._noise, self._one_each = survey.noise, _one_each(survey, surfaces)
         self._faces = surfaces.triangles
         self._divided: dict[int, Pattern] = {}  # {id of a pattern that is kept: its sub-rays}
-        # So far off a surface light goes on, not to meet it again: Embree rounds to a fourth.
+        # Light continues so far behind a surface, not to hit it again: Embree rounds to a quarter.
         reach = np.float32(np.abs(scene.vertices).max())
         self._clear_m = max(1e-5, 4 * float(np.spacing(reach)))
 
     @staticmethod
     def needed(survey: Survey, surfaces: Surfaces) -> bool:
-        """Whether plain casting does not do for a survey."""
+        """Whether a survey needs more than plain casting."""
         noise = survey.noise
         noisy = max(noise.range_m, noise.range_per_m, noise.angle_deg) > 0
         return noisy or not _one_each(survey, surfaces)
 
     def divide(self, sensor: Sensor, pattern: Pattern) -> None:
-        """Make the sub-rays of a pattern once that is cast again and again, if they are few."""
+        """Make the sub-rays of a repeated pattern once, if they are few."""
         subrays = self._survey.returns.subrays
         few = len(pattern) * subrays <= PATTERN_RAYS
         if few and subrays > 1 and not self._noise.angle_deg:
@@ -144,7 +144,7 @@ class EchoCaster:
         Parameters
         ----------
         sensor
-            Whose beams they are.
+            Sensor of the beams.
         scan
             Number of the first scan.
         pattern, poses, window, groups
@@ -186,7 +186,7 @@ class EchoCaster:
     def _beams(
         self, beam: Real, pattern: Pattern, first: int, keys: Keys, start: int, stop: int
     ) -> Pattern:
-        """Make the sub-rays of rays `start` to `stop`, noise of angles included, ray by ray."""
+        """Make the sub-rays of rays `start` to `stop`, with noise of angles, ray by ray."""
         rays = np.arange(start, stop)
         rows = (first + rays) % len(pattern)
         directions = np.empty((len(rays), len(beam), 3))
@@ -210,7 +210,7 @@ class EchoCaster:
         window: tuple[int, int],
         groups: Whole,
     ) -> Echoes:
-        """Cast rays that have one return each: energies of those only that are kept."""
+        """Cast rays with one return each; compute energies only for kept ones."""
         found = self._caster.returns(
             sensor, self._survey.keep_every, pattern, poses, window, groups
         )
@@ -230,7 +230,7 @@ class EchoCaster:
         return self._surfaces.energy(triangle, cosine, distance, extinction)
 
     def _hits(self, sensor: Sensor, beams: Pattern, poses: Poses, window: tuple[int, int]) -> Hits:
-        """Cast sub-rays, and follow the light through what passes it and off mirrors."""
+        """Cast sub-rays, and follow the light through glass and off mirrors."""
         surfaces, materials = self._surfaces, self._surfaces.materials
         farthest = sensor.max_range_m
         found = self._caster.scan(
@@ -262,7 +262,7 @@ class EchoCaster:
             ahead = ahead - folded[:, None] * surfaces.normals(triangle[on], times[on])
             away = self._clear_m / np.maximum(np.abs(along), 1e-3)
             light = Pattern(ahead, ends + away[:, None] * ahead)
-            # Light that goes on is where it is at once: it passes 300 m in a microsecond.
+            # Light takes no time: it travels 300 m in a microsecond.
             now = Poses(np.zeros(3), clock=Clock(times[on], np.zeros(1)))
             found = self._caster.scan(light, now, t_max=farthest)
             before = distance + away
@@ -278,7 +278,7 @@ class EchoCaster:
         return hits
 
     def _reported(self, returns: Hits, keys: Keys) -> Hits:
-        """Take what is seen, and of it what the mode reports."""
+        """Select detected returns, and among them those that the mode reports."""
         if self._noise.loses:
             seen = self._noise.detected(returns.energy, *keys.of(returns.ray), numbers(returns.ray))
             returns = returns.take(seen)
@@ -313,21 +313,21 @@ def _one_each(survey: Survey, surfaces: Surfaces) -> bool:
 
 
 def numbers(ray: Whole) -> Whole:
-    """Count the entries of each ray, which stand together, from 0: (n,)."""
+    """Count the entries of each ray, which are consecutive, from 0: (n,)."""
     return np.arange(len(ray)) - np.repeat(*_runs(ray))
 
 
 def _runs(ray: Whole) -> tuple[Whole, Whole]:
-    """Where runs of equal numbers begin, and how long they are."""
+    """Find starts and lengths of runs of equal numbers."""
     begins = np.flatnonzero(np.diff(ray, prepend=-1))
     return begins, np.diff(begins, append=len(ray))
 
 
 def separated(hits: Hits, gap_m: float) -> Hits:
-    """Make returns of hits: those of a ray that follow within a distance are one return.
+    """Make returns of hits: hits of a ray within a distance of the next are one return.
 
-    Its energy is the sum of theirs, its distance their mean weighted by energy, its triangle
-    that of the strongest. Hits without energy are none.
+    Its energy is their sum, its distance their mean weighted by energy, its triangle that of the
+    strongest. Hits without energy are dropped.
 
     Parameters
     ----------
@@ -350,7 +350,7 @@ def separated(hits: Hits, gap_m: float) -> Hits:
     width = np.maximum.reduceat(hits.distance, begins) - np.minimum.reduceat(hits.distance, begins)
     new = np.zeros(len(hits.ray), np.bool_)
     new[begins] = True
-    # Few beams meet an edge, and only those are sorted.
+    # Few beams hit an edge, and only those are sorted.
     wide = np.flatnonzero(np.repeat(width > gap_m, counts))
     if len(wide):
         order = wide[np.lexsort((hits.distance[wide], hits.ray[wide]))]
@@ -368,7 +368,7 @@ def separated(hits: Hits, gap_m: float) -> Hits:
 
 
 def chosen(returns: Hits, mode: Mode) -> NDArray[np.bool_]:
-    """Which returns of each ray a mode reports: (n,)."""
+    """Whether a mode reports each return: (n,)."""
     ray = returns.ray
     begins, counts = _runs(ray)
     first, last = np.zeros((2, len(ray)), np.bool_)

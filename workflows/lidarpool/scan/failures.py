@@ -1,4 +1,4 @@
-"""Telling failed tasks apart, and saying which scans an error is about."""
+"""Classifies failed tasks, and names the scans of an error."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ ASK_S = 10.0  # for an error's text, which the scheduler has
 
 @contextmanager
 def naming_scans(first: int, last: int | None = None) -> Iterator[None]:
-    """Put the scans that were being worked on before the message of whatever is raised.
+    """Prefix the message of any error with the current scans.
 
     Raises
     ------
     RuntimeError
-        In place of any error of the body; it travels through Dask whatever the error was.
+        Instead of any error of the body, because it can always be sent through Dask.
     WorkerLeft
-        If that is what was raised: the scans are not to blame.
+        If the body raised it: the scans are not the cause.
     """
     try:
         yield
@@ -36,31 +36,31 @@ def naming_scans(first: int, last: int | None = None) -> Iterator[None]:
 
 
 def was_killed(future: Future) -> bool:
-    """Whether it was not a failed task that failed: its workers kept dying, or its worker left."""
+    """Whether the cause was not the task: its workers kept dying, or its worker left."""
     return isinstance(future.exception(timeout=ASK_S), (KilledWorker, WorkerLeft))
 
 
 def rig_is_missing(future: Future) -> bool:
-    """Whether a task of stage 2 has failed since its worker had no rig."""
+    """Whether a task of stage 2 failed because its worker had no rig."""
     return isinstance(future.exception(timeout=ASK_S), RigMissing)
 
 
 def raise_if_failed(future: Future, what: str) -> None:
-    """Raise LidarpoolError if a task has failed or was cancelled by somebody else."""
+    """Raise LidarpoolError if a task has failed or was cancelled from outside."""
     if future.status == "error":
         error = future.exception(timeout=ASK_S)
         error.__traceback__ = future.traceback(timeout=ASK_S)
-        words = str(error) or type(error).__name__  # some of Dask's have no words
+        words = str(error) or type(error).__name__  # some of Dask's have no message
         raise LidarpoolError(f"{what} failed: {words}") from error
     if future.status == "cancelled":  # "lost" passes: a worker died and the task runs again
         raise LidarpoolError(f"{what} was cancelled from outside this run.")
 
 
 def words_on_memory(client: Client, workers: Collection[str]) -> str:
-    """Clause for a message about workers that died, if nannies ended them for their memory."""
-    # A nanny logs it as an event, with the address of the worker; no other cause is told.
+    """Clause for a message about dead workers, if nannies ended them for their memory."""
+    # A nanny logs this as an event, with the address of the worker; other causes are unknown.
     events = client.get_events("worker-restart-memory")
     ended = {event.get("worker") for _, event in events} & set(workers)
     if not ended:
         return ""
-    return " (used more memory than their limit, says the nanny that ended them)"
+    return " (ended by their nanny for exceeding the memory limit)"

@@ -1,4 +1,4 @@
-"""What the fork server imports, so that the workers of a cluster on this machine have it."""
+"""Imports of the fork server, which workers of a local cluster inherit."""
 
 from __future__ import annotations
 
@@ -11,6 +11,6 @@ from ..plan import trial  # noqa: F401
 from . import stages  # noqa: F401
 
 keep_freed_memory()
-with suppress(ImportError):  # where it cannot be loaded, a check says why
+with suppress(ImportError):  # if it cannot be loaded, a check says why
     import embreex.mesh_construction
     import embreex.rtcore_scene  # noqa: F401

@@ -1,4 +1,4 @@
-"""The long-running tasks of stages 1, 3 and 4: started where there is room, and kept alive."""
+"""The long-running tasks of stages 1, 3 and 4: starts them on free slots, and again."""
 
 from __future__ import annotations
 
@@ -17,34 +17,34 @@ from .failures import raise_if_failed, was_killed, words_on_memory
 
 LOOK_EVERY_S = 0.5
 SETTLE_S = 2.0  # for a task that was just submitted to start
-DEATHS_MOST = 12  # of one stage with nothing committed in between
+DEATHS_MOST = 12  # deaths of one stage with nothing committed in between
 ASK_LOCK_S = 0.05
 
-# Makes what a stage is to do, from the attempt's number: a function and its arguments.
+# Makes a stage's task from the number of the attempt: a function and its arguments.
 Work = tuple[Callable[..., Any], tuple[Any, ...]]
 Command = Callable[[int], Work]
 
 
 @dataclass(eq=False)
 class _Task:
-    """One stage as it runs now."""
+    """Current state of a stage."""
 
     future: Future
     worker: str  # address of the one worker that it may run on
     since: float
-    dead_since: float | None = None  # it has died, and was not started again yet
+    dead_since: float | None = None  # it has died, and has not been restarted yet
     died: list[str] = field(default_factory=list)  # earlier workers, in a row
-    progress: int = -1  # what had been committed when it last died
+    progress: int = -1  # progress when it last died
 
 
 class LongStages:
-    """Runs each stage on a worker of its own choosing, and starts it again when that dies.
+    """Runs each stage on a chosen worker, and restarts it when the worker dies.
 
-    Dask would do both, in ways that do not fit tasks as long as the run: it may give two of them
-    to one slot, where the second waits until the first has ended, which it never does; and it
-    blames a task for the deaths of the workers it ran on, so that the fourth ends it. The stages
-    are started all together, under a lock of the cluster, when there are slots for all of them:
-    two runs that each had some of the slots would wait for each other for ever.
+    Dask would do both, but not in a way that suits tasks as long as the run: it may give two of
+    them to one slot, where the second waits for the first for ever; and it counts the deaths of
+    a task's workers, and fails the task at the fourth. All stages are started together, under a
+    lock of the cluster, when there are slots for all: two runs with some of the slots each would
+    wait for each other for ever.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ class LongStages:
     run
         Id of the run, part of the tasks' keys.
     commands
-        What each stage is to do, by name; asked again each time the stage is started.
+        Makers of the stages' tasks, by name; called for each start.
     on_death
         Called with the name of a stage whose worker has died.
     patience_s
@@ -75,8 +75,8 @@ class LongStages:
         self._submitted = 0
         self._looked_at = 0.0
         self._enough_at = time.monotonic()  # slots, free or not
-        self._waited_from: float | None = None  # for slots that others held
-        self.waiting = False  # for slots that others hold, to start with
+        self._waited_from: float | None = None  # waited for slots that others held
+        self.waiting = False  # since when it waits for such slots; None if it does not
         self.notes: list[str] = []  # what a user should know
 
     @property
@@ -90,7 +90,7 @@ class LongStages:
         return all(task.future.done() for task in self._tasks.values())
 
     def worker_of(self, name: str) -> str:
-        """Address of the worker of a stage that runs; "" where it does not."""
+        """Address of the worker of a running stage; else ""."""
         task = self._tasks.get(name)
         return task.worker if task and task.dead_since is None else ""
 
@@ -100,11 +100,11 @@ class LongStages:
         Raises
         ------
         LidarpoolError
-            If the partition has too few slots, and goes on having too few.
+            If the partition has too few slots for too long.
         """
         lock = Lock(self._lock_name, scheduler_rpc=self.client.scheduler, loop=self.client.loop)
         acquired = False
-        with suppress(RuntimeError):  # another run has just let go of it, see `forget_lock`
+        with suppress(RuntimeError):  # another run has just removed it, see `forget_lock`
             acquired = lock.acquire(timeout=ASK_LOCK_S)
         if not acquired:
             self.waiting = True
@@ -135,7 +135,7 @@ class LongStages:
                 )
             for name in self._commands:
                 self._submit(name, free)
-            # Another run may look as soon as the lock is free: the tasks must be known by then.
+            # Another run may look once the lock is free: the scheduler must know the tasks by then.
             deadline = now + SETTLE_S
             keys = {task.future.key for task in self._tasks.values()}
             while self._look().tasks.keys() < keys and time.monotonic() < deadline:
@@ -157,7 +157,7 @@ class LongStages:
         return look_for_tasks(self.client, self.partition.name, keys)
 
     def look(self, progress: int) -> None:
-        """See, once in a while, to stages that died or wait behind another.
+        """From time to time, restart stages that died or wait behind another.
 
         Parameters
         ----------
@@ -183,8 +183,7 @@ class LongStages:
             if task.future.status == "finished":
                 continue
             room = max(free.values(), default=0) > 0
-            # A worker that is silent may wake up: its stages are left to it while there is no
-            # other place for them.
+            # A silent worker may wake up: it keeps its stages while there are no other slots.
             if task.dead_since is None and (
                 self._has_died(task, seen) or (task.worker in seen.silent and room)
             ):
@@ -211,7 +210,7 @@ class LongStages:
         return task.worker not in seen.members
 
     def _is_behind_another(self, task: _Task, seen: Whereabouts, now: float) -> bool:
-        """Whether a task is behind another on a worker that has more than its slots hold."""
+        """Whether a task waits behind another on a worker with more tasks than slots."""
         settled = now - task.since > SETTLE_S
         behind = not seen.runs_for_long(task.future.key) and seen.free.get(task.worker, 0) < 0
         return settled and behind
@@ -219,7 +218,7 @@ class LongStages:
     def _wait_for_slot(self, name: str, seconds: float) -> None:
         """LidarpoolError when a stage has had no slot for long.
 
-        One of several collectors is not missed: the others do its work.
+        One of several collectors is not needed: the others do its work.
         """
         kind = name.partition("-")[0]
         spare = any(
@@ -245,7 +244,7 @@ class LongStages:
         self._tasks[name].died, self._tasks[name].progress = died, progress
 
     def _submit(self, name: str, free: dict[str, int]) -> None:
-        """Start a stage, under a key of its own, where most slots are free."""
+        """Start a stage, under a new key, on the worker with the most free slots."""
         worker = max(free, key=lambda address: (free[address], address))
         free[worker] -= 1
         number, self._submitted = self._submitted, self._submitted + 1
@@ -255,7 +254,7 @@ class LongStages:
         future = self.partition.submit(function, *arguments, key=key, worker=worker)
         self._tasks[name] = _Task(future, worker, time.monotonic())
         if earlier is not None:
-            # Where it still runs after all, it ends with its pipe; what comes of it is dropped.
+            # If it still runs, it ends with its pipe; its result is dropped.
             earlier.future.cancel()
 
 

@@ -1,7 +1,7 @@
-"""What travels between the four stages and the driver: descriptions, summaries and receipts.
+"""Messages between the four stages and the driver: descriptions, summaries and receipts.
 
-Their size does not depend on the number of points. All of it is what msgpack carries, so that
-nothing that comes through a pipe is ever unpickled.
+Their size does not depend on the number of points. They are plain data for msgpack, so that
+nothing from a pipe is ever unpickled.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ SAMPLES_WANTED = 400  # of a survey
 
 
 def samples_of_scan(scan_count: int) -> int:
-    """Sample rays of each scan: fewer where there are many scans, since each one travels."""
+    """Sample rays of each scan: fewer if there are many scans, because all are sent."""
     return max(1, min(SAMPLES_MOST, -(-SAMPLES_WANTED // scan_count)))
 
 
 def summary_type(samples: int) -> np.dtype[np.void]:
     """Summary of a scan: hits, points kept, and ends of sample rays, metres, local coordinates.
 
-    A sample that there is none of is NaN.
+    Missing samples are NaN.
     """
     return np.dtype([("hits", "<u4"), ("points", "<u4"), ("samples", "<f4", (samples, 3))])
 
@@ -42,7 +42,7 @@ class Receipt:
     Parameters
     ----------
     offer
-        Number of the offer that it answers; see `scan.batches`.
+        Number of its offer; see `scan.batches`.
     first, stop
         Its scans.
     name
@@ -50,7 +50,7 @@ class Receipt:
     rows, size
         Its points and its bytes.
     hits
-        Of its scans, before they were thinned out.
+        Hits of its scans, before thinning out.
     cells
         Lowest and highest cell as six numbers; empty where there are no points.
     summaries
@@ -58,8 +58,8 @@ class Receipt:
     records
         The tasks of stage 2 and 4 that made it.
     held_at
-        Address of the worker that holds the part in its memory because it does not see the
-        storage; "" where the part is in storage already.
+        Address of the worker that holds the part in memory because it does not see the storage;
+        "" if the part is in storage.
     """
 
     offer: int
@@ -100,20 +100,20 @@ def unpack_record(data: Sequence[Any]) -> TaskRecord:
 
 @dataclass(frozen=True)
 class Frame:
-    """One scan as stage 3 hands it out, in scan order, when its points are in storage.
+    """One scan from stage 3, in scan order, whose points are in storage.
 
     Parameters
     ----------
     scan
         Its number.
     sensor
-        Name of its sensor; "" where there is one without.
+        Name of its sensor; "" for a single one without a name.
     pose
-        Where that was when it began, in the scene's local coordinates.
+        Pose of the sensor at its beginning, in the scene's local coordinates.
     rays, hits, count
         Rays fired, those that hit something, and points of the cloud.
     samples
-        float32 (m, 3): where a few of the rays ended, metres, local coordinates.
+        float32 (m, 3): ends of a few rays, metres, local coordinates.
     """
 
     scan: int
@@ -131,6 +131,6 @@ class Frame:
         Raises
         ------
         LidarpoolError
-            If the part cannot be read, as after the run where it was not kept.
+            If the part cannot be read, such as after a run that was not kept.
         """
         return self._read(self.scan)

@@ -1,4 +1,4 @@
-"""Where a carrier is at each firing, and how it moves on until the next."""
+"""Poses of a carrier at each firing, and its motion until the next."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Clock:
-    """When rays are fired, in nanoseconds since the survey's start.
+    """Firing times of rays, in nanoseconds since the survey's start.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ class Clock:
     delays
         (m,): of each ray of a firing.
     start, subrays
-        Of the rays from number `start` on, each is divided into so many.
+        First ray, and the number of sub-rays of each.
     """
 
     begins: Float
@@ -37,7 +37,7 @@ class Clock:
     subrays: int = 1
 
     def of(self, ray: NDArray[np.integer[Any]]) -> Float:
-        """When rays (n,) are fired: (n,)."""
+        """Return the firing times of rays (n,): (n,)."""
         firing, beam = np.divmod(self.start + ray // self.subrays, len(self.delays))
         times: Float = self.begins[firing] + self.delays[beam]
         return times
@@ -45,7 +45,7 @@ class Clock:
 
 @dataclass(frozen=True)
 class Poses:
-    """Where rays are cast from, as `RayCaster.scan` takes it."""
+    """Poses of rays for `RayCaster.scan`."""
 
     positions: Float
     rotations: Float | None = None
@@ -58,7 +58,7 @@ class Poses:
         """Arguments of `RayCaster.scan` and `Pattern.rays`."""
         if self.rays_per_pose is None:
             return {"positions": self.positions, "rotations": self.rotations}
-        # Not checked again, see `check_trajectory`: that takes as long as casting a fortieth.
+        # Not checked again, see `check_trajectory`: that would take a fortieth of the casting time.
         return {
             "positions": raybeam.poses.Poses(
                 self.positions, self.rotations, self.rays_per_pose, self.motion
@@ -66,11 +66,11 @@ class Poses:
         }
 
     def times(self, ray: NDArray[np.integer[Any]]) -> Float:
-        """When rays are fired, nanoseconds since the survey's start; where there are actors."""
+        """Return firing times of rays, nanoseconds since the survey's start; for actors."""
         return np.zeros(len(ray)) if self.clock is None else self.clock.of(ray)
 
     def part(self, start: int, stop: int, subrays: int) -> Poses:
-        """Poses of rays `start` to `stop`, each divided; they begin where a pose does."""
+        """Poses of the sub-rays of rays `start` to `stop`; `start` is the first of a pose."""
         each, motion, clock = self.rays_per_pose, self.motion, self.clock
         if clock is not None:
             clock = replace(clock, start=start, subrays=subrays)
@@ -91,12 +91,12 @@ class Poses:
 
 
 def check_trajectory(path: Trajectory) -> None:
-    """Look at the first poses of a trajectory, which may be somebody's own, before it is used.
+    """Check the first poses of a trajectory, which may be a user's, before it is used.
 
     Raises
     ------
     ValueError
-        If a position is not finite or a rotation is none.
+        If a position is not finite or a rotation is invalid.
     """
     for station in range(path.stations):
         raybeam.poses.check_poses(*path.poses(station, np.zeros(1)), None, 0)
@@ -105,15 +105,15 @@ def check_trajectory(path: Trajectory) -> None:
 def poses_of_firings(
     carried: Mounted, path: Trajectory, station: int, first: int, stop: int
 ) -> Poses:
-    """Poses that the beams of a sensor are fired from in firings `first` to `stop`.
+    """Poses of a sensor's beams in firings `first` to `stop`.
 
-    They are those of its head, where all rays are beams that a head turns: then the rays of one
-    firing do for all, and none are made again. Else they are those of the carrier.
+    If a head turns all beams, they are poses of the head, and the rays of one firing serve for
+    all. Else they are poses of the carrier.
 
-    The beams of a firing that are fired later leave from where the carrier is then: it moves
-    evenly from each firing to the next. A pose for each beam would cost as much as casting it.
+    Later beams of a firing start from the carrier's position at their time: it moves evenly from
+    each firing to the next. A pose for each beam would cost as much as casting it.
 
-    There is no motion where the carrier stands, or all beams of a firing are fired at one time.
+    There is no motion if the carrier stands, or if all beams of a firing are fired at once.
     """
     sensor = carried.sensor
     firings = np.arange(first, stop + 1, dtype=np.int64)
@@ -148,7 +148,7 @@ def poses_of_firings(
 
 
 def into_axes(vectors: Float, rotations: Float | None) -> Float:
-    """Turn vectors (m, 3) from the scene's axes into those of rotations (m, 3, 3), each its own."""
+    """Rotate vectors (m, 3) from the scene's axes to those of rotations (m, 3, 3), one each."""
     if rotations is None:
         return vectors
     x, y, z = vectors.T

@@ -3,6 +3,6 @@
 GPU, LIDAR, OTHER = "GPU", "LIDAR", "OTHER"
 
 GENERATE = "generate"  # 1, on LIDAR: one long task
-INTERSECT = "intersect"  # 2, on GPU: a short task an item
+INTERSECT = "intersect"  # 2, on GPU: a short task for each batch
 SORT = "sort"  # 3, on LIDAR: one long task
 COLLECT = "collect"  # 4, on LIDAR: two long tasks

@@ -1,4 +1,4 @@
-"""The returns of a batch, with all that columns can be made from."""
+"""The returns of a batch: the sources of columns."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 
 
 class BatchReturns:
-    """Returns that are kept of some consecutive scans of one station, in (scan, ray) order.
+    """Kept returns of some consecutive scans of one station, in (scan, ray) order.
 
-    Its attributes are arrays with one value a return, (n,), made when they are asked for: the
+    Its attributes are arrays (n,) with a value for each return, computed on first use: the
     sources of columns (`lidarpool.columns.table`).
 
     Parameters
@@ -30,13 +30,13 @@ class BatchReturns:
     rig
         Sensor, scene and survey.
     specs
-        The scans; the firings of each begin where those of the one before end.
+        The scans; the firings of each follow those of the one before.
     found
-        What was cast: rays numbered from 0 at the first firing.
+        Result of the cast: rays numbered from 0 at the first firing.
     pattern, start
-        What was cast from, and the number of its ray 0 within the pattern.
+        The pattern that was cast, and the number of ray 0 within it.
     poses
-        That it was cast from.
+        Poses of the cast.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class BatchReturns:
     def __len__(self) -> int:
         return len(self.found.ray)
 
-    # -- which ray ---------------------------------------------------------------------------
+    # -- the ray -----------------------------------------------------------------------------
 
     @cached_property
     def _first_rays(self) -> NDArray[np.int64]:
@@ -104,14 +104,14 @@ class BatchReturns:
 
     @cached_property
     def time(self) -> NDArray[np.int64]:
-        """When the ray was fired, nanoseconds since the survey's start."""
+        """Firing time of the ray, nanoseconds since the survey's start."""
         times = self.sensor.begins_ns(self._firings).take(self._number)
         times += self.sensor.beams.time_ns.take(self.channel)
         return self.specs[0].start_ns + np.rint(times, out=times).astype(np.int64)
 
     @property
     def _firings(self) -> NDArray[np.int64]:
-        """All of the scans, whether anything came back or not."""
+        """All rays of the scans, with and without returns."""
         return np.arange(self.specs[0].firings[0], self.specs[-1].firings[1])
 
     @cached_property
@@ -119,7 +119,7 @@ class BatchReturns:
         """Number of the firing, from that of the first scan."""
         return self.found.ray // np.int64(self.sensor.channels)
 
-    # -- where -------------------------------------------------------------------------------
+    # -- positions ---------------------------------------------------------------------------
 
     @cached_property
     def _rays(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -127,7 +127,7 @@ class BatchReturns:
 
     @property
     def origins(self) -> NDArray[np.float64]:
-        """Where the rays left, metres, the scene's local coordinates: (n, 3)."""
+        """Starts of the rays, metres, the scene's local coordinates: (n, 3)."""
         return np.broadcast_to(self._rays[0], (len(self), 3))
 
     @property
@@ -137,12 +137,12 @@ class BatchReturns:
 
     @property
     def range(self) -> NDArray[np.float64]:
-        """Distance from where the ray left, metres, with noise."""
+        """Distance from the start of the ray, metres, with noise."""
         return self.found.distance if self.echoes is None else self.echoes.reported
 
     @cached_property
     def positions(self) -> NDArray[np.float64]:
-        """Where the rays ended, metres, the scene's local coordinates: (n, 3)."""
+        """Ends of the rays, metres, the scene's local coordinates: (n, 3)."""
         origins, directions = self._rays
         out = directions * self.range[:, None]
         return np.add(out, origins, out=out)
@@ -182,7 +182,7 @@ class BatchReturns:
 
     @cached_property
     def sensor_positions(self) -> NDArray[np.float64]:
-        """Where the rays ended in the axes of the sensor when they were fired, metres: (n, 3)."""
+        """Ends of the rays in the axes of the sensor at their firing, metres: (n, 3)."""
         origins = self._pattern.origins
         ends = self._pattern.directions[self._rows] * self.range[:, None]
         if origins is not None:
@@ -215,7 +215,7 @@ class BatchReturns:
         """Angle of the ray above the sensor's xy plane, degrees."""
         return np.degrees(np.arcsin(np.clip(self._sensor_directions[:, 2], -1, 1)))
 
-    # -- what --------------------------------------------------------------------------------
+    # -- the surface -------------------------------------------------------------------------
 
     @property
     def triangle(self) -> NDArray[np.int32]:
@@ -241,7 +241,7 @@ class BatchReturns:
 
     @cached_property
     def intensity(self) -> NDArray[np.float64]:
-        """Energy that came back, see `Surfaces.energy`."""
+        """Received energy, see `Surfaces.energy`."""
         if self.echoes is not None:
             return self.echoes.energy
         extinction = self.survey.extinction(self.sensor)
@@ -257,12 +257,12 @@ class BatchReturns:
 
     @property
     def return_number(self) -> NDArray[np.uint8]:
-        """Which reported return of its pulse."""
+        """Number among the reported returns of its pulse."""
         return np.ones(len(self), np.uint8) if self.echoes is None else self.echoes.number
 
     @property
     def returns(self) -> NDArray[np.uint8]:
-        """How many returns of its pulse are reported."""
+        """Number of reported returns of its pulse."""
         return np.ones(len(self), np.uint8) if self.echoes is None else self.echoes.returns
 
     @property
@@ -274,7 +274,7 @@ class BatchReturns:
 def turned(
     vectors: NDArray[np.float64], rotation: NDArray[np.float64] | None
 ) -> NDArray[np.float64]:
-    """Turn vectors (n, 3) by a matrix; in one order of rounding, unlike BLAS, however many."""
+    """Rotate vectors (n, 3) by a matrix, with a fixed order of rounding, unlike BLAS."""
     if rotation is None:
         return vectors
     x, y, z = vectors.T

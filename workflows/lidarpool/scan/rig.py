@@ -1,9 +1,8 @@
-"""What a GPU worker needs for a survey: the scene with its ray caster, and the sensor.
+"""The rig of a GPU worker: the scene with its ray caster, and the sensor.
 
-It is the worker's own: made once in each process by a task that is bound to it, kept in a table
-of this module, and named by a handle in the tasks that cast. A task's result would not do: Dask
-drops the copies of a result that nobody needs at an instant, and every copy that came back would
-build its tree anew.
+A task bound to the worker makes it once in each process and keeps it in a table of this module;
+casting tasks name it by a handle. A task's result would not work: Dask drops copies that no task
+needs at an instant, and every new copy would build its tree again.
 """
 
 from __future__ import annotations
@@ -30,12 +29,12 @@ from .returns import BatchReturns, turned
 from .surfaces import Surfaces
 from .world import World
 
-UNUSED_S = 600.0  # a rig that no run has used for so long goes when another is made
+UNUSED_S = 600.0  # a rig unused for so long is dropped when another is made
 
 
 @dataclass(frozen=True, eq=False)
 class RigPlan:
-    """What rigs are made of.
+    """Description of a rig.
 
     Parameters
     ----------
@@ -50,8 +49,8 @@ class RigPlan:
     backend: str
 
     def packed(self) -> bytes:
-        """Bytes to send to workers: they look at their version before they open them."""
-        # Sensors and columns of somebody's script, lambdas too, travel by value.
+        """Bytes to send to workers, which check their version before they unpickle them."""
+        # Sensors and columns of a user's script, including lambdas, are sent by value.
         return cloudpickle.dumps(self, protocol=5)
 
 
@@ -61,7 +60,7 @@ class Rig:
     Parameters
     ----------
     plan
-        What it is made of.
+        Its description.
     threads
         CPU threads to cast with; None for all cores.
     device
@@ -75,7 +74,7 @@ class Rig:
         self.used_at = time.monotonic()
         self._caster = World(plan.scene, plan.backend, threads, device)
         self.surfaces = Surfaces(plan.scene, tuple(plan.survey.materials))
-        self._echoes: EchoCaster | None = None  # where plain casting will do
+        self._echoes: EchoCaster | None = None  # if plain casting is enough
         if EchoCaster.needed(plan.survey, self.surfaces):
             self._echoes = EchoCaster(self._caster, plan.scene, plan.survey, self.surfaces)
         check_trajectory(plan.survey.path)
@@ -93,7 +92,7 @@ class Rig:
                 self._echoes.divide(sensor, self._whole[-1])
 
     def _pattern(self, number: int, first: int, stop: int) -> Pattern:
-        """Rays of a sensor in the axes of its carrier; or of one firing in those of its head."""
+        """Rays of a sensor in its carrier's axes, or of one firing in its head's axes."""
         firings = np.arange(first, stop, dtype=np.int64)
         carried = self.survey.carried[number]
         if self.by_head[number]:
@@ -109,7 +108,7 @@ class Rig:
         return Pattern(directions, origins)
 
     def cast(self, first: int, stop: int) -> Iterator[BatchReturns]:
-        """Cast scans `first` to `stop`: the returns of each run of them from one station."""
+        """Cast scans `first` to `stop`; yields the returns for each station."""
         run: list[ScanSpec] = []
         for spec in map(self.survey.scan, range(first, stop)):
             here = (spec.sensor, spec.station, spec.firings[0])
@@ -160,7 +159,7 @@ _lock = threading.Lock()
 
 
 def set_up(handle: str, packed: bytes) -> None:
-    """Make a rig in this process, unless it is there; runs on a GPU worker."""
+    """Make a rig in this process, unless it exists; runs on a GPU worker."""
     with _lock:
         if handle in _rigs:
             return
@@ -189,5 +188,5 @@ def rig_of(handle: str) -> Rig:
 
 
 def drop_rig(handle: str) -> None:
-    """Forget a rig; no error if there is none."""
+    """Drop a rig; no error if there is none."""
     _rigs.pop(handle, None)

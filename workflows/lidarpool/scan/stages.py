@@ -1,8 +1,7 @@
 """Stages 1, 3 and 4: the long-running tasks on LIDAR workers.
 
-Each secedes at once: it frees its thread, so that a worker with one thread and four LIDAR
-slots runs all four, and keeps its slot. A pipe that fails ends a stage quietly: whoever
-failed it knows why.
+Each secedes at once: it frees its thread but keeps its slot, so that a worker with one thread and
+four LIDAR slots runs all four. A failed pipe ends a stage silently: the driver knows the reason.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from .failures import naming_scans
 from .messages import Receipt
 from .names import COLLECT, GENERATE, LIDAR, SORT
 
-FETCH_PATIENCE_S = 2.0  # for a sign of life of the worker that has a batch
+FETCH_PATIENCE_S = 2.0  # longest wait for a sign of life of a batch's worker
 
 
 @telling_departure()
@@ -43,9 +42,9 @@ def generate(
     outlet: Pipe,
     first: int = 0,
 ) -> TaskRecord:
-    """Stage 1: describe every scan from `first` on, as many in one item as is advised.
+    """Stage 1: describe every scan from `first` on, with the advised number in one item.
 
-    An item is a range of scans, all of which the survey says the same of everywhere.
+    An item is a range of scans: the survey describes them equally on every worker.
     """
     secede()
     recorder = Recorder(GENERATE, LIDAR)
@@ -55,7 +54,7 @@ def generate(
         while sent < survey.scan_count:
             stop = min(sent + outlet.advice, survey.scan_count)
             with naming_scans(sent, stop - 1):
-                survey.scan(stop - 1)  # what cannot be described is told of here
+                survey.scan(stop - 1)  # raises here if a scan cannot be described
             trace("generate.put", **fields, scans=list(range(sent, stop)))
             outlet.put((sent, stop))
             trace("generate.sent", **fields, scans=list(range(sent, stop)))
@@ -63,7 +62,7 @@ def generate(
         outlet.close()
     except PipeFailed:
         pass
-    except PipeClosed:  # an earlier run of this task got as far as closing it
+    except PipeClosed:  # an earlier start of this task has closed it
         sent = survey.scan_count
     return recorder.done(sent - first)
 
@@ -77,11 +76,11 @@ def sort_frames(
     Parameters
     ----------
     fields
-        What tells this start of the task from others, for traces and the driver.
+        Identifies this start of the task, for traces and the driver.
     size
         Bytes of a summary.
     following
-        The scan whose turn it is; all before have been handed out.
+        The next scan; all before it have been handed out.
     inlet, outlet
         From the driver lists of {first: a scan, data: summaries from there on}, and to it one such.
     """
@@ -129,13 +128,13 @@ def collect(
     fields
         As of `sort_frames`.
     storage, probe
-        Where parts go, and a file there with its content. A worker that does not see it holds its
-        parts in memory, and the driver fetches them.
+        Place of the parts, and a file there with its content. A worker that does not see that file
+        holds its parts in memory, and the driver fetches them.
     inlet
         From the driver: lists of {offer, key, at, first, stop, name}.
     outlet
-        To the driver: {receipt: …}, or {lost: offer} for one that could not be fetched,
-        {failed: reason} where the storage takes nothing, {hidden: worker} where it is not seen.
+        To the driver: {receipt: …}, or {lost: offer} for a batch that could not be fetched,
+        {failed: reason} if the storage fails, {hidden: worker} if it is not seen.
     """
     secede()
     recorder = Recorder(COLLECT, LIDAR)
@@ -150,7 +149,7 @@ def collect(
                 answer = _collected(fields, storage if seen else None, item)
                 if "receipt" in answer:
                     scans += item["stop"] - item["first"]
-                outlet.put(answer, unbounded=True)  # the driver bounds what it asks for
+                outlet.put(answer, unbounded=True)  # the driver limits its requests
                 trace("collect.sent", **fields, scans=list(range(item["first"], item["stop"])))
     except (PipeClosed, PipeFailed):
         pass
@@ -160,7 +159,7 @@ def collect(
 def _collected(
     fields: dict[str, Any], storage: Storage | None, item: dict[str, Any]
 ) -> dict[str, Any]:
-    """Make a part of one batch; returns what to tell the driver."""
+    """Make a part of one batch; returns the message to the driver."""
     first, stop, offer = item["first"], item["stop"], item["offer"]
     scans = list(range(first, stop))
     found = fetch_available(own_client(), [item["key"]], FETCH_PATIENCE_S, at=item["at"])

@@ -1,4 +1,4 @@
-"""What rays meet: objects, their materials, and the energy that comes back of them."""
+"""Surfaces: objects, their materials, and the energy of returns."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from ..scene.scene import Scene
 from ..sensor.materials import Material, MaterialTable, at_right_angles
 
-BLOCK_FACES = 1 << 18  # whose normals are made at a time
+BLOCK_FACES = 1 << 18  # triangles whose normals are made at a time
 
 Triangles = NDArray[np.integer[Any]]
 Real = NDArray[np.float64]
 
 
 class Surfaces:
-    """Triangles as light sees them.
+    """Optical properties of triangles.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ class Surfaces:
     Raises
     ------
     LidarpoolError
-        If there are materials, and an object has none, or one is that of no object.
+        If there are materials, and an object has none, or a name fits no object.
     """
 
     def __init__(self, scene: Scene, materials: tuple[Material, ...]) -> None:
@@ -41,7 +41,7 @@ class Surfaces:
 
     @cached_property
     def _normals(self) -> NDArray[np.float32]:
-        """Unit normals of all triangles, one row an axis: looked up so, they are fastest."""
+        """Unit normals of all triangles, one row for each axis, the fastest layout."""
         out = np.empty((3, len(self._scene.faces)), np.float32)
         for begin in range(0, out.shape[1], BLOCK_FACES):
             faces = self._scene.faces[begin : begin + BLOCK_FACES]
@@ -54,7 +54,7 @@ class Surfaces:
     def normals(self, triangle: Triangles, times: Real | NDArray[np.int64]) -> Real:
         """Return the unit normals of triangles (n,): (n, 3), in single precision.
 
-        Those of actors are turned as these are at the times (n,), nanoseconds.
+        Normals of actors are rotated by the actor's pose at the times (n,), nanoseconds.
         """
         normals = np.empty((3, len(triangle)))
         for axis, out in zip(self._normals, normals, strict=True):
@@ -79,14 +79,14 @@ class Surfaces:
         return np.asarray(along)
 
     def objects(self, triangle: Triangles) -> NDArray[np.int32]:
-        """Objects that triangles (n,) belong to."""
+        """Objects of triangles (n,)."""
         return self._scene.face_object[triangle]
 
     def energy(self, triangle: Triangles, cosine: Real, distance: Real, extinction: float) -> Real:
-        """Energy that comes back of rays that end on triangles (n,), metres away.
+        """Received energy of rays that end on triangles (n,), at distances in metres.
 
-        ``reflectance * cosine * (10 m / distance)**2 * exp(-2 * extinction * distance)``; from a
-        retro-reflector, a gain stands in place of the cosine.
+        ``reflectance * cosine * (10 m / distance)**2 * exp(-2 * extinction * distance)``; for a
+        retro-reflector, a gain replaces the cosine.
         """
         scattered = self.materials.scattered(self.objects(triangle), cosine)
         return np.asarray(scattered * at_right_angles(distance, extinction))

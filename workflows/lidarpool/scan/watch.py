@@ -1,4 +1,4 @@
-"""Waiting for partitions that are empty: how long, and what is said meanwhile."""
+"""Waiting for empty partitions, with messages and a time limit."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from ..base.errors import LidarpoolError
 from ..base.vocabulary import PATIENCE_S
 
 WATCH_EVERY_S = 1.0
-TELL_EVERY_S = 5.0  # what is waited for; less often in a long wait
+TELL_EVERY_S = 5.0  # messages about waiting; less often in a long wait
 
 
 class Watch:
-    """Notices a partition that stays without workers, or without such as take tasks.
+    """Detects a partition that stays without workers, or whose workers take no tasks.
 
     Dask itself would wait for ever.
 
@@ -26,13 +26,13 @@ class Watch:
     client
         Client of the cluster.
     names
-        Partitions whose workers get new tasks all the time.
+        Partitions whose workers get new tasks during the run.
     lasting
-        Partitions whose tasks last as long as the run: workers that take no more are as good.
+        Partitions whose tasks last as long as the run: their workers need not take more.
     patience_s
         How long one may be empty, seconds.
     tell
-        Called, every few seconds, with what is waited for.
+        Called every few seconds with a message while it waits.
     """
 
     def __init__(
@@ -46,17 +46,17 @@ class Watch:
         self.client, self.lasting = client, frozenset(lasting)
         self.patience_s, self._tell = patience_s, tell
         self._looked = self._told = time.monotonic()
-        # {partition: when workers were last there}
+        # {partition: when it last had workers}
         self._seen = dict.fromkeys([*names, *self.lasting], self._looked)
-        self._paused: set[str] = set()  # partitions that have only such
+        self._paused: set[str] = set()  # partitions whose workers take no tasks
 
     def forget(self, names: Iterable[str]) -> None:
-        """Look after these partitions no more: nothing is left to do there."""
+        """Stop watching these partitions, which have no more work."""
         for name in names:
             self._seen.pop(name, None)
 
     def look(self, now: float) -> None:
-        """Check, once in a while; LidarpoolError if a partition has been empty for too long."""
+        """Check from time to time; LidarpoolError if a partition was empty for too long."""
         if now - self._looked < WATCH_EVERY_S:
             return
         self._looked = now
@@ -73,7 +73,7 @@ class Watch:
                 raise LidarpoolError(self._error(name))
 
     def _say(self, now: float) -> None:
-        """Tell what is waited for."""
+        """Print what the run waits for."""
         waiting = {name: seen for name, seen in self._seen.items() if now - seen > TELL_EVERY_S}
         if waiting and now - self._told >= max(TELL_EVERY_S, (now - min(waiting.values())) / 10):
             self._told = now

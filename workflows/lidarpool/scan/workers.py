@@ -1,4 +1,4 @@
-"""The workers of stage 2 as the driver sees them: prepared, refused, silent, gone."""
+"""The driver's record of stage 2 workers: prepared, refused, silent, gone."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from .rig import RigPlan, drop_rig
 
 LOOK_EVERY_S = 1.0
 SETUP_DEATHS = 4  # workers in a row that may die while they prepare themselves
-ANSWER_S = 1.0  # that a prepared worker's answer is waited for without a sign of life
-RELEASE_S = 3.0  # for workers to forget their rigs
+ANSWER_S = 1.0  # longest wait for a prepared worker's answer without a sign of life
+RELEASE_S = 3.0  # for workers to drop their rigs
 PREPARING = "preparing the scene on the GPU workers"
 
 
 class CastingWorkers:
-    """The GPU workers that have a rig; each makes its own, also one that joins late.
+    """The GPU workers with a rig; each makes its own, including late ones.
 
-    A worker is looked over before it opens anything: one with another version of lidarpool is
-    refused by name and casts nothing.
+    A worker's version is checked before it unpickles anything: a worker with another version of
+    lidarpool is refused by name and casts nothing.
 
     Parameters
     ----------
@@ -45,9 +45,9 @@ class CastingWorkers:
         self.handle, self._packed = handle, plan.packed()
         self._plan: Future | None = None  # the packed plan, on the workers
         self._setups: dict[str, Future] = {}  # {address: task that prepares the worker}
-        self._refused: dict[str, str] = {}  # {address: why}
+        self._refused: dict[str, str] = {}  # {address: reason of refusal}
         self._count = 0
-        self._died: list[str] = []  # while they prepared themselves, one after the other
+        self._died: list[str] = []  # workers that died while preparing, in a row
         self._looked_at = float("-inf")
         self.seen = Whereabouts()
         self.slots: dict[str, int] = {}  # {address of a prepared worker: batches at a time}
@@ -74,12 +74,12 @@ class CastingWorkers:
         return [f.key for a, f in self._setups.items() if a not in self.slots]
 
     def look(self) -> None:
-        """See to workers that have come or gone.
+        """Handle workers that have joined or left.
 
         Raises
         ------
         LidarpoolError
-            If preparing the scene fails, or ends one worker after the other.
+            If preparing the scene fails, or kills several workers in a row.
         """
         self._looked_at = time.monotonic()
         keys = [future.key for future in self.futures]
@@ -92,7 +92,7 @@ class CastingWorkers:
         self.check()
 
     def check(self) -> None:
-        """Note which workers are prepared by now."""
+        """Record the workers that are prepared."""
         for address, future in list(self._setups.items()):
             if address in self.slots:
                 if address in self.seen.silent:
@@ -105,16 +105,18 @@ class CastingWorkers:
             self._plan = None  # sent again for the next worker that needs it
 
     def drop(self, address: str) -> None:
-        """Prepare a worker anew: its rig is gone."""
+        """Prepare a worker again: its rig is gone."""
         self._setups.pop(address, None)
         self.slots.pop(address, None)
 
     def release(self) -> None:
-        """Have the workers forget their rigs; those that cannot be reached are done without."""
+        """Let the workers drop their rigs, as far as they can be reached."""
         addresses = [a for a in self.slots if a in self.seen.members]
         self.slots.clear()
         if addresses and self._client.status == "running":
-            with suppress(TimeoutError):  # Dask tries for half a minute to reach one that is ending
+            with suppress(
+                TimeoutError
+            ):  # Dask tries for half a minute to reach a worker that is ending
                 self._client.run(
                     drop_rig,
                     self.handle,
@@ -126,7 +128,7 @@ class CastingWorkers:
     def _prepare(self, address: str) -> None:
         if self._plan is None:
             with warnings.catch_warnings():
-                # A large scene is a large graph, and there is no other way to have it made again.
+                # A large scene makes a large graph, which is the only way to have it recomputed.
                 warnings.filterwarnings("ignore", message="Sending large graph")
                 self._plan = self._partition.submit(
                     _same, self._packed, key=f"scene-{self.handle}-{self._count}"
@@ -142,7 +144,7 @@ class CastingWorkers:
         )
 
     def _take(self, address: str, future: Future) -> None:
-        """Enter a worker that has answered; one that has stopped since is asked again."""
+        """Record a worker that has answered; one that has stopped since is asked again."""
         found = fetch_available(self._client, [future.key], ANSWER_S, at=address)
         if future.key not in found:
             return
@@ -165,7 +167,7 @@ class CastingWorkers:
         self._died.clear()
 
     def _remove(self, address: str) -> None:
-        """Forget a worker that has gone; it may have died of the scene."""
+        """Remove a worker that has gone; the scene may have killed it."""
         future = self._setups.pop(address)
         self._refused.pop(address, None)
         if self.slots.pop(address, None) is not None:
@@ -175,7 +177,7 @@ class CastingWorkers:
             self._died.append(address)
         if len(self._died) >= SETUP_DEATHS and not self.slots:
             raise LidarpoolError(
-                f"{PREPARING} has ended {len(self._died)} of them, one after the other"
+                f"{PREPARING} has killed {len(self._died)} of them in a row"
                 f"{words_on_memory(self._client, self._died)}: "
                 "look into their logs, or try another backend."
             )
@@ -188,8 +190,8 @@ def _same(packed: bytes) -> bytes:
 def _preparation(wanted: str) -> Callable[[str, bytes], dict[str, Any]]:
     """Make the task that prepares a worker.
 
-    It is nested, so that it travels by value: a worker that lacks the package, or has another
-    version of it, can still say so.
+    It is nested, so that it is sent by value: a worker without the package, or with another
+    version, can still say so.
     """
 
     def prepare(handle: str, packed: bytes) -> dict[str, Any]:

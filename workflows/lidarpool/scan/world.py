@@ -1,8 +1,8 @@
-"""The ray caster of a whole world: of the scene, which stands, and of actors, which move.
+"""The ray caster of a whole world: the static scene and moving actors.
 
-Each ray is taken into an actor's axes at its own time, so that no tree is ever built again. An
-actor is asked only about rays that come near a sphere that holds it meanwhile, and only those are
-made: which they are is told by where the sphere lies in the axes of each pose.
+Each ray is transformed to an actor's axes at its own time, so that no tree is ever rebuilt. Only
+rays that come near the actor's bounding sphere are made and cast; the position of the sphere in the
+axes of each pose selects them.
 """
 
 from __future__ import annotations
@@ -19,26 +19,24 @@ from ..scene.scene import Scene
 from ..sensor import Sensor
 from .motion import Poses, into_axes
 
-CELL_RAYS = 1 << 10  # of a sensor that stands, which are fired at nearly one time
-CELLS = 64  # cells for which an actor's way is looked at once
-NEAR_M = 1.0  # rays of a cell start no farther than this from its place
-TURN = (
-    2e-3  # radians: rays of a cell point no farther than this off the pattern, turned by its pose
-)
+CELL_RAYS = 1 << 10  # rays in a cell of a still sensor, which are fired at nearly one time
+CELLS = 64  # cells that share one look at an actor's trajectory
+NEAR_M = 1.0  # rays of a cell start no farther than this from its position
+TURN = 2e-3  # radians: rays of a cell deviate at most so much from the pattern in its pose
 
 Float = NDArray[np.float64]
 
 
 class World:
-    """Casts scans as `RayCaster.scan` does, hits of actors among the others.
+    """Casts scans like `RayCaster.scan`, including hits on actors.
 
-    Triangles of actors are numbered after those of the scene, see `Scene.solid`. What no actor
-    touches has the bits that it has without actors.
+    Triangles of actors are numbered after those of the scene, see `Scene.solid`. Rays that touch
+    no actor give the same bits as without actors.
 
     Parameters
     ----------
     scene
-        With its actors.
+        The scene with its actors.
     backend, threads, device
         As of `RayCaster`.
     """
@@ -66,7 +64,7 @@ class World:
         groups: NDArray[np.int64] | None = None,
         tally: bool = False,
     ) -> ScanReturns:
-        """See `RayCaster.scan`; the poses have a clock where there are actors."""
+        """See `RayCaster.scan`; the poses have a clock if there are actors."""
         start, stop = (0, len(pattern)) if window is None else window
         limits = {"t_min": t_min, "t_max": t_max}
         common: dict[str, Any] = {**poses.given, "window": (start, stop), **limits}
@@ -105,7 +103,7 @@ class World:
         window: tuple[int, int],
         groups: NDArray[np.int64],
     ) -> ScanReturns:
-        """Cast what a sensor fires, each group a scan: hits in its range, counted and thinned."""
+        """Cast a sensor's rays, each group a scan: hits in its range, counted and thinned out."""
         return self.scan(
             pattern,
             poses,
@@ -119,7 +117,7 @@ class World:
 
 
 class _Cells:
-    """Rays of a scan, so many to a cell that they start and are fired nearly together.
+    """Cells of a scan's rays, which start and are fired nearly together.
 
     Parameters
     ----------
@@ -147,7 +145,7 @@ class _Cells:
         alike = len(pattern) == each and start % each == 0
         directions = pattern.directions if alike else pattern.directions.take(rows, axis=0)
         self._directions = directions.reshape(-1, each, 3).transpose(2, 0, 1)
-        # A cone that holds the rays of a cell.
+        # A cone around the rays of a cell.
         middle = self._directions.mean(axis=2)
         self._axes = middle / np.maximum(np.linalg.norm(middle, axis=0), 1e-9)
         cosines = _along(self._axes[:, :, None], self._directions)
@@ -159,7 +157,7 @@ class _Cells:
         self._lasts, self._end = (ends - self._begins).max(initial=0), ends.max(initial=0)
 
     def near(self, actor: _Cast, t_max: float) -> NDArray[np.intp]:
-        """Numbers of the rays that come near an actor; no other ray meets it."""
+        """Numbers of the rays that come near an actor; no other ray hits it."""
         if not self._rays:
             return np.zeros(0, np.intp)
         low, high = self._begins.min(), self._begins.max()
@@ -202,7 +200,7 @@ class _Cast:
         self.radius = float(np.linalg.norm(vertices - self._centre, axis=1).max())
 
     def centre(self, times: Float) -> Float:
-        """Middle of a sphere that holds it, of `radius`, at times (m,): (m, 3)."""
+        """Centre of its bounding sphere, of `radius`, at times (m,): (m, 3)."""
         positions, rotations = self._way.poses(0, times)
         turned = self._centre if rotations is None else rotations @ self._centre
         return np.asarray(positions + turned)
@@ -210,16 +208,16 @@ class _Cast:
     def hits(
         self, origins: Float, directions: Float, times: Float, *, t_min: float, t_max: float
     ) -> tuple[NDArray[np.intp], Float, NDArray[np.int32]]:
-        """Where rays (m, 3) meet it that are fired at times (m,), nanoseconds.
+        """Hits on it of rays (m, 3) fired at times (m,), nanoseconds.
 
         Returns
         -------
-        Numbers of the rays that do (h,), distances in lengths of their directions, and triangles.
+        Numbers of the rays that hit (h,), distances in lengths of their directions, and triangles.
         """
         positions, rotations = self._way.poses(0, times)
         starts = into_axes(origins - positions, rotations)
         hits = self._caster.cast(starts, into_axes(directions, rotations), t_min, t_max)
         on = np.flatnonzero(hits.hit)
-        # Directions of a sensor that turns meanwhile are not quite of unit length.
+        # Directions of a sensor that turns during a pose are not quite of unit length.
         lengths = np.linalg.norm(directions[on], axis=1)
         return on, hits.distance[on] / lengths, hits.triangle[on] + np.int32(self._first)

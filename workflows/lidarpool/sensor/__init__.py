@@ -1,4 +1,4 @@
-"""Sensors: beams, the head that moves them, where they are, and what a survey scans."""
+"""Sensors: beams, heads, trajectories, and surveys."""
 
 from .beams import Beams, Head, Mirror, Spin
 from .materials import Material

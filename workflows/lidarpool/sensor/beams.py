@@ -18,7 +18,7 @@ CHANNELS_MOST = 65_535  # the type of the column
 
 @dataclass(frozen=True, eq=False)
 class Beams:
-    """The beams of a sensor: all of them are fired once in each firing.
+    """The beams of a sensor; each firing fires all of them once.
 
     Channel 0 is the first of them, usually the lowest.
 
@@ -29,10 +29,10 @@ class Beams:
     azimuth
         float64 (c,): offset from the head's azimuth, radians; 0 by default.
     time_ns
-        float64 (c,): when a beam is fired within a firing, nanoseconds; 0 by default.
+        float64 (c,): time of a beam within a firing, nanoseconds; 0 by default.
     origin
-        float64 (c, 3): where a beam leaves when the head is at azimuth 0, metres, in the sensor's
-        axes; the sensor's centre by default.
+        float64 (c, 3): start of a beam with the head at azimuth 0, metres, in the sensor's axes;
+        the sensor's centre by default.
 
     Raises
     ------
@@ -71,18 +71,18 @@ class Beams:
         return cls(np.linspace(-half, half, layers) if layers > 1 else np.zeros(1))
 
     def turning(self, radians_per_ns: float) -> Beams:
-        """Return the beams of a head that turns on while they are fired one after the other.
+        """Return the beams for a head that keeps turning within a firing.
 
         Parameters
         ----------
         radians_per_ns
-            What the head turns, counter-clockwise.
+            Speed of the head, counter-clockwise.
 
         Returns
         -------
         Beams
-            The same, each turned by as much as the head is at its time; so the turn within a
-            firing costs nothing when rays are made.
+            The same beams, each rotated by the head's angle at its time, so that the rotation
+            within a firing takes no time later.
         """
         angle = radians_per_ns * self.time_ns
         x, y, z = self.origin.T
@@ -97,20 +97,20 @@ class Beams:
 
 
 class Head(Protocol):
-    """What moves the beams: in one time step it passes some firings, numbered from 0."""
+    """Moves the beams; each time step has some firings, numbered from 0."""
 
     @property
     def period(self) -> int | None:
-        """Firings after which it stands as before; None where it never does exactly."""
+        """Firings after which it repeats; None if it never does exactly."""
 
     def firings(self, step: int) -> tuple[int, int]:
-        """First firing of a time step, and one past the last; steps meet without gap."""
+        """First firing of a time step, and one past the last; steps have no gaps."""
 
     def times_ns(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
         """When firings begin, nanoseconds since the head started: (k,)."""
 
     def azimuths(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Where the head looks at firings, radians: (k,)."""
+        """Azimuth of the head at firings, radians: (k,)."""
 
 
 @dataclass(frozen=True)
@@ -121,15 +121,15 @@ class Spin:
     Parameters
     ----------
     firings_per_turn
-        Firings in one turn; not a whole number where firing rate and turning rate do not fit.
+        Firings in one turn: firing rate over turning rate, not always a whole number.
     step_deg
-        Degrees turned in one time step, in (0, 360].
+        Rotation in one time step, in (0, 360].
     rate_hz
         Turns a second.
     clockwise
-        Which way it turns, seen from above.
+        Direction of rotation, seen from above.
     zero_deg
-        Where it looks at firing 0: counter-clockwise from the sensor's +x axis.
+        Azimuth at firing 0: counter-clockwise from the sensor's +x axis.
 
     Raises
     ------
@@ -167,11 +167,11 @@ class Spin:
 
     @cached_property
     def _firings_per_step(self) -> Fraction:
-        """How many firings the head passes in a time step, exactly.
+        """Exact number of firings in a time step.
 
-        Neither 0.1 nor 360/7 degrees is itself in binary. The nearest fraction with a denominator
-        of at most a million is what was meant, for decimals and for parts of a turn; with it, the
-        steps of a turn hold each firing once.
+        Neither 0.1 nor 360/7 degrees is exact in binary. The nearest fraction with a denominator
+        of at most a million is the intended one, for decimals and for parts of a turn; with it,
+        the steps of a turn have each firing once.
         """
         step = Fraction(self.step_deg).limit_denominator(1_000_000)
         per_turn = Fraction(self.firings_per_turn).limit_denominator(1_000_000)
@@ -187,8 +187,8 @@ class Spin:
         )
 
     def firings(self, step: int) -> tuple[int, int]:
-        """See `Head.firings`; after one turn the numbers go on."""
-        # Rounded up, in whole numbers: arithmetic of fractions would take as long as a small scan.
+        """See `Head.firings`; numbers continue after one turn."""
+        # Rounded up, in whole numbers: fractions would take as long as a small scan.
         count, steps = self._firings_per_step.as_integer_ratio()
         return -(-step * count // steps), -(-(step + 1) * count // steps)
 
@@ -202,20 +202,20 @@ class Spin:
         return np.radians(self.zero_deg) + (-turned if self.clockwise else turned)
 
     def _within(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Count firings since the turn began; not whole where turns begin between two."""
+        """Count firings since the turn began; fractional if a turn begins between two."""
         return np.asarray(firings % self.firings_per_turn, np.float64)
 
     @property
     def radians_per_ns(self) -> float:
-        """Radians turned in a nanosecond, counter-clockwise."""
+        """Radians in a nanosecond, counter-clockwise."""
         return 2 * np.pi * self.rate_hz / 1e9 * (-1 if self.clockwise else 1)
 
 
 @dataclass(frozen=True)
 class Mirror(Spin):
-    """A mirror that sweeps the beams over a line, to and fro or always the same way.
+    """A mirror that sweeps the beams over a line, to and fro or in one direction.
 
-    A turn is one cycle of it: two lines of a mirror that swings, one of a polygon's facet.
+    A turn is one cycle: two lines of a swinging mirror, one of a polygon's facet.
     Azimuth 0 is in the middle of a line.
 
     Parameters
@@ -223,9 +223,9 @@ class Mirror(Spin):
     motion
         "sine" and "triangle" swing, "sawtooth" is a polygon.
     width_deg
-        From one end of a line to the other.
+        Length of a line.
     duty
-        Of each cycle, the share in which it fires: a polygon's facets see more than is used.
+        Share of each cycle in which it fires: a polygon's facets cover more than is used.
     """
 
     motion: str = "triangle"

@@ -1,4 +1,4 @@
-"""Files that say how one unit differs from its model: angles of beams, or lists of rays."""
+"""Calibration files of units: angles of beams, or lists of rays."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from .beams import Beams
 
 @dataclass(frozen=True)
 class Calibration:
-    """What a calibration file says.
+    """Content of a calibration file.
 
     Parameters
     ----------
     file
         Its name.
     maker
-        Whose format it is; None for a plain table of beams.
+        Maker of the format; None for a plain table of beams.
     beams
-        Beams in the maker's order, at the times that the file says, if any.
+        Beams in the maker's order, with the file's times, if any.
     rays, shot_ns
-        Instead, unit directions (n, 3) in the order of firing, and when each is fired (n,), if
-        the file says so.
+        Instead, unit directions (n, 3) in the order of firing, and their times (n,), if the file
+        has them.
     head
-        What the file says of the head: fields of `SensorModel`.
+        Fields of `SensorModel` for the head.
     """
 
     file: str
@@ -71,11 +71,11 @@ def read_calibration(path: Path) -> Calibration:
             return _ouster(path.name, json.loads(text))
         return _table(path.name, text)
     except (OSError, ValueError, TypeError, KeyError, yaml.YAMLError, LidarpoolError) as error:
-        raise LidarpoolError(f"{path} is no calibration that can be used: {said(error)}") from error
+        raise LidarpoolError(f"{path} is not a usable calibration: {said(error)}") from error
 
 
 def said(error: Exception) -> str:
-    """Return what an error of a file says, in one line."""
+    """Return the message of an error in one line."""
     words = f"{error} is missing" if isinstance(error, KeyError) else str(error)
     words = (error.strerror if isinstance(error, OSError) else None) or words
     return " ".join(words.split()).rstrip(".") + "."
@@ -88,7 +88,7 @@ def _velodyne(name: str, data: Any) -> Calibration:
     lasers = sorted(data["lasers"], key=lambda laser: laser["laser_id"])
     count = data.get("num_lasers", len(lasers))
     if [laser["laser_id"] for laser in lasers] != list(range(count)):
-        raise ValueError(f"lasers 0 to {count - 1} must be there, each once")
+        raise ValueError(f"it must have lasers 0 to {count - 1}, each once")
     elevation, azimuth, up, left = np.array(
         [
             [
@@ -100,7 +100,7 @@ def _velodyne(name: str, data: Any) -> Calibration:
             for laser in lasers
         ]
     ).T
-    # Offsets at right angles to the beam, upwards and to the left of it.
+    # Offsets at right angles to the beam, upwards and to the left.
     ahead, cos, sin = -up * np.sin(elevation), np.cos(azimuth), np.sin(azimuth)
     origin = [ahead * cos - left * sin, ahead * sin + left * cos, up * np.cos(elevation)]
     beams = Beams(elevation, azimuth, origin=np.column_stack(origin))
@@ -110,11 +110,10 @@ def _velodyne(name: str, data: Any) -> Calibration:
 def _ouster(name: str, data: Any) -> Calibration:
     """Beams of Ouster's metadata, old and new; geometry as in its sensor manual.
 
-    Ranges are counted from where the beam leaves, as everywhere here; Ouster's own include the
-    way from the axis.
+    Ranges begin at the beam's start, as everywhere here; Ouster's own begin at the axis.
     """
     if not isinstance(data, dict):
-        raise ValueError("it is no metadata of Ouster's")
+        raise ValueError("it is not Ouster metadata")
     beam = data.get("beam_intrinsics", data)
     if "beam_altitude_angles" not in beam:
         raise ValueError("it has no beam_altitude_angles, as Ouster's metadata have")
@@ -158,7 +157,7 @@ def _ouster(name: str, data: Any) -> Calibration:
 
 
 def _table(name: str, text: str) -> Calibration:
-    """One of the comma-separated formats, told by the header."""
+    """One of the comma-separated formats, chosen by the header."""
     header = [word.strip().lower() for word in text.partition("\n")[0].split(",")]
     if header == ["time/s", "azimuth/deg", "zenith/deg"]:
         return _livox(name, _rows(text, 1, 3))
@@ -172,7 +171,7 @@ def _table(name: str, text: str) -> Calibration:
         known = ("elevation_deg", "azimuth_deg", "time_us", "x_m", "y_m", "z_m")
         other = [word for word in header if word not in known]
         if other:
-            raise ValueError(f"column {other[0]!r} is none of {', '.join(known)}")
+            raise ValueError(f"column {other[0]!r} is not one of {', '.join(known)}")
         columns = dict(zip(header, _rows(text, 1, len(header)).T, strict=True))
         zero = np.zeros(len(columns["elevation_deg"]))
         beams = Beams(
@@ -186,7 +185,7 @@ def _table(name: str, text: str) -> Calibration:
         [float(word) for word in header]
     except ValueError:
         raise ValueError(
-            f"its first line, {','.join(header)[:60]!r}, is of no known format"
+            f"its first line, {','.join(header)[:60]!r}, has no known format"
         ) from None
     elevation, azimuth = np.radians(_rows(text, 0, 2)).T
     return Calibration(name, "robosense", Beams(elevation, -azimuth))

@@ -1,4 +1,4 @@
-"""What surfaces do to light: materials by the names of objects, energies of returns, weather."""
+"""Materials by the names of objects, energies of returns, weather."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from ..base.errors import LidarpoolError
 from ..base.words import did_you_mean
 from .optics import check_numbers
 
-REFERENCE_M = 10.0  # energy 1 is a white surface met at right angles from here
-REFLECTANCE = 0.5  # where none is stated: between asphalt (0.1 to 0.2) and white paint (0.8)
+REFERENCE_M = 10.0  # energy is 1 for a white surface hit at right angles from here
+REFLECTANCE = 0.5  # default reflectance: between asphalt (0.1 to 0.2) and white paint (0.8)
 # Engineer grade sheeting, ASTM D4956 type I white: 70 cd/lx/m², of a white diffuser 1/π.
 RETRO_GAIN = 220.0
 GLASS_INDEX = 1.5
-NEAREST_M = 1e-3  # energies do not grow any more below this
+NEAREST_M = 1e-3  # energies do not grow below this distance
 
 Transparent = Literal["none", "pass", "mirror"]
 
@@ -28,22 +28,22 @@ Transparent = Literal["none", "pass", "mirror"]
 @dataclass(frozen=True)
 @checked_fields
 class Material:
-    """What the surfaces of some objects are made of.
+    """Material of some objects.
 
     Parameters
     ----------
     objects
-        Names of objects, which may hold * and ?; one or several.
+        Names of objects, with * and ?; one or several.
     reflectance
         Share of the light that is scattered back in all directions, 0 to 1, at the sensor's
         wavelength; by default 0.5, and 0 where `transparent` is "pass" or "mirror".
     semantic_class
         Value of the column `class`.
     retro
-        Whether light goes back where it came from, as from traffic signs and licence plates.
+        Whether light returns in its own direction, as from traffic signs and licence plates.
     transparent
-        What becomes of the light that is not scattered back: "none" (it is lost), "pass" (it
-        goes straight on, less what a surface of glass reflects), "mirror" (it is reflected).
+        Light that is not scattered: "none" (is lost), "pass" (passes straight through, minus the
+        reflection of glass), "mirror" (is reflected).
 
     Raises
     ------
@@ -96,12 +96,12 @@ class MaterialTable:
         Raises
         ------
         LidarpoolError
-            If a name is that of no object, or there are materials, and none names some object.
+            If a name fits no object, or there are materials and an object has none.
         """
         for pattern in (one for material in materials for one in material.objects):
             if not any(Material(pattern).named(name) for name in names):
                 raise LidarpoolError(
-                    f"materials names {pattern!r}, and no object is called so."
+                    f"materials names {pattern!r}, but no object has that name."
                     + (did_you_mean(pattern, names) or f" There are {', '.join(names[:5])}, …")
                 )
         default = Material("*")
@@ -129,19 +129,19 @@ class MaterialTable:
 
     @property
     def plain(self) -> bool:
-        """Whether each ray ends where it first meets something, and something comes back."""
+        """Whether each ray ends at its first hit, with a return."""
         return bool((self.reflectance > 0).all() and not (self.passes | self.mirrors).any())
 
     def scattered(
         self, rows: NDArray[np.integer[Any]], cosine: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Share of the light that comes back from objects (n,): 1 from white at right angles."""
+        """Share of the light returned by objects (n,): 1 for white at right angles."""
         return self.reflectance[rows] * np.where(self.retro[rows], RETRO_GAIN, cosine)
 
     def goes_on(
         self, rows: NDArray[np.integer[Any]], cosine: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Share of the light that goes on from objects (n,) that pass it or are mirrors."""
+        """Share of the light that continues at glass or mirrors (n,)."""
         through = np.where(self.passes[rows], 1 - fresnel(cosine), 1.0)
         return np.asarray((1 - self.reflectance[rows]) * through)
 
@@ -155,7 +155,7 @@ def fresnel(cosine: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def at_right_angles(distance: Any, extinction: float = 0.0) -> Any:
-    """Energy that comes back from white surfaces met at right angles, metres away."""
+    """Energy returned by white surfaces hit at right angles, by distance in metres."""
     distance = np.maximum(distance, NEAREST_M)
     return (REFERENCE_M / distance) ** 2 * np.exp(-2 * extinction * distance)
 
@@ -166,8 +166,8 @@ def extinction(visibility_km: float | None, wavelength_nm: float) -> float:
     Parameters
     ----------
     visibility_km
-        Meteorological visibility, where a contrast has fallen to 2 %; None for clear air, which
-        takes nothing.
+        Meteorological visibility, where a contrast has fallen to 2 %; None for clear air
+        without extinction.
     wavelength_nm
         Of the laser.
 

@@ -1,4 +1,4 @@
-"""Sensors by the name of their model: data files, one a sensor, and what is made of them."""
+"""Sensor models by name: reads their data files and makes sensors."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class _Part(BaseModel):
 
 
 def _numbers(value: Any) -> Any:
-    """Take {first, last, count} for numbers evenly spaced, both ends included."""
+    """Expand {first, last, count} to evenly spaced numbers, both ends included."""
     if isinstance(value, dict):
         return np.linspace(value["first"], value["last"], value["count"]).tolist()
     return value
@@ -39,7 +39,7 @@ def _numbers(value: Any) -> Any:
 
 Numbers = Annotated[tuple[float, ...], BeforeValidator(_numbers)]
 Place = tuple[float, float, float]
-# 55.296 is no binary number, and 500/9 no decimal one.
+# 55.296 is not exact in binary, nor 500/9 in decimal.
 Exact = Annotated[Fraction, BeforeValidator(lambda value: Fraction(str(value)))]
 Positive = Annotated[float, Field(gt=0)]
 
@@ -53,7 +53,7 @@ class BeamTable(_Part):
     origin_m: Place | tuple[Place, ...] = ()
 
     def beams(self) -> Beams | None:
-        """Make them; None where a calibration has to say the elevations."""
+        """Make them; None if a calibration has to give the elevations."""
         count = len(self.elevation_deg)
         if not count:
             return None
@@ -65,7 +65,7 @@ class BeamTable(_Part):
         )
 
     def origins(self, count: int) -> NDArray[np.float64]:
-        """Origins of so many beams: (count, 3), or (0, 3) where there are none."""
+        """Origins of so many beams: (count, 3), or (0, 3) if there are none."""
         origin = np.array(self.origin_m, np.float64).reshape(-1, 3)
         return np.repeat(origin, count, axis=0) if len(origin) == 1 else origin
 
@@ -98,7 +98,7 @@ class OpticsPart(_Part):
 
 
 class SensorModel(_Part):
-    """What a data file says of a sensor. `docs/how-to/sensor.md` describes its fields."""
+    """Data file of a sensor. `docs/how-to/sensor.md` describes its fields."""
 
     name: str
     sources: dict[str, str]
@@ -126,7 +126,7 @@ class SensorModel(_Part):
 
     @property
     def needs_calibration(self) -> bool:
-        """Whether its rays are known only from the file of a unit."""
+        """Whether its rays need a calibration file."""
         return not (self.beams.elevation_deg or self.mirror or self.prisms)
 
     def turn(self, rate_hz: float | None, columns: int | None) -> tuple[float, float]:
@@ -167,7 +167,7 @@ def read_model(name: str | Path) -> SensorModel:
     if str(name) not in model_names():
         raise LidarpoolError(
             f"There is no sensor model {str(name)!r}.{did_you_mean(str(name), model_names())} "
-            "lidarpool sensors lists them; one's own is given as a file, such as mine.yaml."
+            "lidarpool sensors lists them; give your own as a file, such as mine.yaml."
         )
     return _built_in(str(name))
 
@@ -189,7 +189,7 @@ def _read(path: Path | Traversable) -> SensorModel:
             said_of_it = f"this is not a field.{did_you_mean(str(first['loc'][-1]), fields)}"
         raise LidarpoolError(f"{path}, {place}: {said_of_it}") from error
     except (OSError, ValueError, TypeError, KeyError, yaml.YAMLError, LidarpoolError) as error:
-        raise LidarpoolError(f"{path} is no model that can be used: {said(error)}") from error
+        raise LidarpoolError(f"{path} is not a usable model: {said(error)}") from error
 
 
 @checked
@@ -203,26 +203,26 @@ def load_sensor(
     min_range_m: float | None = None,
     max_range_m: float | None = None,
 ) -> Sensor:
-    """Make a sensor as its maker specifies it, or as a unit was calibrated.
+    """Make a sensor from a model, or from the calibration of a unit.
 
     Parameters
     ----------
     model
-        Name, such as "velodyne/vlp16", or a data file of one's own (.yaml). Where only a
-        calibration is given, the model whose beams are nearest to it.
+        Name, such as "velodyne/vlp16", or your own data file (.yaml). With a calibration only,
+        the model whose beams are nearest to it.
     calibration
         File of the unit: Velodyne YAML, Ouster metadata, Hesai angle corrections, RoboSense
         angle.csv, Livox list of rays, or a table of beams; see `read_calibration`.
     columns
-        Firings in a turn, where the model, or a table of beams, leaves a choice.
+        Firings in a turn, if the model, or a table of beams, leaves a choice.
     rate_hz
         Turns, lines or frames a second.
     step_deg
-        Of a turn, what makes one scan. Ten degrees are 800 rays of a VLP-16 and 3,600 of an
-        OS1-128: enough that a scan costs little by itself, as batches join consecutive scans up
-        to a million rays, and few enough that several workers share a turn.
+        Part of a turn that is one scan. Ten degrees are 800 rays of a VLP-16 and 3,600 of an
+        OS1-128: a scan then costs little by itself, because batches join consecutive scans up to
+        a million rays, and several workers can share a turn.
     min_range_m, max_range_m
-        In place of the model's.
+        Instead of the model's.
 
     Raises
     ------
@@ -276,8 +276,8 @@ def load_sensor(
 
 
 def _model_of(unit: Calibration, columns: int | None) -> SensorModel:
-    """Find the model whose beams are nearest, else take what the file itself says."""
-    off = {}  # {model: how far its elevations are from those of the unit, degrees}
+    """Find the model whose beams are nearest, else use the file alone."""
+    off = {}  # {model: distance of its elevations from those of the unit, degrees}
     for name in model_names():
         ours = read_model(name).beams.elevation_deg
         if name.startswith(f"{unit.maker}/") and unit.beams and len(ours) == len(unit.beams):
@@ -288,7 +288,7 @@ def _model_of(unit: Calibration, columns: int | None) -> SensorModel:
     head = {"firings_per_turn": columns} if columns and unit.maker is None else unit.head
     if not head:
         raise LidarpoolError(
-            f"{unit.file} is of no known model, and does not say when rays are fired: give model:"
+            f"{unit.file} fits no known model, and has no firing times: give model:"
             f"{'' if unit.maker else ', or columns: (firings in a turn),'} as well."
         )
     return SensorModel(name=(unit.maker or "beams").title(), sources={}, **head)
@@ -297,9 +297,11 @@ def _model_of(unit: Calibration, columns: int | None) -> SensorModel:
 def _listed(
     described: SensorModel, unit: Calibration, head: Spin, common: dict[str, Any]
 ) -> ListedSensor:
-    """Rays of a unit's list, at the model's rate where the list has no times."""
+    """Rays of a unit's list, at the model's rate if the list has no times."""
     if unit.rays is None or described.beams.elevation_deg:
-        raise LidarpoolError(f"{unit.file} does not fit {described.name}: it lists other things.")
+        raise LidarpoolError(
+            f"{unit.file} does not fit {described.name}: one lists rays, the other beams."
+        )
     each_ns = 1e9 / (head.firings_per_turn * head.rate_hz)
     times = unit.shot_ns
     if times is None:
@@ -315,7 +317,7 @@ def _calibrated(described: SensorModel, unit: Calibration) -> Beams:
     expected = len(table.elevation_deg) or len(table.time_us)
     if expected not in (0, len(beams)):
         raise LidarpoolError(
-            f"{unit.file} has {len(beams)} beams, and {described.name} has {expected}."
+            f"{unit.file} has {len(beams)} beams, but {described.name} has {expected}."
         )
     times = beams.time_ns if beams.time_ns.any() else np.multiply(table.time_us, 1000.0)
     origin = beams.origin if beams.origin.any() else table.origins(len(beams))

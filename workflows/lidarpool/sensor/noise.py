@@ -1,4 +1,4 @@
-"""Noise of a sensor: of its ranges and angles, and pulses of which nothing comes back."""
+"""Noise of ranges and angles, and lost returns."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from ..base.counted import normal, uniform
 from .materials import at_right_angles
 from .optics import check_numbers
 
-# A pulse is seen where signal and noise pass a threshold of so many standard deviations.
+# Detection threshold for signal plus noise, in standard deviations.
 THRESHOLD_SIGMAS = 5.0
-TARGET_REFLECTANCE = 0.1  # that makers state ranges for
+TARGET_REFLECTANCE = 0.1  # reflectance of stated ranges
 
 _RANGE, _ACROSS, _UP, _DETECTION, _LOSS = range(1, 6)  # purposes of random numbers
 
@@ -33,15 +33,15 @@ class Noise:
     range_m, range_per_m
         Standard deviation of a range of r metres: ``range_m + range_per_m * r``.
     angle_deg
-        Standard deviation of where a beam points, in each of the two directions across it. The
-        light goes there; what is reported is the angle without noise.
+        Standard deviation of beam directions, in each of the two directions across. The ray is
+        cast there; the reported angle has no noise.
     dropout
-        Share of returns that are lost whatever their strength, 0 to 1.
+        Share of returns that are lost whatever their energy, 0 to 1.
     detection_range_m
-        Where half of the pulses are seen that a surface of 10 % reflectance sends back at right
-        angles in clear air; None if all are seen, from however far.
+        Range at which half of the pulses from a surface of 10 % reflectance are detected, at right
+        angles in clear air; None if all are detected, at any range.
     seed
-        Another one gives other noise.
+        Another seed gives other noise.
 
     Raises
     ------
@@ -63,7 +63,7 @@ class Noise:
 
     @property
     def loses(self) -> bool:
-        """Whether returns are lost."""
+        """Whether returns can be lost."""
         return self.dropout > 0 or self.detection_range_m is not None
 
     def ranges(self, distance: Real, scan: Whole, ray: Whole, number: Whole) -> Real:
@@ -72,7 +72,7 @@ class Noise:
         return np.maximum(distance + sigma * normal(self.seed, _RANGE, scan, ray, number), 0)
 
     def angles(self, scan: Whole, ray: Whole) -> tuple[Real, Real]:
-        """How far beams point off their way, across and up: (n,) and (n,), radians."""
+        """Deviations of beams, across and up: (n,) and (n,), radians."""
         sigma = np.radians(self.angle_deg)
         return (
             sigma * normal(self.seed, _ACROSS, scan, ray),
@@ -80,11 +80,11 @@ class Noise:
         )
 
     def detected(self, energy: Real, scan: Whole, ray: Whole, number: Whole) -> NDArray[np.bool_]:
-        """Which returns (n,) are seen.
+        """Whether returns (n,) are detected.
 
-        The signal with its normally distributed noise has to pass a threshold: half of the
-        returns whose energy is that of the threshold are seen, 97.7 % of those with 1.4 times as
-        much, and with a fifth of it, 3 in 100,000.
+        The signal with its normally distributed noise has to pass a threshold: at an energy equal
+        to the threshold half of the returns are detected, at 1.4 times as much 97.7 %, and at a
+        fifth of it 3 in 100,000.
         """
         seen = uniform(self.seed, _LOSS, scan, ray, number) >= self.dropout
         if self.detection_range_m is not None:

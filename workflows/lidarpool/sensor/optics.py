@@ -1,4 +1,4 @@
-"""What a sensor sends out, and which returns it reports."""
+"""Light of a sensor, and the returns that it reports."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MODES = ("strongest", "first", "last", "dual", "all")
 
 Mode = Literal["strongest", "first", "last", "dual", "all"]
 
-# Rows of the hexagon are turned away from the axes, along which edges of surfaces often lie.
+# The hexagon is rotated, because edges of surfaces are often parallel to the axes.
 _TURNED = 0.19
 
 
@@ -34,18 +34,18 @@ def check_numbers(thing: object, limits: Mapping[str, tuple[float, float]]) -> N
 @dataclass(frozen=True)
 @checked_fields
 class Optics:
-    """The light of a sensor, and how finely it reports.
+    """Light and resolution of a sensor.
 
     Parameters
     ----------
     wavelength_nm
-        Of the laser; 905 where no source states one.
+        Of the laser; 905 if no source states it.
     divergence_mrad
-        Full angle of the beam's cone, at 1/e² of its maximum; None where it is not known.
+        Full angle of the beam's cone, at 1/e² of its maximum; None if unknown.
     pulse_ns
         Length of a pulse.
     resolution_m
-        Of reported ranges: what positions are rounded to unless the survey says otherwise.
+        Of reported ranges: default step for rounding positions.
     """
 
     wavelength_nm: float = 905.0
@@ -61,19 +61,19 @@ class Optics:
 @dataclass(frozen=True)
 @checked_fields
 class Returns:
-    """How many rays make up a beam, and which of what comes back is reported.
+    """Sub-rays of a beam, and which returns are reported.
 
     Parameters
     ----------
     mode
-        Of the returns of a pulse: the strongest, the first, the last, the strongest and the last
-        ("dual"; the two strongest where those are one), or all.
+        Returns of a pulse to report: the strongest, the first, the last, the strongest and the
+        last ("dual"; the two strongest if those are one), or all.
     subrays
-        Rays that a beam is divided into, a hexagonal number: 1, 7, 19, 37, 61, … 217.
+        Rays in a beam, a hexagonal number: 1, 7, 19, 37, 61, … 217.
     divergence_mrad
         Full angle of the beam; None for the sensor's.
     pulse_ns
-        Length of the pulse; None for the sensor's. What lies within half of it is one return.
+        Length of the pulse; None for the sensor's. Hits within half of it are one return.
 
     Raises
     ------
@@ -93,17 +93,17 @@ class Returns:
         check_numbers(self, {"divergence_mrad": (0, 1000), "pulse_ns": (0, 1e6)})
 
     def of(self, optics: Optics) -> tuple[float, float]:
-        """Divergence, radians, and distance that tells two returns apart, metres.
+        """Divergence, radians, and least distance of two returns, metres.
 
         Raises
         ------
         LidarpoolError
-            If there are sub-rays, and nobody has said how wide the beam is.
+            If there are sub-rays, and the divergence is unknown.
         """
         wide = optics.divergence_mrad if self.divergence_mrad is None else self.divergence_mrad
         if wide is None and self.subrays > 1:
             raise LidarpoolError(
-                f"returns.subrays is {self.subrays}, and the sensor states no divergence: give "
+                f"returns.subrays is {self.subrays}, but the sensor has no divergence: give "
                 "returns.divergence_mrad."
             )
         pulse_ns = optics.pulse_ns if self.pulse_ns is None else self.pulse_ns
@@ -113,8 +113,8 @@ class Returns:
 def hexagon(count: int, divergence: float) -> NDArray[np.float64]:
     """Places of sub-rays in a beam: (count, 2), radians off its axis, the middle first.
 
-    Each stands for the same share of the beam, so that the outermost cells end where the cone
-    does: a beam that is as bright everywhere.
+    Each has the same share of the beam, so that the outermost cells end with the cone: an evenly
+    bright beam.
     """
     rings = SUBRAYS.index(count)
     spacing = divergence / 2 / (rings + 0.5)

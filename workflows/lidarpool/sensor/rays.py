@@ -1,4 +1,4 @@
-"""Sensors whose rays lie on no cones about an axis: behind prisms, or listed one by one."""
+"""Sensors without conical beams: behind prisms, or with listed rays."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class Prism:
     rpm
         Turns a minute about x, from y to z.
     phase_deg
-        Where its thin edge is at time 0, likewise.
+        Angle of its thin edge at time 0, likewise.
     inclined_first
-        Whether light enters by the inclined face; else by the flat one.
+        Whether light enters through the inclined face; else through the flat one.
     """
 
     wedge_deg: float
@@ -39,18 +39,17 @@ class Prism:
 
 @dataclass(frozen=True, eq=False)
 class PrismSensor(Sensor):
-    """Beams along x through wedge prisms that turn about x at rates of their own.
+    """Beams along x through wedge prisms that turn about x at different rates.
 
-    The head is only the clock. Directions follow exactly from Snell's law in vectors at each
-    face. Prisms are thin: all rays leave from the sensor's centre. No turn of all together is
-    short enough to be called a period.
+    The head is only the clock. Directions are exact by Snell's law at each face. Prisms are
+    thin: all rays start at the sensor's centre. The pattern has no useful period.
 
     Parameters
     ----------
     beams
-        One along x by default; others enter the first prism askew.
+        One along x by default; others enter the first prism at an angle.
     prisms
-        In the order of the light's way.
+        In the order in which light passes them.
     """
 
     beams: Beams = field(default_factory=lambda: Beams(np.zeros(1)))
@@ -68,9 +67,9 @@ class PrismSensor(Sensor):
         flat = np.array([1.0, 0, 0])[:, None, None]
         ray = np.repeat(self.ahead.T[:, None, :], len(firings), axis=1)
         for prism in self.prisms:
-            # Within a turn first: the cosine of a large angle has lost digits.
+            # Reduced to a turn first: the cosine of a large angle loses digits.
             angle = 2 * np.pi * ((prism.rpm * minutes + prism.phase_deg / 360) % 1)
-            # Normals along the way of the light; the faces part towards the thick edge.
+            # Normals along the light's direction; the faces diverge towards the thick edge.
             wedge = np.radians(prism.wedge_deg)
             inclined = np.empty((3, len(firings), 1))
             inclined[0] = np.cos(wedge)
@@ -88,7 +87,7 @@ def _refracted(
 ) -> NDArray[np.float64]:
     """Rays (3, k, c) behind a face, by Snell's law; `ratio` is the index before over that behind.
 
-    The normals (3, k, 1), or (3, 1, 1), point along the way of the light.
+    The normals (3, k, 1), or (3, 1, 1), point along the light's direction.
     """
     along = (rays * normals).sum(axis=0)
     behind = np.sqrt(1 - ratio**2 * (1 - along**2))
@@ -99,17 +98,17 @@ def _refracted(
 class ListedSensor(Sensor):
     """Rays listed one by one, as in a maker's file: one beam, each firing another direction.
 
-    After the last it begins again. The head's time steps are shares of the list; its own times
-    and azimuths have no meaning.
+    The list repeats. The head's time steps are parts of the list; its times and azimuths are
+    not used.
 
     Parameters
     ----------
     rays
         float64 (n, 3): unit directions in the order of firing.
     shot_ns
-        float64 (n,): when each is fired, from 0 on, in order.
+        float64 (n,): firing times from 0 on, in order.
     cycle_ns
-        How long the list takes.
+        Duration of the list.
     """
 
     beams: Beams = field(default_factory=lambda: Beams(np.zeros(1)))

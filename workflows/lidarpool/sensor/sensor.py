@@ -18,25 +18,25 @@ from .optics import Optics
 @dataclass(frozen=True, eq=False)
 @checked_fields
 class Sensor:
-    """Beams that a head moves. In each firing all beams are fired once.
+    """Beams that a head moves. Each firing fires all beams once.
 
-    A sensor of another kind has beams or a head of its own, or is a subclass with other
-    `directions`, `origins` or `begins_ns`: nothing else has to know of it. Its fields are what
-    tells it from others (see `lidarpool.base.fingerprint`), so keep what it depends on in them.
+    Another kind of sensor has its own beams or head, or is a subclass with other `directions`,
+    `origins` or `begins_ns`; no other code changes. Its fields identify it (see
+    `lidarpool.base.fingerprint`), so keep everything that it depends on in fields.
 
     Parameters
     ----------
     beams, head
-        What is fired, and where it looks.
+        Its beams, and what moves them.
     min_range_m, max_range_m
-        Returns nearer or farther than this, in metres, are not seen. A ray goes on through what
-        is nearer.
+        Returns nearer or farther than this, in metres, are ignored. A ray passes through nearer
+        surfaces.
     name
         Of the model, for reports; by default that of the class.
     optics
-        Its light, and how finely it reports.
+        Its light and resolution.
     start_ns
-        When its head starts, nanoseconds after the survey, or the station, begins.
+        Start of its head, nanoseconds after the start of the survey or station.
 
     Raises
     ------
@@ -57,7 +57,7 @@ class Sensor:
     name: str = ""
     optics: Optics = field(default_factory=Optics)
     start_ns: float = 0.0
-    cycle: ClassVar[str] = "turn"  # what is done so many times a second, in a word
+    cycle: ClassVar[str] = "turn"  # name of a cycle
 
     def __post_init__(self) -> None:
         checks = (
@@ -71,7 +71,7 @@ class Sensor:
 
     @property
     def model(self) -> str:
-        """What it is, for reports."""
+        """Its model, for reports."""
         return self.name or f"{type(self).__name__} with {self.channels} channels"
 
     @classmethod
@@ -103,7 +103,7 @@ class Sensor:
         step_deg
             Degrees turned in one time step, in (0, 360].
         min_range_m, max_range_m
-            As of every sensor.
+            As for every sensor.
         rate_hz
             Turns a second.
 
@@ -134,18 +134,18 @@ class Sensor:
 
     @property
     def channels(self) -> int:
-        """Beams, and so rays a firing."""
+        """Number of beams, and of rays in a firing."""
         return len(self.beams)
 
     @property
     def period(self) -> int | None:
-        """Firings after which directions and origins repeat; None where they never do."""
+        """Firings after which directions and origins repeat; None if they never do."""
         return self.head.period
 
     def firings(self, step: int) -> tuple[int, int]:
         """First firing of time step `step`, and one past the last.
 
-        Successive steps meet without gap or overlap; the numbers go on from turn to turn.
+        Successive steps have no gap or overlap; numbers continue from turn to turn.
         """
         return self.head.firings(step)
 
@@ -154,9 +154,9 @@ class Sensor:
         return self._turned(firings, self._ahead)
 
     def origins(self, firings: NDArray[np.int64]) -> NDArray[np.float64] | None:
-        """Where the rays of firings (k,) leave, in the sensor's axes: (k, channels, 3), metres.
+        """Return starts of the rays of firings (k,), sensor axes: (k, channels, 3), metres.
 
-        None where all leave from the sensor's centre.
+        None if all start at the sensor's centre.
         """
         if not self.beams.origin.any():
             return None
@@ -169,15 +169,15 @@ class Sensor:
 
     @cached_property
     def centre(self) -> NDArray[np.float64] | None:
-        """Where all beams leave, (3,) in the head's axes; None where they do not leave together."""
+        """Common start of all beams, (3,) in the head's axes; None if they differ."""
         origin = self.beams.origin
         return origin[0] if (origin == origin[0]).all() else None
 
     def spins(self, firings: NDArray[np.int64]) -> NDArray[np.float64] | None:
-        """Return cosines and sines of the angles that the head is turned by at firings: (2, k).
+        """Return cosines and sines of the head's angles at firings: (2, k).
 
-        About its z axis, which lies in the sensor's axes as `axes` tells. None where the rays are
-        not those of beams that such a head turns.
+        About the head's z axis; `axes` relates it to the sensor's axes. None if the rays are not
+        beams turned by such a head.
         """
         kind = type(self)
         if kind.directions is not Sensor.directions or kind.origins is not Sensor.origins:
@@ -187,15 +187,15 @@ class Sensor:
 
     @property
     def axes(self) -> NDArray[np.float64] | None:
-        """Rotation to the sensor's axes from those that the head turns in; None where the same."""
+        """Rotation from the head's axes to the sensor's; None if they are the same."""
         return None
 
     def _turned(
         self, firings: NDArray[np.int64], vectors: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Turn vectors (c, 3), such as one of each beam, with the head: (k, c, 3).
+        """Rotate vectors (c, 3), such as one for each beam, with the head: (k, c, 3).
 
-        Products of what a firing and what a beam has: no trigonometry on each ray.
+        Uses products of firing and beam terms, without trigonometry for each ray.
         """
         azimuth = self.head.azimuths(firings)[:, None]
         cos, sin = np.cos(azimuth), np.sin(azimuth)
@@ -207,22 +207,22 @@ class Sensor:
         return out if self.axes is None else out @ self.axes.T
 
     def begins_ns(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
-        """When firings (k,) begin, since the station did: (k,)."""
+        """Return the starts of firings (k,), since the start of the station: (k,)."""
         return self.start_ns + self.head.times_ns(firings)
 
     def times_ns(self, firings: NDArray[np.int64]) -> NDArray[np.int64]:
-        """When the rays of firings (k,) are fired, since the station began: (k, channels)."""
+        """Return the times of the rays of firings (k,), from the station's start: (k, channels)."""
         times = self.begins_ns(firings)[:, None] + self.beams.time_ns
         return np.rint(times).astype(np.int64)
 
     @property
     def lead_ns(self) -> float:
-        """When the first beam is fired within a firing."""
+        """Time of the first beam within a firing."""
         return float(self.beams.time_ns.min())
 
     @cached_property
     def _ahead(self) -> NDArray[np.float64]:
-        """Unit direction of each beam when the head is at azimuth 0, (c, 3)."""
+        """Unit direction of each beam with the head at azimuth 0, (c, 3)."""
         beams = self.beams
         level = np.cos(beams.elevation)
         x, y = level * np.cos(beams.azimuth), level * np.sin(beams.azimuth)
@@ -233,7 +233,7 @@ class Sensor:
 class LineSensor(Sensor):
     """A sensor whose head turns about its x axis: azimuth 0 looks down, 90 degrees to the left.
 
-    So an airborne scanner flies along x and sweeps across.
+    For airborne scanners, which fly along x and sweep across.
     """
 
     cycle: ClassVar[str] = "cycle"

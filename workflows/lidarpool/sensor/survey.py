@@ -1,4 +1,4 @@
-"""A survey: sensors on a carrier, its trajectory, and the scans that follow from them."""
+"""A survey: sensors on a carrier, its trajectory, and the resulting scans."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from .optics import Returns, check_numbers
 from .sensor import Sensor
 from .trajectory import CENTRE, Pose, Stations, Trajectory
 
-STEPS = 36  # from each pose where none are given: one turn of most sensors
+STEPS = 36  # default at each pose: one turn of most sensors
 STEPS_MOST = 10_000_000  # along a trajectory
 SENSORS_MOST = 255  # the type of the column
 
@@ -35,9 +35,9 @@ class Mounted:
     sensor
         The lidar.
     mount
-        Where it sits and how it is turned, in the carrier's axes.
+        Its pose in the carrier's axes.
     name
-        What it is called where there are several.
+        Its name, needed if there are several.
     steps
         Time steps from each station; by default those of the survey.
     """
@@ -50,18 +50,18 @@ class Mounted:
 
 @dataclass(frozen=True)
 class ScanSpec:
-    """The firings of one time step of the sensor: the unit of ordering and of exactly-once.
+    """The firings of one time step of a sensor: the unit of ordering and exactly-once delivery.
 
     Parameters
     ----------
     scan
         Its number in the survey.
     station
-        Where the sensor is, see `Trajectory`.
+        Station of the trajectory, see `Trajectory`.
     firings
-        Half-open range of numbers of firings, counted from the beginning of the station.
+        Half-open range of firings, counted from the start of the station.
     start_ns
-        When the station begins, nanoseconds since the survey's start.
+        Start of the station, nanoseconds since the survey's start.
     sensor
         Number of its sensor.
     channels
@@ -86,42 +86,42 @@ class ScanSpec:
 class Survey:
     """All scans of a carrier's sensors.
 
-    Scans of a sensor are in the order of time, and all of one sensor come before those of the
-    next: so a batch is one cast, and each part belongs to one sensor or two. What is simultaneous
-    is told by the column `time`.
+    Scans of a sensor are in time order, and all scans of one sensor come before those of the next,
+    so that a batch is one cast, and each part belongs to one sensor or two. The column `time`
+    shows which points are simultaneous.
 
     Parameters
     ----------
     sensor
-        The lidar, where there is one and it is the carrier.
+        The lidar, if there is one without a carrier.
     poses
-        Where it scans from, one after the other: `Pose`, or x, y, z.
+        Its poses one after the other: `Pose`, or x, y, z.
     steps
         Time steps from each pose, 36 by default; along a `Track` by default as many as it lasts.
     keep_every
-        Of the hits of each scan, the cloud keeps every n-th.
+        The cloud keeps every n-th hit of each scan.
     precision_m
         Points are rounded to multiples of this, in metres; None for the sensor's resolution.
     columns
-        What points have beside x, y, z, scan, channel and object: names of the table of columns
-        (`lidarpool.columns.table`), or `Column` of one's own. Of several sensors the column
-        `sensor` is always one.
+        Columns in addition to x, y, z, scan, channel and object: names of the table of columns
+        (`lidarpool.columns.table`), or your own `Column`. Several sensors always have the column
+        `sensor`.
     trajectory
-        In place of `poses`, where the carrier moves.
+        Instead of `poses`, if the carrier moves.
     sensors
-        In place of `sensor`: `Mounted`, each with a name of its own if there are several.
+        Instead of `sensor`: `Mounted`, each with its own name if there are several.
     coordinates
-        Of the points: "world", or "sensor" for those of the sensor at the time of each ray, as its
-        driver gives them.
+        Of the points: "world", or "sensor" for the axes of the sensor at the time of each ray, as
+        sensor drivers have them.
     materials
-        What objects are made of, by their names; where several name an object, the last counts.
-        Without any, all scatter half of the light.
+        Materials of objects by name; the last entry for an object counts. Without any, all objects
+        scatter half of the light.
     returns
         Sub-rays of a beam, and which returns of a pulse are reported.
     noise
-        Of ranges and angles, and returns that are lost.
+        Noise of ranges and angles, and lost returns.
     visibility_km
-        Meteorological visibility; None for air that takes no light.
+        Meteorological visibility; None for air without extinction.
 
     Raises
     ------
@@ -197,18 +197,18 @@ class Survey:
 
     @cached_property
     def path(self) -> Trajectory:
-        """Where the carrier is: the trajectory, or the poses as one."""
-        assert self.trajectory is not None  # made of the poses where it was not given
+        """The trajectory, or the poses as one."""
+        assert self.trajectory is not None  # made of the poses by default
         return self.trajectory
 
     @cached_property
     def carried(self) -> tuple[Mounted, ...]:
-        """The sensors, also where there is one."""
+        """The sensors, also if there is only one."""
         return tuple(self.sensors) or (Mounted(self.sensor),)
 
     @cached_property
     def channels(self) -> int:
-        """Beams of the sensor that has most."""
+        """Most beams of a sensor."""
         return max(carried.sensor.channels for carried in self.carried)
 
     @cached_property
@@ -259,7 +259,7 @@ class Survey:
 
     @cached_property
     def station_ns(self) -> int:
-        """How long a station takes: until the last sensor is done."""
+        """Duration of a station: until the last sensor is done."""
         return max(
             round(_begin_ns(carried.sensor, carried.sensor.firings(steps - 1)[1]))
             for carried, steps in zip(self.carried, self.steps_each, strict=True)
@@ -267,7 +267,7 @@ class Survey:
 
     @property
     def duration_ns(self) -> float:
-        """Until the last firing begins."""
+        """Time until the last firing begins."""
         each = zip(self.carried, self.steps_each, strict=True)
         last = max(_end_ns(carried.sensor, steps) for carried, steps in each)
         return (self.path.stations - 1) * self.station_ns + last
@@ -285,13 +285,13 @@ class Survey:
         return (self.scan(index) for index in range(self.scan_count))
 
     def pose(self, index: int) -> Pose:
-        """Pose of its sensor when scan `index` begins."""
+        """Pose of its sensor at the start of scan `index`."""
         spec = self.scan(index)
         time = self.begins_ns(index) - spec.start_ns
         return self.path.pose(spec.station, time).then(self.carried[spec.sensor].mount)
 
     def begins_ns(self, index: int) -> float:
-        """When scan `index` begins, nanoseconds since the survey's start."""
+        """Start of scan `index`, nanoseconds since the survey's start."""
         spec = self.scan(index)
         sensor = self.carried[spec.sensor].sensor
         return spec.start_ns + _begin_ns(sensor, spec.firings[0]) + sensor.lead_ns
@@ -302,7 +302,7 @@ def _begin_ns(sensor: Sensor, firing: int) -> float:
 
 
 def _end_ns(sensor: Sensor, steps: int) -> float:
-    """When the last firing of so many time steps begins."""
+    """Start of the last firing of so many time steps."""
     return _begin_ns(sensor, sensor.firings(steps - 1)[1] - 1) + sensor.lead_ns
 
 

@@ -1,4 +1,4 @@
-"""Where a sensor is: poses, and trajectories that give a pose for each firing."""
+"""Poses, and trajectories that give a pose for each firing."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from ..base.arguments import as_array, checked_fields
 from ..base.errors import LidarpoolError
 
-QUATERNION_SLACK = 1e-3  # of a quaternion's length, which files round
-# Times since 1970 are coarser than a nanosecond in double precision; and the beams of the last
+QUATERNION_SLACK = 1e-3  # tolerance of a quaternion's length, which files round
+# Times since 1970 are coarser than a nanosecond in double precision, and the beams of the last
 # firing are fired a little after its pose.
 _CLOCK_S, _FIRING_S = 1e-6, 1e-3
 
@@ -21,14 +21,14 @@ _CLOCK_S, _FIRING_S = 1e-6, 1e-3
 @dataclass(frozen=True)
 @checked_fields
 class Pose:
-    """Where a sensor stands and how it is turned.
+    """Position and rotation of a sensor.
 
     Parameters
     ----------
     position
         x, y, z in metres, in the scene's own coordinates.
     yaw_deg, pitch_deg, roll_deg
-        Turns about z, then the new y, then the new x, in degrees (aerospace order).
+        Rotations about z, then the new y, then the new x, in degrees (aerospace order).
     """
 
     position: tuple[float, float, float]
@@ -44,7 +44,7 @@ class Pose:
 
     @property
     def rotation(self) -> NDArray[np.float64] | None:
-        """Rotation from sensor to scene axes, (3, 3); None where the sensor is not turned."""
+        """Rotation from sensor to scene axes, (3, 3); None without rotation."""
         if not (self.yaw_deg or self.pitch_deg or self.roll_deg):
             return None
         angles = np.radians([self.yaw_deg, self.pitch_deg, self.roll_deg])
@@ -58,7 +58,7 @@ class Pose:
         )
 
     def then(self, mount: Pose) -> Pose:
-        """Pose of what sits at `mount` in the axes of this one."""
+        """Pose of something mounted at `mount` in the axes of this one."""
         if mount == CENTRE:
             return self
         eye = np.eye(3)
@@ -76,23 +76,23 @@ class Pose:
         if level > 1e-9:
             yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
             roll = np.arctan2(rotation[2, 1], rotation[2, 2])
-        else:  # straight up or down, where yaw and roll are about one axis
+        else:  # straight up or down: yaw and roll have the same axis
             yaw, roll = np.arctan2(-rotation[0, 1], rotation[1, 1]), 0.0
         return cls(place, *np.degrees([yaw, pitch, roll]).tolist())
 
 
-CENTRE = Pose((0.0, 0.0, 0.0))  # where a sensor sits that is its own carrier
+CENTRE = Pose((0.0, 0.0, 0.0))  # mount of a sensor without a carrier
 
 
 class Trajectory(Protocol):
-    """Poses over time. A survey has stations: between them it jumps, within one it moves.
+    """Poses over time. A survey has stations: it jumps between them, and may move within one.
 
-    Scans of one station follow one another, and the head turns on from each to the next.
+    Scans of one station follow one another, while the head keeps turning.
     """
 
     @property
     def stations(self) -> int:
-        """How many there are."""
+        """Number of stations."""
 
     @property
     def moves(self) -> bool:
@@ -100,17 +100,17 @@ class Trajectory(Protocol):
 
     @property
     def duration_ns(self) -> float:
-        """How long a station may last, nanoseconds; infinite where it may last for ever."""
+        """Longest duration of a station, nanoseconds; may be infinite."""
 
     def pose(self, station: int, time_ns: float = 0.0) -> Pose:
-        """Pose so long after the beginning of a station."""
+        """Pose at a time since the start of a station."""
 
     def poses(
         self, station: int, times_ns: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
         """Positions (k, 3) and rotations (k, 3, 3) at times (k,) of a station that moves.
 
-        They are fastest to work with where the poses of each number lie together in memory.
+        They are fastest if each of their numbers is contiguous over the poses.
         """
 
 
@@ -152,31 +152,31 @@ class Stations:
 @dataclass(frozen=True, eq=False)
 @checked_fields
 class Track:
-    """Poses at times, and between them a straight or a smooth way: one station.
+    """Poses at times, with a straight or smooth path between them: one station.
 
     Parameters
     ----------
     times_s
-        float64 (k,): when the carrier is at each pose, seconds, ascending; by any clock.
+        float64 (k,): times of the poses, seconds, ascending; by any clock.
     positions
         float64 (k, 3): metres, in the scene's own coordinates.
     quaternions
         float64 (k, 4): x, y, z, w of the rotations from the carrier's axes to the scene's, of unit
-        length within 1e-3. None where the carrier faces its way, level.
+        length within 1e-3. None if the carrier is level and faces its direction of travel.
     smooth
         Positions follow cubic Hermite curves (tangents through three poses, as Catmull and Rom,
         1974), not straight lines. Rotations turn evenly about one axis from each pose to the
         next in both cases (Shoemake, 1985).
     start_s
-        Time, by the same clock, at which the station begins; by default the first.
+        Start of the station, by the same clock; by default the first time.
     duration_s
-        How long the station lasts; by default up to the last time.
+        Duration of the station; by default until the last time.
 
     Raises
     ------
     LidarpoolError
         If there are fewer than two poses, a number is not finite, times do not ascend, a
-        quaternion is none, or the station is not within the times.
+        quaternion is invalid, or the station is not within the times.
 
     Examples
     --------
@@ -215,7 +215,7 @@ class Track:
                     f"{turns.shape}."
                 )
         lengths = np.linalg.norm(turns, axis=1)
-        # Written so that NaN is refused.
+        # Written so that NaN is an error.
         bad = ~(np.abs(lengths - 1) <= QUATERNION_SLACK)
         _refuse(bad, "the quaternion of pose {} is not of length 1")
         turns /= lengths[:, None]
@@ -281,7 +281,7 @@ class Track:
         if len(segment) and segment.max() == segment.min():
             segment = segment[:1]  # all are in one
         way, turn, rates = self._segments
-        # By Horner; a straight way has no more than two coefficients.
+        # By Horner; a straight path has only two coefficients.
         positions = way[-1].take(segment, axis=1)
         for coefficient in way[-2::-1]:
             positions = positions * since + coefficient.take(segment, axis=1)
@@ -293,7 +293,7 @@ class Track:
 
     @cached_property
     def _segments(self) -> tuple[list[NDArray[np.float64]], NDArray[np.float64], Any]:
-        """What poses between two that are given follow from, one column a segment.
+        """Coefficients of poses between two given ones, one column for each segment.
 
         Returns
         -------
@@ -322,7 +322,7 @@ class Track:
         (p, pw), (q, qw) = ((t[:, :3], t[:, 3:]) for t in (turns[:-1], turns[1:]))
         axis = pw * q - qw * p - np.cross(p, q)
         cosine = (p * q).sum(axis=1, keepdims=True) + pw * qw
-        axis = np.where(cosine < 0, -axis, axis)  # the shorter way
+        axis = np.where(cosine < 0, -axis, axis)  # the shorter rotation
         sine = np.linalg.norm(axis, axis=1, keepdims=True)
         rates = 2 * np.arctan2(sine, np.abs(cosine)) / steps
         x, y, z = (axis / np.where(sine > 0, sine, 1)).T
@@ -347,7 +347,7 @@ def matrices(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def quaternions_of(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return unit quaternions x, y, z, w (k, 4) of matrices (k, 3, 3), rounded ones too.
+    """Return unit quaternions x, y, z, w (k, 4) of matrices (k, 3, 3), which may be rounded.
 
     The eigenvector of the greatest eigenvalue (Bar-Itzhack, 2000).
     """
@@ -363,9 +363,9 @@ def quaternions_of(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _along(times: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Quaternions (k, 4) of a carrier that is level and faces its way; where it stands, as before.
+    """Quaternions (k, 4) of a level carrier that faces its direction of travel.
 
-    Before it first moves it faces where it will.
+    While it stands it keeps its direction; before it first moves it faces its first direction.
     """
     x, y = (np.gradient(axis, times) for axis in (places[:, 0], places[:, 1]))
     moving = np.flatnonzero(np.hypot(x, y) > 1e-9)
@@ -377,6 +377,6 @@ def _along(times: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[n
 
 
 def _refuse(bad: NDArray[np.bool_], words: str) -> None:
-    """Raise LidarpoolError if anything is bad, with the number of the first in the words."""
+    """Raise LidarpoolError if any is bad, with the number of the first."""
     if bad.any():
         raise LidarpoolError(f"{words.format(int(bad.argmax()))} (poses are counted from 0).")

@@ -25,7 +25,7 @@ _CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 def load_trajectory(
     path: str | Path,
     *,
-    format: str | None = None,  # noqa: A002 - what it is called in scenarios
+    format: str | None = None,  # noqa: A002 - its name in scenarios
     times: str | Path | None = None,
     columns: Mapping[str, str] | None = None,
     camera_axes: bool | None = None,
@@ -41,17 +41,16 @@ def load_trajectory(
     path
         TUM (rows of time, x, y, z, qx, qy, qz, qw), KITTI (rows of a 3 x 4 matrix), or
         comma-separated with a header: time_s or time_ns, x, y, z, and qx, qy, qz, qw, or any of
-        yaw_deg, pitch_deg, roll_deg; without them the carrier faces its way.
+        yaw_deg, pitch_deg, roll_deg; without them the carrier faces its direction of travel.
     format
-        "tum", "kitti" or "csv"; by default kitti where there are `times`, csv for a .csv, else
-        tum.
+        "tum", "kitti" or "csv"; by default kitti with `times`, csv for a .csv, else tum.
     times
-        Of a KITTI file: the file with the seconds of its rows.
+        For a KITTI file: the file with the seconds of its rows.
     columns
-        Of a table, {name as above: name in the file}, where they differ.
+        For a table, {name as above: name in the file}, if they differ.
     camera_axes
-        Whether the poses are a camera's (z ahead, y down), to be turned to a carrier's (x ahead,
-        z up); by default those of KITTI.
+        Whether to convert poses from camera axes (z ahead, y down) to a carrier's (x ahead,
+        z up); by default for KITTI.
     offset_s
         Added to all times.
     smooth, start_s, duration_s
@@ -60,7 +59,7 @@ def load_trajectory(
     Raises
     ------
     LidarpoolError
-        If it cannot be read, or is none; the message names the file.
+        If it cannot be read, or is invalid; the message names the file.
     """
     path = Path(path)
     kind = format or ("kitti" if times else "csv" if path.suffix.lower() == ".csv" else "tum")
@@ -88,7 +87,7 @@ def load_trajectory(
             track = _from_camera(track)
         return track
     except (OSError, ValueError, LidarpoolError) as error:
-        raise LidarpoolError(f"{path} is no trajectory that can be used: {said(error)}") from error
+        raise LidarpoolError(f"{path} is not a usable trajectory: {said(error)}") from error
 
 
 def _numbers(text: str, columns: int, delimiter: str | None = None) -> NDArray[np.float64]:
@@ -114,7 +113,7 @@ def _table(text: str, names: dict[str, str]) -> tuple[Any, Any, Any]:
     head = [name.strip() for name in text.partition("\n")[0].split(",")]
     known = ("time_s", "time_ns", *_PLACE, *_TURNS[0], *_TURNS[1])
     if unknown := [name for name in names if name not in known]:
-        raise ValueError(f"columns names {unknown[0]!r}, and there are {', '.join(known)}")
+        raise ValueError(f"columns names {unknown[0]!r}; possible names are {', '.join(known)}")
     at = {
         name: head.index(names.get(name, name)) for name in known if names.get(name, name) in head
     }
@@ -141,9 +140,9 @@ def quaternions_from_degrees(angles: NDArray[np.float64]) -> NDArray[np.float64]
 
 
 def _from_camera(track: Track) -> Track:
-    """Turn poses of a camera in a camera's axes to those of a carrier."""
+    """Convert poses of a camera in camera axes to those of a carrier."""
     assert track.quaternions is not None  # of every track
     x, y, z, w = track.quaternions.T
-    turns = np.stack([z, -x, -y, w], axis=1)  # the axis turned, the angle the same
+    turns = np.stack([z, -x, -y, w], axis=1)  # the axis is rotated, the angle is the same
     places = track.positions @ _CAMERA.T
     return Track(track.times_s, places, turns, track.smooth, track.start_s, track.duration_s)
