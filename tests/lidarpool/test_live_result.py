@@ -420,5 +420,29 @@ def test_a_link_brings_back_what_was_chosen(cloud, pictured, page):
     with connect(query["websocket"][0], subprotocols=[f"viser-v{version('viser')}"]):
         drawn_until(view, lambda: shown.cloud.filter == wanted)
     assert shown.choices == choices
-    shown.choose([("colour", "nothing"), ("cut", "high"), ("only", "z,1"), ("only", "w,1,2")])
+    shown.choose(
+        [
+            ("colour", "nothing"),
+            ("cut", "high"),
+            ("time", "nan"),
+            ("only", "z,1"),
+            ("only", "w,1,2"),
+        ]
+    )
     assert shown.choices == [entry for entry in choices if entry[0] != "only"]
+
+
+def test_columns_of_one_value_or_none_can_be_filtered_by(tmp_path, page):
+    """Far from zero, where a slider has few digits left."""
+    rows = np.zeros(20, [*((a, "<f8") for a in "xyz"), ("nothing", "<f4"), ("big", "<f8")])
+    rows["x"], rows["nothing"], rows["big"] = 5e6, np.nan, 1e18
+    lines = [*(f"property double {a}" for a in "xyz"), "property float nothing"]
+    head = ["ply", "format binary_little_endian 1.0", "element vertex 20", *lines]
+    head += ["property double big", "end_header", ""]
+    (tmp_path / "one.ply").write_bytes("\n".join(head).encode() + rows.tobytes())
+    view = ResultView(page, CloudFile(tmp_path / "one.ply"))
+    for name in ("x", "y", "nothing", "big"):
+        view._view.cloud._filter_by.value = name
+        view.draw()
+        assert view._view.cloud._input.min < view._view.cloud._input.max
+        assert not view._view.cloud.filter.limits

@@ -162,7 +162,8 @@ class CloudView:
             return gui.add_dropdown("only", ("all", *labels), initial_value=chosen)
         unit = _NS if column.unit == "ns" else 1.0
         low, high = (values.min() / unit, values.max() / unit) if len(values) else (0.0, 1.0)
-        step = 10.0 ** math.floor(math.log10(max(high - low, 1e-6) / 500))
+        span = max(high - low, 1e-6 * abs(high), 1e-6)  # digits that a slider can tell
+        step = 10.0 ** math.floor(math.log10(span / 500))
         step = max(step, 1.0) if values.dtype.kind in "iu" and unit == 1.0 else step
         first, last = (
             round(step * end, 9) for end in (math.floor(low / step), math.ceil(high / step))

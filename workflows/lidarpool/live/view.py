@@ -367,7 +367,7 @@ class View:
                 if name in menus and value in menus[name].options:
                     menus[name].value = value
                 elif (slider := sliders.get(name)) is not None:
-                    slider.value = float(np.clip(float(value), slider.min, slider.max))
+                    slider.value = min(max(slider.min, float(value)), slider.max)
                 elif name == "only":
                     column, low, high = value.split(",")
                     if column in self.cloud.filtered:
