@@ -453,6 +453,20 @@ def serve_no_longer(scheduler: Any, kind: type[web.Application]) -> None:
     pages[:] = [page for page in pages if not isinstance(page, kind)]
 
 
+def link_from_dashboard(scheduler: Any, page: str, shown: bool) -> None:
+    """List a page in the menu of Dask's own pages, or not; nothing where there is no such menu.
+
+    All of them are made by partial functions that share one dictionary for their template.
+    """
+    for application in scheduler.http_application.applications:
+        for context in getattr(application, "_applications", {}).values():
+            make = getattr(context.application.handlers[0], "_func", None)
+            menus = (one for one in getattr(make, "args", ()) if isinstance(one, dict))
+            pages = next(menus, {}).get("pages", [])
+            if (page in pages) != shown:
+                (pages.append if shown else pages.remove)(page)
+
+
 # -- clients -----------------------------------------------------------------------------
 
 

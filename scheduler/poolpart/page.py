@@ -15,7 +15,7 @@ from tornado import web
 
 from .errors import PoolError
 from .fence import fences_of
-from .internals import depth_of, serve, serve_no_longer
+from .internals import depth_of, link_from_dashboard, serve, serve_no_longer
 from .pipe import pipes_of
 from .stats import NAME as STATISTICS
 from .stats import forget_statistics, running_on, slots_of, statistics_of, told
@@ -182,6 +182,7 @@ async def _open(owner: str, stay: bool, dask_scheduler: Any = None) -> None:
         # A `dask scheduler --dashboard-prefix` is part of the path.
         handlers = [(r"(?:/.*)?/" + PATH, _Handler, {"scheduler": dask_scheduler})]
         serve(dask_scheduler, PageApplication(handlers))
+        link_from_dashboard(dask_scheduler, PATH, True)
     dask_scheduler.plugins[NAME].owners.add(None if stay else owner)
     statistics_of(dask_scheduler)
 
@@ -195,4 +196,5 @@ def close_page(scheduler: Any) -> None:
     """Stop serving the page."""
     if NAME in scheduler.plugins:
         serve_no_longer(scheduler, PageApplication)
+        link_from_dashboard(scheduler, PATH, False)
         scheduler.remove_plugin(NAME)

@@ -83,6 +83,16 @@ def test_it_is_served_and_taken_away(client):
     assert applications == before
 
 
+def test_pages_of_dask_link_to_it_for_as_long_as_it_is_there(client):
+    url = Pool.from_client(client).page()
+    status, _, text = get(url.replace("partitions", "status"))
+    linked = '<a href="partitions">Partitions</a>'
+    assert (linked in text) == (status == 200)  # without a dashboard there are no such pages
+    assert text.count("Partitions</a>") <= 1
+    Pool.from_client(client).dissolve()
+    assert linked not in get(url.replace("partitions", "status"))[2]
+
+
 def test_what_it_tells(client, wait_until):
     pool = Pool.from_client(client)
     url = pool.page()
