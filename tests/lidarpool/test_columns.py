@@ -39,10 +39,10 @@ def test_columns_are_chosen_by_name_once_and_in_order():
     [
         (["intensty"], r"no column 'intensty'.*'intensity'"),
         (["reflectance of the surface"], r"There are .*intensity.*"),
-        ([Column("time", "u4", "s", "another")], "Two columns are called 'time': rename one"),
-        ([Column("a", "u1", "", ""), Column("a", "u2", "", "")], "Two columns are called 'a'"),
-        ([Column("ring", "u1", "", "")], "Two columns are called 'ring'"),
-        ([Column("a", "u1", "", "", file_name="x")], "Two columns are called 'x'"),
+        ([Column("time", "u4", "s", "another")], "Two columns have the name 'time': rename one"),
+        ([Column("a", "u1", "", ""), Column("a", "u2", "", "")], "Two columns have the name 'a'"),
+        ([Column("ring", "u1", "", "")], "Two columns have the name 'ring'"),
+        ([Column("a", "u1", "", "", file_name="x")], "Two columns have the name 'x'"),
     ],
 )
 def test_columns_that_cannot_be_chosen(columns, message):
@@ -52,23 +52,23 @@ def test_columns_that_cannot_be_chosen(columns, message):
 
 @pytest.mark.parametrize("name", ["", "a b", "1st", "a-b", "../x"])
 def test_a_column_is_called_by_an_identifier(name):
-    with pytest.raises(LidarpoolError, match=f"cannot be called '{name}': use an identifier"):
+    with pytest.raises(LidarpoolError, match=f"cannot have the name '{name}': use an identifier"):
         Column(name, "u1", "", "")
 
 
 @pytest.mark.parametrize("name", ["a b", "a\nb", "höhe", "positions", "normals", "colors", "x"])
 def test_a_column_that_files_cannot_hold_is_neither_chosen_nor_written(name, tmp_path):
     column = Column("a", "u1", "", "", file_name=name)
-    with pytest.raises(LidarpoolError, match=r"called .* in files.*: (use|rename)"):
+    with pytest.raises(LidarpoolError, match=r"name .* in files.*: (use|rename)"):
         chosen([column])
-    with pytest.raises(LidarpoolError, match=r"called .* in files.*: (use|rename)"):
+    with pytest.raises(LidarpoolError, match=r"name .* in files.*: (use|rename)"):
         save_cloud(tmp_path / "c.ply", Cloud(np.zeros((1, 3)), {"a": [1]}, (column,)))
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("dtype", ["float23", "U5", "O", "bool", "M8[s]", "complex64", "3f4"])
 def test_a_column_holds_numbers(dtype):
-    with pytest.raises(LidarpoolError, match="give one of whole or real numbers"):
+    with pytest.raises(LidarpoolError, match="give a type of whole or real numbers"):
         Column("a", dtype, "", "")
 
 
@@ -155,7 +155,7 @@ def test_a_column_of_ones_own_is_held_to_its_description():
         (np.zeros(3), {}, r"not \(3,\)"),
         ([[np.nan, 0, 0]], {}, "NaN or infinite"),
         (np.full((1, 3), np.inf, np.float32), {}, "NaN or infinite"),
-        (np.zeros((2, 3)), {"scan": [1]}, r"'scan' has the shape \(1,\) and there are 2 points"),
+        (np.zeros((2, 3)), {"scan": [1]}, r"'scan' has the shape \(1,\), but there are 2 points"),
         (np.zeros((2, 3)), {"scan": [[1, 2]]}, r"shape \(1, 2\)"),
         (np.zeros((1, 3)), {"channel": [65_536]}, "channel holds 65536 to 65536.* 0 to 65535"),
         (np.zeros((1, 3)), {"scan": [2**31]}, "scan holds 2147483648"),

@@ -180,8 +180,8 @@ AMPLE = "".join(
         ),
         ({"here": f"<skew>45 1 0 0 0 1 0</skew>{HERE}"}, "by <skew>"),
         ({"here": f"<scale>nan 1 1</scale>{HERE}"}, "by a matrix that is none"),
-        ({"primitive": f"<triangles>{V}<p>0 1 9</p></triangles>"}, "name vertices 0 to 9"),
-        ({"primitive": f"<triangles>{V}<p>0 1 -1</p></triangles>"}, "name vertices -1 to 1"),
+        ({"primitive": f"<triangles>{V}<p>0 1 9</p></triangles>"}, "refer to vertices 0 to 9"),
+        ({"primitive": f"<triangles>{V}<p>0 1 -1</p></triangles>"}, "refer to vertices -1 to 1"),
         (
             {"primitive": PARTS["primitive"].replace("<vcount>4", "<vcount>5")},
             "polygons of 5 corners, 4 are there",

@@ -97,9 +97,9 @@ def test_a_node_scaled_to_nothing_is_skipped_and_said(tmp_path, caplog):
     header["scenes"][0]["nodes"] = [0, 1]
     path = write(tmp_path / "m.glb", glb(header, CORNERS))
     assert [mesh.name for mesh in load_meshes(path)] == ["Sign"]
-    assert "scales Hidden to nothing: left out" in caplog.text
+    assert "scales Hidden to zero: left out" in caplog.text
     header["scenes"][0]["nodes"] = [1]
-    with pytest.raises(LidarpoolError, match="no triangles that are not scaled to nothing"):
+    with pytest.raises(LidarpoolError, match="no triangles that are not scaled to zero"):
         load(tmp_path, header)
 
 
@@ -174,11 +174,14 @@ def weigh(header, where):
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
-        (lambda h: h.update(asset={"version": "1.0"}), "is glTF 1.0, which is not read: convert"),
+        (
+            lambda h: h.update(asset={"version": "1.0"}),
+            "is glTF 1.0, which is not supported: convert",
+        ),
         (lambda h: h.update(nodes={"root": {}}), "is glTF 1.0"),
         (lambda h: h.update(extensionsRequired=["EXT_meshopt_compression"]), "needs EXT_meshopt"),
-        (lambda h: weigh(h, "nodes"), "morph targets in effect"),
-        (lambda h: weigh(h, "meshes"), "morph targets in effect"),
+        (lambda h: weigh(h, "nodes"), "active morph targets"),
+        (lambda h: weigh(h, "meshes"), "active morph targets"),
         (lambda h: h["nodes"][0].update(skin=0), "skeleton"),
         (
             lambda h: h["nodes"][0].update(extensions={"EXT_mesh_gpu_instancing": {}}),

@@ -325,7 +325,7 @@ def test_what_is_left_out_of_a_scene_is_in_the_advice(scenario, tmp_path):
     read = scenario("scene: m.glb")
     scene = read.build_scene()
     assert scene.names == ("N1",)
-    assert "m.glb scales N0 to nothing: left out" in read.advice(scene)[0]
+    assert "m.glb scales N0 to zero: left out" in read.advice(scene)[0]
 
 
 YAML_VALUES = st.recursive(

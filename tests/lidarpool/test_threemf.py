@@ -118,9 +118,9 @@ AMPLE = "".join(
 @pytest.mark.parametrize(
     ("parts", "message"),
     [
-        ({"more": 'requiredextensions="b"'}, "needs .*beamlattice/2017/02, which is not read"),
+        ({"more": 'requiredextensions="b"'}, "needs .*beamlattice/2017/02, which is not supported"),
         ({"beams": "<b:beamlattice/>"}, "has a <beamlattice>"),
-        ({"items": '<item objectid="9"/>'}, "object '9' is placed and is not there"),
+        ({"items": '<item objectid="9"/>'}, "object '9' is placed, but missing"),
         ({"items": '<item objectid="1" transform="1 0 0"/>'}, "broken"),
         ({"unit": 'unit="parsec"'}, "parsec"),
         ({"x": "nan"}, "NaN"),

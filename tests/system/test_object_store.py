@@ -190,7 +190,7 @@ def test_a_result_goes_to_the_bucket(cluster, lidarpool, tmp_path, environment):
     ("url", "words"),
     [
         ("s3://nobody/x", "make the bucket first"),
-        ("s3://a:b@surveys/x", "holds a password: leave that out"),
+        ("s3://a:b@surveys/x", "has a password: leave it out"),
         ("s9://surveys/x", "Protocol not known: s9"),
     ],
 )
@@ -216,7 +216,7 @@ def test_without_credentials_or_rights(lidarpool, environment, monkeypatch, tmp_
     fsspec.filesystem("s3").clear_instance_cache()
     refused = lidarpool("demo", "--out", f"{BUCKET}/x")
     fsspec.filesystem("s3").clear_instance_cache()
-    assert refused.code == 2 and "look at the credentials and rights" in refused.err
+    assert refused.code == 2 and "check the credentials and rights" in refused.err
     assert len(refused.err.splitlines()) == 1
 
 

@@ -1,4 +1,4 @@
-"""The cloud: what a survey is for."""
+"""The point cloud."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from ..base.errors import LidarpoolError
 from ..base.open3d_module import load_open3d
 from .table import TABLE, Column
 
-CHUNK_POINTS = 1_000_000  # in memory at a time where a cloud is read in order
+CHUNK_POINTS = 1_000_000  # points in memory at a time while a cloud is read in order
 
 
 class CloudLike(Protocol):
-    """A cloud in memory or in parts, to be read in order, a piece at a time."""
+    """A cloud in memory or in parts, which is read in order, a piece at a time."""
 
     def __len__(self) -> int: ...
 
@@ -33,13 +33,13 @@ class CloudLike(Protocol):
         """The columns beside the positions, in the order of files."""
 
     def chunks(self, points: int = CHUNK_POINTS) -> Iterator[Cloud]:
-        """Give the points in order, at most so many at a time."""
+        """Yield the points in order, at most so many at a time."""
 
 
 class Savable:
-    """What clouds in memory and in parts share: they can be saved."""
+    """Common base of clouds in memory and in parts: `save`."""
 
-    # Gives the `lidarpool.export.sweeps.Sweeps` of the survey; None where nobody knows them.
+    # Returns the `lidarpool.export.sweeps.Sweeps` of the survey; None if unknown.
     sweeps: Callable[[], Any] | None
 
     @checked
@@ -47,11 +47,11 @@ class Savable:
         self,
         path: str | Path,
         *,
-        format: str | None = None,  # noqa: A002 - as scenarios and the command call it
+        format: str | None = None,  # noqa: A002 - its name in scenarios and in the command
         layout: str = "velodyne",
         precision_m: float | None = None,
     ) -> list[str]:
-        """Write the points in the format that the path ends in, whole or not at all.
+        """Write the points in the format of the path's ending, completely or not at all.
 
         The same points give the same bytes. About a million points are in memory at a time, or
         those of the largest sweep.
@@ -60,14 +60,14 @@ class Savable:
         ----------
         path
             Its ending is .ply, .las, .laz, .e57, .mcap or .parquet, unless there is a `format`.
-            The folder it goes to must exist. A file that is there is replaced, a folder is not.
+            Its folder must exist. An existing file is replaced, a folder is not.
         format
             Such as "laz", and for folders of many files "parquet", "pcd", "kitti", "nuscenes" or
             "rosbag2".
         layout
-            Of the points of mcap and rosbag2: velodyne, autoware or ouster.
+            Layout of points in mcap and rosbag2: velodyne, autoware or ouster.
         precision_m
-            Metres that positions are kept to; by default as they were rounded, else 0.001.
+            Step of stored positions, metres; by default that of the survey, else 0.001.
 
         Returns
         -------
@@ -76,11 +76,10 @@ class Savable:
         Raises
         ------
         LidarpoolError
-            If there is no such format, a column or package is missing that it needs, the cloud
-            is not of a result and the format stores single sweeps, or it cannot be written.
+            If there is no such format, it lacks a column or package, it stores single sweeps and
+            the cloud is not of a result, or the file cannot be written.
         """
-        # Formats are in a room above this one, which does not import it: it is found by name, as
-        # they are.
+        # Formats are in a room above this one, which must not import it: find it by name.
         save = import_module("lidarpool.export.formats").save
         left_out: list[str] = save(Path(path), self, format, layout, precision_m)
         return left_out
@@ -91,18 +90,18 @@ class Savable:
 class Cloud(Savable):
     """Points of a survey, ordered by scan and ray.
 
-    A column is read as ``cloud["channel"]``, and ``cloud.scan`` will do where a name is free.
+    Read a column as ``cloud["channel"]``, or as ``cloud.scan`` unless an attribute has its name.
 
     Parameters
     ----------
     positions
         float32 or float64 (n, 3), metres, world coordinates.
     columns
-        {name: (n,)}: the other columns, of `lidarpool.columns.table` or one's own.
+        {name: (n,)}: the other columns, of `lidarpool.columns.table` or your own.
     own
         Descriptions of the columns that are not in the table.
     sweeps
-        Gives the sweeps of the survey to `save`; clouds of a `Result` have it.
+        Returns the sweeps of the survey for `save`; clouds of a `Result` have it.
 
     Raises
     ------
@@ -122,15 +121,15 @@ class Cloud(Savable):
         if positions.ndim != 2 or positions.shape[1:] != (3,):
             raise LidarpoolError(f"A cloud needs positions of (n, 3), not {positions.shape}.")
         if not np.isfinite(positions).all():
-            raise LidarpoolError("A point of the cloud is NaN or infinite; it cannot be kept.")
+            raise LidarpoolError("A point of the cloud is NaN or infinite; it cannot be stored.")
         known = TABLE | {column.name: column for column in self.own}
         columns = {}
         for name, values in self.columns.items():
             array = np.asarray(values)
             if array.shape != (len(positions),):
                 raise LidarpoolError(
-                    f"Column {name!r} has the shape {array.shape} and there are {len(positions)} "
-                    "points: give one value a point."
+                    f"Column {name!r} has the shape {array.shape}, but there are {len(positions)} "
+                    "points: give one value for each point."
                 )
             columns[name] = _fitting(known[name], array) if name in known else array
         object.__setattr__(self, "positions", positions)
@@ -157,7 +156,7 @@ class Cloud(Savable):
         raise AttributeError(f"a cloud has no attribute or column {name!r}")
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"sweeps": None}  # the scene would go along
+        return self.__dict__ | {"sweeps": None}  # the scene would be pickled as well
 
     @property
     def table(self) -> tuple[Column, ...]:
@@ -192,18 +191,18 @@ class Cloud(Savable):
         return cloud
 
     def part(self, rows: slice | NDArray[np.integer]) -> Cloud:
-        """Return some of the points; consecutive ones as views."""
+        """Select points; consecutive ones as views."""
         columns = {name: array[rows] for name, array in self.columns.items()}
         return Cloud(self.positions[rows], columns, self.own, self.sweeps)
 
     def chunks(self, points: int = CHUNK_POINTS) -> Iterator[Cloud]:
-        """Give the points in order, at most so many at a time, as views."""
+        """Yield the points in order, at most so many at a time, as views."""
         for first in range(0, len(self), points):
             yield self.part(slice(first, first + points))
 
     @classmethod
     def joined(cls, parts: list[Cloud]) -> Cloud:
-        """Put clouds of the same columns one behind the other; at least one must be given."""
+        """Concatenate clouds of the same columns; at least one."""
         first = parts[0]
         if len(parts) == 1:
             return first
@@ -216,13 +215,13 @@ class Cloud(Savable):
 
 
 def described(cloud: CloudLike) -> str:
-    """Say how many points a cloud has, and what its columns are called."""
+    """Describe a cloud by its number of points and its columns."""
     names = ", ".join(("x", "y", "z", *(column.name for column in cloud.table)))
     return f"<{type(cloud).__name__} of {len(cloud):,} points: {names}>"
 
 
 def _fitting(column: Column, values: ArrayLike) -> NDArray[Any]:
-    """`values` in the column's type; LidarpoolError where a plain cast would wrap around."""
+    """Convert `values` to the column's type; LidarpoolError if a cast would wrap around."""
     given, wanted = np.asarray(values), np.dtype(column.dtype)
     cast = given.astype(wanted, copy=False)
     if cast is not given and wanted.kind in "iu" and not np.array_equal(cast, given):

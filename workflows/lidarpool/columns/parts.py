@@ -1,10 +1,10 @@
 """Parts: the columns of some consecutive scans as one file.
 
 A part is a NumPy archive without compression (``numpy.load`` opens it): an array for each column,
-rows in (scan, ray) order, and three more: `.scans`, first scan and one past the last; `.counts`,
-rows of each scan; and the tally of hits by triangle, `.triangles` and `.hits`, of all hits and not
-only those that were kept. `x`, `y` and `z` are whole multiples of the precision from the scene's
-local origin, so that rounding once is rounding for good.
+rows in (scan, ray) order, and more: `.scans`, first scan and one past the last; `.counts`, rows of
+each scan; and the hits of each triangle, `.triangles` and `.hits`, including hits that were not
+kept. `x`, `y` and `z` are whole multiples of the precision from the scene's local origin, so that
+they are rounded only once.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class PartColumns:
     columns
         {name: (rows,)}: the columns, positions as cells.
     triangles, hits
-        int32 (k,), int64 (k,): triangles that were hit, and how often, by all hits.
+        int32 (k,), int64 (k,): triangles that were hit, and all their hits.
     """
 
     first: int
@@ -60,7 +60,7 @@ class PartColumns:
 
     @property
     def cells(self) -> NDArray[np.int64] | None:
-        """Lowest and highest cell, (2, 3); None where there are no rows."""
+        """Lowest and highest cell, (2, 3); None without rows."""
         if not len(self):
             return None
         axes = [self.columns[axis.name] for axis in AXES]
@@ -73,7 +73,7 @@ class PartColumns:
 
 
 def pack(part: PartColumns) -> bytearray:
-    """Write a part down: the same content gives the same bytes."""
+    """Encode a part: the same content gives the same bytes."""
     arrays = {
         ".scans": np.array([part.first, part.stop], np.int64),
         ".counts": part.counts,
@@ -82,7 +82,7 @@ def pack(part: PartColumns) -> bytearray:
         **part.columns,
     }
     memory = io.BytesIO()
-    # NumPy's own savez sets the time of each file, and copies the content once more.
+    # NumPy's savez stores the time of each file, and copies the content once more.
     with zipfile.ZipFile(memory, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
         for name, array in arrays.items():
             head = io.BytesIO()
@@ -102,12 +102,12 @@ def unpack(data: bytes) -> PartColumns:
     Raises
     ------
     LidarpoolError
-        If it is no part or damaged; the message is a clause.
+        If it is not a part, or damaged; the message is a clause.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             names = archive.namelist()
-            # A damaged entry of the list of files may hide those behind it.
+            # A damaged entry of the file list may hide later ones.
             if len(names) != int.from_bytes(data[-12:-10], "little"):
                 raise ValueError(f"{len(names)} arrays")
             arrays = {name.removesuffix(".npy"): _read_array(archive, name) for name in names}
@@ -132,7 +132,7 @@ def unpack(data: bytes) -> PartColumns:
 
 
 def _read_array(archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
-    """Read an array to its end: only there are checksums compared."""
+    """Read an array to its end, where its checksum is compared."""
     with archive.open(name) as file:
         array: NDArray[Any] = np.lib.format.read_array(file, allow_pickle=False)
         if file.read(1):
@@ -146,7 +146,7 @@ def read_part(storage: Storage, name: str) -> PartColumns:
     Raises
     ------
     LidarpoolError
-        If it is not there, cannot be read or is damaged.
+        If it is missing, cannot be read or is damaged.
     """
     try:
         return unpack(storage.read(name))
@@ -162,7 +162,7 @@ def read_part(storage: Storage, name: str) -> PartColumns:
 
 
 def read_tally(storage: Storage, name: str) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """Read which triangles the hits of a part fell on, and how often; the rest stays on disk.
+    """Read the hits of each triangle of a part, and nothing else.
 
     Raises
     ------
@@ -183,26 +183,26 @@ def read_tally(storage: Storage, name: str) -> tuple[NDArray[np.int32], NDArray[
 
 
 class StoredCloud(Savable):
-    """The points of parts in (scan, ray) order, read as many at a time as wanted; a `CloudLike`.
+    """The points of parts in (scan, ray) order, read in pieces; a `CloudLike`.
 
     Parameters
     ----------
     storage
-        Where the parts are.
+        Place of the parts.
     names, rows
-        Names of the parts in scan order, and how many points each has.
+        Names of the parts in scan order, and their numbers of points.
     columns
-        What a part holds.
+        Columns of a part.
     cells
-        Lowest and highest cell of all points, (2, 3); None where there are no points.
+        Lowest and highest cell of all points, (2, 3); None without points.
     precision_m
         Size of the cells that positions were rounded to.
     origin
         World position of the scene's local origin, (3,), metres.
     keeper
-        Whatever has to live as long as the parts are to be read.
+        Object to keep alive while the parts can be read.
     sweeps
-        Gives the sweeps of the survey to `save`.
+        Returns the sweeps of the survey for `save`.
     """
 
     def __init__(
@@ -282,7 +282,7 @@ class StoredCloud(Savable):
             yield Cloud.joined(held)
 
     def sample(self, most: int, parts: int) -> Cloud:
-        """Read at most so many points, evenly chosen, of at most so many parts."""
+        """Read at most so many evenly spaced points, of at most so many parts."""
         filled = [i for i, rows in enumerate(self.rows) if rows]
         opened = [filled[i] for i in one_of_each_part(len(filled), parts)]
         total = sum(self.rows[i] for i in opened)
@@ -297,7 +297,7 @@ class StoredCloud(Savable):
     def to_dask(self) -> Any:
         """Return a Dask DataFrame of all columns, a partition for each part.
 
-        Whoever computes it must see the parts, and the result must be kept until then.
+        The computing workers must see the parts, and the result must be kept until then.
         """
         import dask.dataframe as dd
 
@@ -328,6 +328,6 @@ def positions(
 ) -> NDArray[np.float64]:
     """World coordinates, (n, 3), of points in these cells, (n, 3)."""
     found = cells * precision_m + origin
-    # Multiplying leaves 0.07 at 0.07000000000000001; the nearest short decimal is meant.
+    # Multiplying gives 0.07000000000000001 for 0.07; take the nearest short decimal.
     digits = max(0, int(np.ceil(-np.log10(precision_m))) + 3)
     return np.round(found, digits, out=found)

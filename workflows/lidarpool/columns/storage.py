@@ -1,7 +1,7 @@
-"""Where runs and results are kept: in a folder, or whatever else fsspec opens.
+"""Storage of runs and results: a folder, or any place that fsspec opens.
 
-A file is there whole or not at all: in a folder it is written under a temporary name and renamed,
-and an object store shows an object when it has been put.
+Files appear completely or not at all: in a folder they are written under a temporary name and
+renamed, and an object store shows only complete objects.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ class Storage:
     Parameters
     ----------
     url
-        A folder's path, or a URL such as ``s3://bucket/folder``. Credentials come from where
-        the library of that kind of storage looks for them.
+        A folder's path, or a URL such as ``s3://bucket/folder``. The library of that kind of
+        storage finds the credentials.
     durable
-        Whether files must survive a power cut: waiting for a disk takes milliseconds a file, and
-        a folder that goes with the process can do without.
+        Whether files must survive a power failure: flushing takes milliseconds for each file, and
+        is not needed for a temporary folder.
     """
 
     url: str
@@ -56,8 +56,8 @@ class Storage:
             return cls(str(Path(text).absolute()), durable)
         if ":" in text.partition("://")[2].partition("/")[0].rpartition("@")[0]:
             raise LidarpoolError(
-                f"A URL for {text.partition(':')[0]} holds a password: leave that out, and give "
-                "it by the environment or the configuration of that storage's library."
+                f"A URL for {text.partition(':')[0]} has a password: leave it out, and give "
+                "it in the environment or the configuration of that storage's library."
             )
         return cls(text.rstrip("/"), durable)
 
@@ -66,7 +66,7 @@ class Storage:
 
     @property
     def is_local(self) -> bool:
-        """Whether it is a folder of a file system of this machine's."""
+        """Whether it is a folder in a local file system."""
         return not is_url(self.url)
 
     @cached_property
@@ -86,7 +86,7 @@ class Storage:
         return Storage, (self.url, self.durable)
 
     def path(self, name: str) -> str:
-        """Path or URL of a file, for people."""
+        """Path or URL of a file, for messages."""
         return f"{self.url}/{name}"
 
     def prepare(self) -> None:
@@ -102,12 +102,12 @@ class Storage:
             return
         with suppress(FileExistsError), _as_os_error():
             system, folder = self._remote
-            # An object store has no folders, and s3fs would make a bucket whose name is mistyped.
+            # An object store has no folders, and s3fs would make a bucket for a mistyped name.
             if folder.startswith("/"):
                 system.makedirs(folder, exist_ok=True)
 
     def claim(self) -> None:
-        """Make the folder, and see that files can be written there and removed.
+        """Make the folder, and check that files can be written and removed.
 
         Raises
         ------
@@ -125,12 +125,12 @@ class Storage:
             ) from error
         except OSError as error:
             raise LidarpoolError(
-                f"Cannot write to {self.url} ({error}): look at the credentials and rights that "
+                f"Cannot write to {self.url} ({error}): check the credentials and rights that "
                 "its library finds, and at its address."
             ) from error
 
     def write(self, name: str, data: Any) -> None:
-        """Write a file, whole or not at all, and be sure that it stays.
+        """Write a file, completely or not at all, and flush it if durable.
 
         Parameters
         ----------
@@ -207,19 +207,19 @@ class Storage:
             system.get_file(f"{folder}/{name}", str(path))
 
     def sees(self, name: str, data: bytes) -> bool:
-        """Whether a file is there with this content: whether this process sees the same place."""
+        """Whether a file has this content, so that this process sees the same place."""
         try:
             return self.read(name) == data
-        except Exception:  # whatever a storage or its missing library has to say
+        except Exception:  # any error of a storage or its missing library
             return False
 
     def sizes(self) -> dict[str, int]:
-        """Files and their sizes in bytes, whatever they are; none where there is no folder."""
+        """All files and their sizes in bytes; none without the folder."""
         if self.is_local:
             sizes: dict[str, int] = {}
             with suppress(FileNotFoundError), os.scandir(self.url) as entries:
                 for entry in entries:
-                    with suppress(FileNotFoundError):  # renamed or removed meanwhile
+                    with suppress(FileNotFoundError):  # just renamed or removed
                         if entry.is_file():
                             sizes[entry.name] = entry.stat().st_size
             return sizes
@@ -234,12 +234,12 @@ class Storage:
         }
 
     def remove(self, names: list[str]) -> None:
-        """Remove files; no error for those that are gone.
+        """Remove files; no error for missing ones.
 
         Raises
         ------
         OSError
-            If one is there and cannot be removed.
+            If a file cannot be removed.
         """
         for name in names:
             if self.is_local:
@@ -257,7 +257,7 @@ class Storage:
             return bool(system.exists(f"{folder}/{name}"))
 
     def discard(self, name: str) -> None:
-        """Remove a file or folder of the storage with all that is in it, if it is there.
+        """Remove a file or folder of the storage with its content, if it exists.
 
         Raises
         ------
@@ -270,7 +270,7 @@ class Storage:
             system.rm(f"{folder}/{name}", recursive=True)
 
     def remove_folder(self) -> None:
-        """Remove the folder where nothing is in it any more."""
+        """Remove the folder if it is empty."""
         if self.is_local:
             with suppress(OSError):
                 Path(self.url).rmdir()
@@ -278,7 +278,7 @@ class Storage:
 
 @contextmanager
 def _as_os_error() -> Iterator[None]:
-    """Raise an OSError for whatever a library of some storage raises."""
+    """Convert any error of a storage library to an OSError."""
     try:
         yield
     except (OSError, LidarpoolError):
@@ -288,7 +288,7 @@ def _as_os_error() -> Iterator[None]:
 
 
 def flush(path: Path) -> None:
-    """Wait until a file, or the names in a folder, are on the disk."""
+    """Flush a file, or the names in a folder, to the disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)

@@ -1,7 +1,7 @@
-"""The table of columns: everything that a point can have, and where it comes from.
+"""The table of columns: all quantities of points, and their sources.
 
 Sensors, stages, parts, exporters, viewer, colouring, report and documentation read this table;
-nothing else lists columns. A column of one's own is a `Column` in `Survey.columns`.
+nothing else lists columns. Your own columns are `Column` objects in `Survey.columns`.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from ..base.words import did_you_mean
 
 Kind = Literal["number", "label"]  # a colour scale, or one colour for each value
 
-COORDINATES = ("world", "sensor")  # that points may be in
-_OPEN3D = ("positions", "normals", "colors")  # which writes the files
+COORDINATES = ("world", "sensor")  # coordinate systems of points
+_OPEN3D = ("positions", "normals", "colors")  # Open3D, which writes the files
 
 
 @dataclass(frozen=True)
 @checked_fields
 class Column:
-    """One quantity that every point of a cloud has.
+    """One quantity of every point of a cloud.
 
     Parameters
     ----------
     name
-        A Python identifier; in files too, unless `file_name` says otherwise.
+        A Python identifier; also used in files, unless there is a `file_name`.
     dtype
         NumPy's name of the type of one value.
     unit
@@ -40,14 +40,14 @@ class Column:
         What it is, in a few words without a full stop.
     source
         Name of an attribute of the returns of a batch (`lidarpool.scan.returns.BatchReturns`),
-        or a function that makes the column from them: an array (n,), one value a point. It
-        runs on the worker that casts the rays. "" for columns that the cloud itself makes.
+        or a function that computes the column from them: an array (n,), one value for each
+        point. It runs on the worker that casts the rays. "" for columns made by the cloud.
     coordinates
-        Coordinate system of the values: "world", "sensor", or "" where there is none.
+        Coordinate system of the values: "world", "sensor", or "" for none.
     kind
         How it is shown: "number" on a colour scale, "label" with a colour for each value.
     file_name
-        Its name in files whose formats have a usual one.
+        Its usual name in files.
 
     Raises
     ------
@@ -66,14 +66,14 @@ class Column:
 
     def __post_init__(self) -> None:
         if not self.name.isidentifier():
-            raise LidarpoolError(f"A column cannot be called {self.name!r}: use an identifier.")
+            raise LidarpoolError(f"A column cannot have the name {self.name!r}: use an identifier.")
         try:
             known = np.dtype(self.dtype).kind in "iuf"
         except TypeError:
             known = False
         if not known:
             raise LidarpoolError(
-                f"Column {self.name!r} has the type {self.dtype!r}; give one of whole or real "
+                f"Column {self.name!r} has the type {self.dtype!r}; give a type of whole or real "
                 "numbers, such as uint8 or float32."
             )
 
@@ -88,7 +88,7 @@ class Column:
         Raises
         ------
         LidarpoolError
-            If its source gives another number of values, or such as the type cannot hold.
+            If its source gives another number of values, or values that the type cannot hold.
         """
         source = self.source
         values = np.asarray(source(returns) if callable(source) else getattr(returns, source))
@@ -110,7 +110,7 @@ class Column:
         return values.astype(wanted, copy=False)
 
 
-SCAN = Column("scan", "int32", "", "time step that the point comes from", kind="label")
+SCAN = Column("scan", "int32", "", "scan of the point: a time step at a pose", kind="label")
 X = Column("x", "int32", "m", "position along x, to the east on maps", "cell_x", "world")
 Y = Column("y", "int32", "m", "position along y, to the north on maps", "cell_y", "world")
 Z = Column("z", "int32", "m", "position along z, up", "cell_z", "world")
@@ -125,11 +125,11 @@ CHANNEL = Column(
 )
 OBJECT = Column("object", "int32", "", "object that was hit", "object", kind="label")
 
-AXES = (X, Y, Z)  # in a part, whole multiples of the precision from the scene's local origin
+AXES = (X, Y, Z)  # in a part: whole multiples of the precision from the scene's local origin
 ALWAYS = (*AXES, CHANNEL, OBJECT)  # the columns that every part holds; `scan` follows from its rows
 OPTIONAL = (
     Column("ray", "uint32", "", "number of the ray within its scan", "ray"),
-    Column("time", "int64", "ns", "when the ray was fired, from the survey's start", "time"),
+    Column("time", "int64", "ns", "time of the ray since the survey's start", "time"),
     Column("azimuth", "float32", "deg", "angle about the sensor's z axis", "azimuth", "sensor"),
     Column(
         "elevation", "float32", "deg", "angle above the sensor's xy plane", "elevation", "sensor"
@@ -153,7 +153,7 @@ OPTIONAL = (
         "return_number",
         "uint8",
         "",
-        "which reported return of its pulse, from 1",
+        "number among the reported returns of its pulse, from 1",
         "return_number",
         kind="label",
     ),
@@ -161,7 +161,7 @@ OPTIONAL = (
         "returns",
         "uint8",
         "",
-        "how many returns of its pulse are reported",
+        "number of reported returns of its pulse",
         "returns",
         kind="label",
     ),
@@ -169,7 +169,7 @@ OPTIONAL = (
         "class",
         "uint16",
         "",
-        "semantic class of the material; 0 if none is stated",
+        "semantic class of the material; 0 for none",
         "semantic_class",
         kind="label",
     ),
@@ -181,13 +181,12 @@ TABLE = {column.name: column for column in (SCAN, *ALWAYS, *OPTIONAL)}  # {name:
 
 
 def chosen(columns: Iterable[str | Column]) -> tuple[Column, ...]:
-    """Columns that are kept beside `ALWAYS`, each once, names looked up in `TABLE`.
+    """Columns in addition to `ALWAYS`, each once, with names looked up in `TABLE`.
 
     Raises
     ------
     LidarpoolError
-        If there is no column of a name, two are called the same, or one is called so that it
-        cannot be written.
+        If there is no column of a name, two have the same name, or a name cannot be written.
     """
     kept: dict[str, Column] = {}
     names = {column.in_files: column for column in TABLE.values()} | TABLE
@@ -203,7 +202,7 @@ def chosen(columns: Iterable[str | Column]) -> tuple[Column, ...]:
         if kept.get(column.name, column) != column or (
             column.name in TABLE and TABLE[column.name] != column
         ):
-            raise LidarpoolError(f"Two columns are called {column.name!r}: rename one.")
+            raise LidarpoolError(f"Two columns have the name {column.name!r}: rename one.")
         kept[column.name] = column
     rest = tuple(column for column in kept.values() if column not in (SCAN, *ALWAYS))
     check_names((SCAN, *ALWAYS, *rest))
@@ -211,23 +210,23 @@ def chosen(columns: Iterable[str | Column]) -> tuple[Column, ...]:
 
 
 def check_names(columns: Iterable[Column]) -> None:
-    """Check that columns can be told apart in files; LidarpoolError if not."""
+    """Check that columns have distinct names in files; LidarpoolError if not."""
     taken: set[str] = set()
     for name in (column.in_files for column in columns):
         if not name.isascii() or not name.isprintable() or " " in name:
             raise LidarpoolError(
-                f"A column cannot be called {name!r} in files: use ASCII letters and digits."
+                f"A column cannot have the name {name!r} in files: use ASCII letters and digits."
             )
         if name in _OPEN3D:
             raise LidarpoolError(
-                f"A column cannot be called {name!r} in files, where Open3D takes it for three "
-                "numbers a point: use another name."
+                f"A column cannot have the name {name!r} in files, where Open3D expects three "
+                "numbers for each point: use another name."
             )
         if name in taken:
-            raise LidarpoolError(f"Two columns are called {name!r} in files: rename one.")
+            raise LidarpoolError(f"Two columns have the name {name!r} in files: rename one.")
         taken.add(name)
 
 
 def stored(optional: Sequence[Column]) -> tuple[Column, ...]:
-    """All columns that a part holds, in the order in which they are stored."""
+    """All columns of a part, in their order in the file."""
     return (*ALWAYS, *optional)

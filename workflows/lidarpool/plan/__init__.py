@@ -1,4 +1,4 @@
-"""Path planning: particle swarms look for a short way around discs in the plane."""
+"""Path planning: particle swarms search for a short path around discs in the plane."""
 
 from .plan import Plan, best
 from .planning import Planning

@@ -1,4 +1,4 @@
-"""Coordinates in which every planning problem looks alike."""
+"""Normalised coordinates for planning."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from .geometry import Floats
 class PathAxes:
     """Axes in which the path starts at (-½, 0) and ends at (½, 0).
 
-    The swarm computes in single precision and with fixed distances; here neither georeferenced
-    coordinates nor the size of the scene matter. Made of + - x / and square roots only, which
-    IEEE 754 rounds in one way: the same numbers on every machine.
+    The swarm computes in single precision and with fixed distances; in these axes neither
+    georeferenced coordinates nor the size of the scene matter. Only + - x / and square roots are
+    used, whose rounding IEEE 754 defines: the same numbers on every machine.
 
     Parameters
     ----------
@@ -47,11 +47,11 @@ class PathAxes:
         return (np.array(self.start) + np.array(self.target)) / 2
 
     def to_local(self, points: Floats) -> Floats:
-        """Points of the plane, (p, 2), on these axes."""
+        """Convert points of the plane, (p, 2), to these axes."""
         (cos, sin), (x, y) = self._axis, (points - self._middle).T / self.unit_m
         return np.stack([cos * x + sin * y, cos * y - sin * x], axis=1)
 
     def to_plane(self, points: Floats) -> Floats:
-        """Points on these axes, (p, 2), in the plane."""
+        """Convert points on these axes, (p, 2), to the plane."""
         (cos, sin), (x, y) = self._axis, points.T * self.unit_m
         return np.stack([cos * x - sin * y, sin * x + cos * y], axis=1) + self._middle

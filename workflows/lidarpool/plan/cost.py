@@ -1,9 +1,9 @@
-"""What a path costs: its length, and a price on entering discs that no short cut is worth.
+"""Cost of a path: its length, and a penalty for entering discs that exceeds any short cut.
 
-Everything here is made to be evaluated hundreds of thousands of times a second by one thread:
-single precision, the particles along the last, contiguous axis, every result written into a
-buffer made beforehand. Only + - x / and square roots are used, and sums run over leading axes
-only, so that the order of additions is ours: the same numbers on every machine.
+It is evaluated hundreds of thousands of times a second by one thread: single precision, particles
+along the last, contiguous axis, results in preallocated buffers. Only + - x / and square roots are
+used, and sums run over leading axes only, which fixes the order of additions: the same numbers on
+every machine.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ Singles: TypeAlias = NDArray[np.float32]
 # Discs are made larger by this share of their distance and size: some 30 rounding errors of
 # single precision, so that a path which passes here also passes the exact check.
 _MARGIN = 4e-6
-_SLOPE = 8.0  # price of a depth of 1; a waypoint pushed 1 into a disc shortens the path by < 2
-_TOUCH = np.float32(1e-5)  # price below which an entry is a rounding error, well under _MARGIN
+_SLOPE = 8.0  # penalty of a depth of 1; a waypoint 1 inside a disc shortens the path by < 2
+_TOUCH = np.float32(1e-5)  # penalty below which an entry is a rounding error, well under _MARGIN
 _NOTHING = np.float32(1e-15)  # added to steps, so that one of length 0 has a direction too
-# Most elements of a buffer, to bound the memory. Smaller blocks, that stay in a second-level
-# cache, were slower: NumPy takes 0.7 µs to begin each of some 35 operations on a block.
+# Most elements of a buffer, to limit the memory. Smaller blocks, which fit a second-level cache,
+# were slower: NumPy takes 0.7 µs to start each of some 35 operations on a block.
 _BLOCK_ELEMENTS = 160_000
 
 
 class PathCost:
     """The cost of many paths between the same two ends, in the coordinates of `PathAxes`.
 
-    A path that enters no disc costs its length. One that does costs, on top, more than any
-    detour around all discs is long, and `_SLOPE` to twice that for each unit of depth in each
-    disc: it never beats a path that is free, and its way out leads downhill.
+    A path that enters no disc costs its length. A path that does also costs more than the longest
+    detour around all discs, and `_SLOPE` to twice that for each unit of depth in each disc: it
+    never beats a free path, and its cost falls on the way out.
 
     Parameters
     ----------
@@ -50,22 +50,22 @@ class PathCost:
     waypoints : float32 (waypoints, 2, particles)
         The paths, contiguous. Write to it, then call `evaluate`.
     entry_price : float
-        The fixed part of the price of entering discs.
+        The fixed part of the penalty for entering discs.
     """
 
     def __init__(self, centres: Floats, radii: Floats, waypoints: int, particles: int) -> None:
         self._points = np.zeros((waypoints + 2, 2, particles), np.float32)
         self._points[0, 0], self._points[-1, 0] = -0.5, 0.5
         self.waypoints: Singles = self._points[1:-1]
-        # The boundaries of all discs together are at least as long as any way around them.
+        # The boundaries of all discs together are at least as long as any path around them.
         self.entry_price = 2.0 + 2 * np.pi * float(radii.sum())
         self._cost = np.empty(particles, np.float32)
         pairs = len(radii) * (waypoints + 1) * particles
         blocks = min(particles, max(1, -(-pairs // _BLOCK_ELEMENTS)))  # rounded up
         ends = [particles * block // blocks for block in range(blocks + 1)]
         self._blocks = [slice(*span) for span in itertools.pairwise(ends)]
-        # One for each width, of which there are two at most: their loops run over whole,
-        # contiguous buffers, which is twice as fast as over parts of wider ones.
+        # One for each width, at most two: their loops run over whole, contiguous buffers, which is
+        # twice as fast as over parts of wider ones.
         self._workspaces = {
             width: _Workspace(centres, _grown(centres, radii), waypoints + 1, width)
             for width in {block.stop - block.start for block in self._blocks}
@@ -121,7 +121,7 @@ class _Workspace:
         self._price, self._entered = singles(width), np.empty(width, np.bool_)
 
     def evaluate(self, points: Singles, cost: Singles, entry_price: float) -> None:
-        """Write to `cost`, (width,), what the paths through `points`, (k + 2, 2, width), cost."""
+        """Write to `cost`, (width,), the costs of paths through `points`, (k + 2, 2, width)."""
         direction, products, length = self._direction, self._products, self._length
         first, last = points[:-1].transpose(1, 0, 2), points[1:].transpose(1, 0, 2)
         np.subtract(last, first, out=direction)
@@ -165,7 +165,7 @@ class _Workspace:
         np.minimum.reduce(along, axis=1, out=self._nearest)
 
     def _charge(self, cost: Singles, entry_price: float) -> None:
-        """Add to `cost` the price of entering discs, from `_nearest`."""
+        """Add to `cost` the penalty for entering discs, from `_nearest`."""
         nearest, price = self._nearest, self._price
         # (r² - d²) / r lies between the depth and twice the depth
         np.minimum(nearest, self._squared_radii, out=nearest)

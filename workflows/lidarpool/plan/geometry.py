@@ -26,7 +26,7 @@ def segment_distances(first: Floats, last: Floats, centres: Floats) -> Floats:
     squared = along[:, 0] ** 2 + along[:, 1] ** 2
     to_centre = centres[None, :, :] - first[:, None, :]
     reach = to_centre[..., 0] * along[:, None, 0] + to_centre[..., 1] * along[:, None, 1]
-    # A segment without length has reach 0: whatever it is divided by, its one point is closest.
+    # A segment of length 0 has reach 0: whatever the divisor, its one point is closest.
     share = np.clip(reach / np.where(squared > 0, squared, 1.0)[:, None], 0.0, 1.0)
     gap_x = to_centre[..., 0] - share * along[:, None, 0]
     gap_y = to_centre[..., 1] - share * along[:, None, 1]
@@ -36,15 +36,15 @@ def segment_distances(first: Floats, last: Floats, centres: Floats) -> Floats:
 def path_length(points: Floats) -> float:
     """Length of the path through `points`, (p, 2)."""
     steps = np.diff(points, axis=0)
-    # Not np.sum, whose order of additions is its own: the length is the same on any machine.
+    # Not np.sum, whose order of additions varies: the length is the same on any machine.
     return float(sum(np.sqrt(steps[:, 0] ** 2 + steps[:, 1] ** 2).tolist()))
 
 
 def clearance(points: Floats, centres: Floats, radii: Floats) -> float:
     """Least distance from the path through `points` to the edge of a disc.
 
-    Negative where the path enters a disc, by its greatest depth; 0 where it touches one;
-    inf where there are no discs.
+    Negative if the path enters a disc, by its greatest depth; 0 if it touches one; inf without
+    discs.
 
     Parameters
     ----------

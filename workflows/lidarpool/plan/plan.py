@@ -14,7 +14,7 @@ from .trial import Trial, with_ends
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """The best path that was found.
+    """The best path found.
 
     Parameters
     ----------
@@ -23,15 +23,15 @@ class Plan:
     length
         Its length in metres.
     shortest_possible
-        Length in metres of the shortest path there is, worked out from the discs' tangents;
-        inf where discs cut the target off.
+        Length in metres of the shortest path, computed from the discs' tangents; inf if discs cut
+        off the target.
     clearance
-        Least distance in metres from the path to a disc; negative where it enters one, inf
-        where there are no discs.
+        Least distance in metres from the path to a disc; negative if it enters one, inf without
+        discs.
     trial
         Number of the trial that found the path.
     trials
-        Trials it was chosen from.
+        Number of trials.
     """
 
     path: Floats
@@ -55,9 +55,9 @@ class Plan:
 def best(trials: Iterable[Trial], planning: Planning) -> Plan:
     """Choose the best path of `trials`: the shortest of those that enter no disc.
 
-    Each path is checked anew, segment by segment against each disc. Where none is free of
-    collisions, the one that enters discs least is the plan, and its `collision_free` is False.
-    The order of `trials` does not matter; of equally good ones the lowest number wins.
+    Each path is checked again, segment by segment against each disc. If none is free of
+    collisions, the one that enters discs least is chosen, with `collision_free` False. The order
+    of `trials` does not matter; of equal ones the lowest number wins.
 
     Raises
     ------

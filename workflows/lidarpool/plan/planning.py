@@ -1,4 +1,4 @@
-"""What is to be planned: two ends, the discs between them, and how hard to search."""
+"""A planning problem: two ends, the discs between them, and the effort of the search."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from .geometry import Floats, segment_distances
 
 @dataclass(frozen=True, eq=False)
 class Planning:
-    """A path to be found in the plane, from `start` to `target`, that enters no disc.
+    """Search for a path in the plane from `start` to `target` that enters no disc.
 
-    It is searched by `trials` particle swarms that know nothing of each other; see `run_trial`.
+    It uses `trials` independent particle swarms; see `run_trial`.
 
     Parameters
     ----------
@@ -30,14 +30,14 @@ class Planning:
     radii
         Their radii in metres, above 0: (m,), or one number for all.
     trials
-        Swarms to run, each with a seed of its own.
+        Swarms to run, each with its own seed.
     particles
         Particles of a swarm; each is one path.
     iterations
-        Times that the particles of a swarm move.
+        Moves of the particles of a swarm.
     waypoints
-        Corners of a path between its two ends. A path can turn about so many discs; more of
-        them cost time in proportion and converge more slowly.
+        Corners of a path between its two ends, so the number of discs that it can turn about. The
+        time is proportional to them, and more corners converge more slowly.
     seed
         0 or above. The same seed gives the same plan, to the bit, wherever the trials run.
 
@@ -109,7 +109,7 @@ def _point(name: str, value: ArrayLike) -> tuple[float, float]:
 
 
 def _checked(name: str, value: ArrayLike, fits: Callable[[Floats], bool], what: str) -> Floats:
-    """`value` as a new array of finite numbers that fits; an error that says what it must be."""
+    """Convert `value` to a new array of finite numbers; the error says what it must be."""
     try:
         numbers = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):

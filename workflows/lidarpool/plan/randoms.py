@@ -1,4 +1,4 @@
-"""Random numbers that cost next to nothing, and are the same wherever they are drawn."""
+"""Cheap random numbers that are the same on every machine."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-_PLACES = 1021  # that windows of a table start at, before the first comes again
+_PLACES = 1021  # starts of windows in a table, before they repeat
 
 
 class Randoms:
     """Single-precision random numbers from a seed.
 
-    NumPy keeps the raw output of its bit generators for ever the same, but not what its
-    `Generator` makes of it (NEP 19), so the last step is done here.
+    NumPy guarantees the raw output of its bit generators, but not that of its `Generator`
+    (NEP 19), so the last step is done here.
 
     Parameters
     ----------
@@ -54,10 +54,10 @@ class Randoms:
 class Windows:
     """A table of numbers, read through windows at random places.
 
-    Fresh random numbers for each move of a swarm would cost as much as all its other
-    arithmetic. Here they are drawn once, and a draw is a view of the table that starts
-    anywhere. Draws overlap, but a number serves another particle and coordinate in each.
-    After a thousand draws the places come again in the same order.
+    New random numbers for each move of a swarm would cost as much as all its other arithmetic.
+    So they are drawn once, and a draw is a view of the table from a random start. Draws
+    overlap, but a number serves another particle and coordinate in each. After a thousand
+    draws the starts repeat.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ class Windows:
     count
         Numbers in a window, fewer than in the table.
     randoms
-        What the places are drawn from.
+        Source of the starts.
     """
 
     def __init__(self, table: NDArray[np.float32], count: int, randoms: Randoms) -> None:

@@ -1,4 +1,4 @@
-"""A particle swarm: the arithmetic of moving, and of remembering what was best."""
+"""A particle swarm: moves particles, and records the best."""
 
 from __future__ import annotations
 
@@ -17,24 +17,23 @@ _TABLE_WINDOWS = 2  # length of the table of random numbers, in windows
 
 
 class Swarm:
-    """A bare-bones particle swarm (Kennedy 2003), in groups that know nothing of each other.
+    """A bare-bones particle swarm (Kennedy 2003), in independent groups.
 
-    A particle has no velocity. It jumps to a place drawn about the middle between the best it
-    has met itself and the best its group has met, with their distance in each coordinate as
-    the standard deviation: where both agree it searches closely, where they differ widely.
-    Against inertia and constriction (Shi and Eberhart 1998, Clerc and Kennedy 2002) it finds
-    paths as good, in scenes of 6 to 25 discs, with two thirds of the arithmetic.
+    A particle has no velocity. It jumps to a random position about the middle between its own
+    best and its group's best, with their distance in each coordinate as the standard deviation:
+    it searches closely where both agree, and widely where they differ. Compared with inertia and
+    constriction (Shi and Eberhart 1998, Clerc and Kennedy 2002) it finds equally good paths, in
+    scenes of 6 to 25 discs, with two thirds of the arithmetic.
 
-    Discs can be passed on either side, and a swarm with one common best settles early for one
-    choice of sides. Groups, that start spread more and less widely about the straight line,
-    settle for several.
+    Discs can be passed on either side, and a swarm with one common best settles early on one
+    choice of sides. Groups with different initial spreads settle on several.
 
     Parameters
     ----------
     paths
-        Where the particles live: its `waypoints` are their positions.
+        Its `waypoints` are the positions of the particles.
     widest
-        How far from the straight line the last group starts, in units of its length.
+        Initial spread of the last group about the straight line, in units of its length.
     randoms
         Source of random numbers.
 
@@ -62,10 +61,10 @@ class Swarm:
         self._leaders = np.empty((rows, self.groups), np.float32)
         self._leader_numbers = np.empty(self.groups, np.intp)
         self._group_starts = np.arange(self.groups) * (particles // self.groups)
-        # Where a particle lands on the way from its best, 0, to its leader's, 1.
+        # Position of a jump between the particle's best, 0, and its leader's, 1.
         table = randoms.normal(_TABLE_WINDOWS * rows * particles) + np.float32(0.5)
         self._shares = Windows(table, rows * particles, randoms)
-        # Other views of the same memory: one long axis is the quickest to go along.
+        # Other views of the same memory: one long axis is fastest.
         self._flat_at, self._flat_best = self._at.reshape(-1), self._best.reshape(-1)
         self._flat_jump = self._jump.reshape(-1)
         self._best_by_group = self._best.reshape(rows, self.groups, -1)
@@ -73,7 +72,7 @@ class Swarm:
         self._best_cost_by_group = self._best_cost.reshape(self.groups, -1)
 
     def step(self) -> None:
-        """Evaluate all particles, remember what is best, and jump."""
+        """Evaluate all particles, record the best, and jump."""
         self._remember(self.paths.evaluate())
         self._move()
 
@@ -84,8 +83,8 @@ class Swarm:
     def _remember(self, cost: Singles) -> None:
         np.less(cost, self._best_cost, out=self._better)  # 1.0 or 0.0
         np.minimum(cost, self._best_cost, out=self._best_cost)
-        # A product and a sum take half the time of a masked copy. The sum is what `_move` wrote
-        # to the position, so the best is exactly what was evaluated.
+        # A product and a sum take half the time of a masked copy. The sum equals the position from
+        # `_move`, so the best is exactly what was evaluated.
         np.multiply(self._jump, self._better, out=self._jump)
         np.add(self._flat_best, self._flat_jump, out=self._flat_best)
         leaders = self._best_cost_by_group.argmin(axis=1, out=self._leader_numbers)
@@ -100,7 +99,7 @@ class Swarm:
 
 
 def _group_count(particles: int) -> int:
-    """Return how many groups, all of one size, `particles` are divided into."""
+    """Return the number of equal groups that `particles` are divided into."""
     return max(
         groups
         for groups in range(1, _GROUPS + 1)
@@ -109,7 +108,7 @@ def _group_count(particles: int) -> int:
 
 
 def _spreads(groups: int, widest: float) -> NDArray[np.float64]:
-    """How far from the straight line each group starts: (groups,), closer at the narrow end."""
+    """Return each group's initial spread about the straight line: (groups,)."""
     widest = max(_LEAST_WIDEST, widest)
     if groups == 1:
         return np.array([widest])
@@ -120,9 +119,9 @@ def _spreads(groups: int, widest: float) -> NDArray[np.float64]:
 def _scattered(corners: int, particles: int, spreads: Floats, randoms: Randoms) -> Singles:
     """First positions: polylines about the straight line, (corners, 2, groups, size).
 
-    A group's paths turn at 1, 2, 3, … places, drawn up to its spread off the straight line, and
-    their corners lie evenly along them. Few turns make paths that lead between discs a simple
-    path rarely happens on when every corner is drawn by itself.
+    A group's paths turn at 1, 2, 3, … points, drawn within its spread about the straight line, and
+    their corners are evenly spaced. With few turns, paths lead between discs more often than with
+    independent corners.
     """
     groups = len(spreads)
     size = particles // groups

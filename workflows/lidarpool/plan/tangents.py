@@ -1,7 +1,7 @@
 """The shortest path around discs, exactly, through the graph of their tangents.
 
-A shortest path in the plane around discs is made of straight pieces that touch the discs they
-meet and of arcs along them (the string pulled taut). So it is a shortest path of the graph
+A shortest path in the plane around discs consists of straight pieces that touch discs and of arcs
+along them (a taut string). So it is a shortest path of the graph
 whose nodes are the points of contact of all common tangents, and whose edges are the tangents
 that no disc blocks and the arcs between neighbouring contacts: the tangent visibility graph of
 Pocchiola and Vegter (1996), here without their sweep, every tangent against every disc.
@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from .geometry import Floats, segment_distances
 
-# A tangent that comes this close to a disc, as a share of the scene's size, passes it. Three
-# discs with one common tangent are usual in drawn scenes, and rounding must not close them.
+# A tangent this close to a disc, as a share of the scene's size, passes it. Three discs with one
+# common tangent are usual in constructed scenes, and rounding must not close the path.
 _TOLERANCE = 1e-10
 _TANGENTS_AT_ONCE = 4096  # of a scene with many discs, to bound the memory of the check
 
@@ -49,7 +49,7 @@ def shortest_path_length(
 
     Returns
     -------
-    The length; inf where discs cut the target off from the start, or hold either of them.
+    The length; inf if discs separate target and start, or contain one of them.
 
     Notes
     -----

@@ -1,4 +1,4 @@
-"""Actors: objects that move while the scene stands still."""
+"""Actors: objects that move through the scene."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from .mesh import Mesh
 
 @dataclass(frozen=True, eq=False)
 class Actor:
-    """An object on a way of its own.
+    """A moving object.
 
     Parameters
     ----------
     mesh
         Its triangles in its own axes (x ahead, z up), and its name.
     trajectory
-        Where its axes are, in the scene's local coordinates; its one station begins with the
+        Poses of its axes, in the scene's local coordinates; its only station begins with the
         survey.
     """
 
@@ -30,17 +30,17 @@ class Actor:
 
     @property
     def name(self) -> str:
-        """What it is called."""
+        """Its name."""
         return self.mesh.name
 
     def placed(self, time_ns: float) -> Mesh:
-        """Its mesh where it is at a time, in the scene's local coordinates."""
+        """Its mesh at a time, in the scene's local coordinates."""
         positions, rotations = self.trajectory.poses(0, np.array([time_ns]))
         vertices = self.mesh.vertices if rotations is None else self.mesh.vertices @ rotations[0].T
         return Mesh(self.name, vertices + positions[0], self.mesh.faces)
 
     def check(self, duration_ns: float) -> None:
-        """Check that it is somewhere as long as a survey lasts; LidarpoolError if not."""
+        """Check that its trajectory covers a survey; LidarpoolError if not."""
         try:
             self.trajectory.poses(0, np.array([0.0, duration_ns]))
         except LidarpoolError as error:
@@ -52,7 +52,7 @@ class Actor:
 
 
 def one_mesh(name: str, meshes: Iterable[Mesh]) -> Mesh:
-    """Put meshes together to one object."""
+    """Join meshes to one object."""
     parts = list(meshes)
     firsts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     faces = [part.faces + first for part, first in zip(parts, firsts, strict=False)]

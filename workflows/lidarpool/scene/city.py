@@ -1,9 +1,8 @@
-"""A made-up city of any size: streets, houses, towers, trees, cars, lamps.
+"""A generated city of any size: streets, houses, towers, trees, cars, lamps.
 
 Streets run along x and y and two of them cross at (0, 0). Blocks between them are divided into
-lots, two rows back to back; the nearer to the centre, the more of them hold towers. Everything is
-made for all blocks at once, by arrays, so that ten million triangles are no more code and few
-more seconds than a thousand.
+lots, two rows back to back; lots near the centre have more towers. Everything is made for all
+blocks at once, by arrays, so that ten million triangles take a few seconds more than a thousand.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from .terrain import grid_faces
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
-# One row a thing: where it stands, how large; `block` is counted from the centre.
+# One row for each thing: position and size; `block` is counted from the centre.
 Things = NDArray[Any]
 
 LEAST_TRIANGLES = 1_000
@@ -40,16 +39,16 @@ _PARKS = 0.09  # share of the blocks
 
 
 def city(triangles: int = 100_000, seed: int = 0) -> Scene:
-    """Make a city of a number of triangles: more of them make a larger city, not a finer one.
+    """Make a city of a number of triangles: more triangles make it larger, not finer.
 
-    There is a crossing at (0, 0), where a sensor may stand. The ground, at z = 0, is an object,
-    the pavement of all blocks is one, and every building, tree, car and lamp is one of its own:
-    building-12, tree-7, counted from the centre.
+    There is a crossing at (0, 0), where a sensor may stand. The ground, at z = 0, is one object,
+    the pavement of all blocks another, and so is each building, tree, car and lamp: building-12,
+    tree-7, counted from the centre.
 
     Parameters
     ----------
     triangles
-        At least 1000. The scene has as many, less one in fifty at the most.
+        At least 1000. The scene has at most one in fifty fewer.
     seed
         The same seed and number give the same city.
 
@@ -80,7 +79,7 @@ def city(triangles: int = 100_000, seed: int = 0) -> Scene:
 
 
 def _things(kinds: dict[str, list[Solid]], sizes: Int, budget: int, seed: int) -> Things:
-    """As many things, from the centre outwards, as the budget of triangles allows."""
+    """Select things from the centre outwards, within the budget of triangles."""
     rings = 1
     while True:
         things = _City(kinds, rings, seed).things()
@@ -92,7 +91,7 @@ def _things(kinds: dict[str, list[Solid]], sizes: Int, budget: int, seed: int) -
 
 
 def _ground(things: Things, triangles: int) -> Solid:
-    """Flat ground under everything, of as many triangles as are left."""
+    """Flat ground under everything, of the remaining triangles."""
     blocks = things[things["owner"] == PAVEMENT]
     reach = (np.abs(blocks["place"]) + blocks["scale"] / 2).max(axis=0) + _MARGIN_M
     rows = max(1, int(np.sqrt(triangles / 2)))
@@ -104,7 +103,7 @@ def _ground(things: Things, triangles: int) -> Solid:
 
 
 def _scene(solids: list[Solid], things: Things, ground: Solid) -> Scene:
-    """Put copies of the solids where they belong."""
+    """Place copies of the solids."""
     points = np.array([len(solid.vertices) for solid in solids])[things["kind"]]
     sides = np.array([len(solid.faces) for solid in solids])[things["kind"]]
     first_point = len(ground.vertices) + np.cumsum(points) - points
@@ -148,7 +147,7 @@ def _names(things: Things) -> list[str]:
 
 
 class _City:
-    """Places for everything on and around ``(2 * rings) ** 2`` blocks.
+    """Positions of everything on and around ``(2 * rings) ** 2`` blocks.
 
     Parameters
     ----------
@@ -289,7 +288,7 @@ class _City:
     def _along_streets(
         self, owner: int, *, inwards: float, spacing: float, chance: float
     ) -> Things:
-        """Rows of one class along all four edges of each block, some places left empty."""
+        """Rows of one class along all four edges of each block, with gaps."""
         rng, n = self._rng, len(self._middle)
         block = np.tile(np.arange(n), 4)
         yaw = np.repeat(np.array([-0.5, 0.0, 0.5, 1.0]) * np.pi, n)  # outwards over the edge

@@ -1,4 +1,4 @@
-"""Things that a city is made of, one of each kind, put together from closed shapes."""
+"""The kinds of things in a city, built from closed shapes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .shapes import revolve
 
 
 class Solid(NamedTuple):
-    """Triangles in coordinates of their own, metres, standing on z = 0.
+    """Triangles in local coordinates, metres, standing on z = 0.
 
     `vertices` are float64 (v, 3), `faces` int64 (f, 3), counter-clockwise seen from outside.
     """
@@ -22,7 +22,7 @@ class Solid(NamedTuple):
     faces: NDArray[np.int64]
 
     def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Solid:
-        """Return it somewhere else."""
+        """Return a moved copy."""
         return Solid(self.vertices + np.array([x, y, z]), self.faces)
 
 
@@ -171,7 +171,7 @@ def _lamp() -> Solid:
 
 
 def joined(parts: Iterable[Solid]) -> Solid:
-    """Several solids as one; where they touch or overlap, each keeps its own surface."""
+    """Join solids; where they touch or overlap, each keeps its surface."""
     solids = list(parts)
     starts = np.cumsum([0] + [len(solid.vertices) for solid in solids[:-1]])
     return Solid(
@@ -181,7 +181,7 @@ def joined(parts: Iterable[Solid]) -> Solid:
 
 
 def loft(outline: ArrayLike, profile: Sequence[tuple[float, float]]) -> Solid:
-    """Raise an outline along z, drawn in or out on the way, and close it at both ends.
+    """Extrude an outline along z, with insets, and close it at both ends.
 
     `outline` (n, 2) is a polygon, counter-clockwise, all of which can be seen from its first
     point; `profile` has pairs of a height and an inset: how far the outline's sides move inwards
@@ -241,5 +241,5 @@ def gable(width: float, depth: float, eaves: float, rise: float, hip: float = 0.
 
 
 def lying(solid: Solid) -> Solid:
-    """Lay it down: what was up points along y, what was along y points up."""
+    """Lay it down: z becomes y, and y becomes z."""
     return Solid(solid.vertices[:, [0, 2, 1]], solid.faces[:, ::-1])

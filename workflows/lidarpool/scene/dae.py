@@ -1,11 +1,10 @@
 """COLLADA files, .dae, after its specification 1.4.1 by the Khronos Group (2008).
 
-Read here and not by pycollada, which drops what has a material, a skin or a morph that it does not
+This is not pycollada, which drops geometry with a material, a skin or a morph that it does not
 resolve, holes in polygons and offsets of accessors, refuses comments, pictures without paths and
-odd colours, and keeps single precision; nor by assimp 5.4, which of 661 public files refused twice
-as many, passes over geometries that are not there, keeps single precision, and ends the process
-where nodes contain each other. Only triangles are looked at: materials, pictures, lights, cameras
-and animations are not.
+odd colours, and keeps single precision; nor assimp 5.4, which refused twice as many of 661 public
+files, skips missing geometries, keeps single precision, and ends the process if nodes contain each
+other. Only triangles are read, not materials, pictures, lights, cameras and animations.
 """
 
 from __future__ import annotations
@@ -31,8 +30,8 @@ _SURFACES = ("triangles", "polylist", "polygons", "tristrips", "trifans")
 
 
 def read_dae(data: bytes, path: Path) -> Content:
-    """Read the scene that a file shows."""
-    # Comments are dropped, entities neither read from files nor expanded without end.
+    """Read the visual scene of a file."""
+    # Drop comments; read no entities from files, and limit their expansion.
     root = ElementTree.fromstring(data)
     for element in root.iter():
         element.tag = element.tag.rpartition("}")[2]
@@ -42,7 +41,7 @@ def read_dae(data: bytes, path: Path) -> Content:
     content = instances(document.roots(), document.node, path.stem)
     content.unit_m = _unit_m(root)
     axis = (root.findtext("asset/up_axis") or "").strip()
-    content.up_axis = axis[:1].lower() if axis in ("X_UP", "Z_UP") else "y"  # its standard's
+    content.up_axis = axis[:1].lower() if axis in ("X_UP", "Z_UP") else "y"  # by its standard
     return content
 
 
@@ -62,7 +61,7 @@ class _Document:
 
     def __init__(self, root: Element) -> None:
         self._root = root
-        # By kind, too: programs give a scene and a node in it the same id.
+        # By kind, too: some programs give a scene and a node in it the same id.
         self._ids: dict[tuple[str, str], Element] = {}
         for element in root.iter():
             self._ids.setdefault((element.tag, element.get("id", "")), element)
@@ -70,7 +69,7 @@ class _Document:
         self._points = cache(self._read_points)
 
     def roots(self) -> list[Element]:
-        """Visual scene that the file shows; the first where it does not say."""
+        """Visual scene of the file; by default the first."""
         shown = self._root.find("scene/instance_visual_scene")
         if shown is not None:
             return [self._target(shown, "visual_scene")]
@@ -89,13 +88,13 @@ class _Document:
                 geometries.append(self._target(child, "geometry"))
             elif child.tag == "instance_controller":
                 raise MeshFileError(
-                    f"moves vertices by a {self._controller(child)}, which is not followed: apply "
+                    f"moves vertices by a {self._controller(child)}, which is not supported: apply "
                     "it, then export"
                 )
             elif child.tag in _STEPS:
                 matrix = matrix @ _STEPS[child.tag](_numbers(child))
             elif child.tag == "skew":
-                raise MeshFileError("shears objects by <skew>, which is not followed: apply it")
+                raise MeshFileError("shears objects by <skew>, which is not supported: apply it")
         name = element.get("name", "") if element.tag == "node" else ""
         return Node(name, matrix, lambda: filter(None, map(self._geometry, geometries)), children)
 
@@ -158,7 +157,7 @@ class _Document:
                 f"{count:,} positions of {stride} numbers announced, {len(numbers):,} numbers there"
             )
         rows = numbers[offset : offset + count * stride].reshape(count, stride)
-        # A parameter without a name is to be passed over.
+        # Skip a parameter without a name.
         names = [parameter.get("name") for parameter in accessor.findall("param")]
         columns = [names.index(axis) for axis in "XYZ" if axis in names]
         return rows[:, columns if len(columns) == 3 else slice(3)]
@@ -203,7 +202,7 @@ def _translate(numbers: Float) -> Float:
 
 
 def _rotate(numbers: Float) -> Float:
-    """Turn about an axis (Rodrigues 1840), by degrees; about none, as some programs write."""
+    """Rotation about an axis (Rodrigues 1840), in degrees; some programs write no axis."""
     *axis, degrees = numbers
     length = np.linalg.norm(axis)
     out = np.eye(4)

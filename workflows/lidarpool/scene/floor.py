@@ -1,4 +1,4 @@
-"""What is below and above a place: the floor, on which a sensor stands, and the ceiling."""
+"""The floor under a position, where a sensor stands, and the ceiling over it."""
 
 from __future__ import annotations
 
@@ -7,28 +7,28 @@ from numpy.typing import NDArray
 
 from .scene import Scene
 
-# Thicker than floors are; what is thicker, such as a hall that is one box, one stands in.
+# More than the thickness of floors: a sensor stands inside thicker things, such as a box hall.
 SLAB_M = 0.5
-FURNITURE_M = 1.5  # what is lower above the floor is no ceiling
+FURNITURE_M = 1.5  # a ceiling is at least so high above the floor
 
 
 def room_at(scene: Scene, x: float, y: float) -> tuple[float, float]:
-    """Heights of the floor at a place, and of the ceiling over it.
+    """Heights of the floor at a position, and of the ceiling over it.
 
     Parameters
     ----------
     scene
-        What was read from mesh files.
+        The scene from mesh files.
     x, y
         World coordinates, metres.
 
     Returns
     -------
     floor
-        z in world metres: of the lowest triangle there if it faces up, as ground does, or of the
-        top of a slab that is the lowest thing there; else of the lowest point of the whole scene.
+        z in world metres: of the lowest triangle there if it faces up, like ground, or of the top
+        of a slab if that is lowest; else of the lowest point of the whole scene.
     ceiling
-        z of the lowest triangle that is higher over it than furniture; infinite if there is none.
+        z of the lowest triangle that is higher than furniture; infinite if there is none.
     """
     heights, up = _crossings(scene, np.array([x, y]) - scene.origin[:2])
     floor = scene.bounds[0, 2]

@@ -1,9 +1,8 @@
 """glTF 2.0 files, .glb and .gltf, after the specification by the Khronos Group (2021).
 
-Read here and not by trimesh, which keeps one of several instances of a node, refuses files
-without scenes and with sparse or normalised positions, and opens whatever files a .gltf names;
-nor by assimp, which passes over what it cannot read. Only triangles are looked at: materials and
-pictures are not.
+This is not trimesh, which keeps one of several instances of a node, refuses files without scenes
+and with sparse or normalised positions, and opens any file that a .gltf names; nor assimp, which
+skips what it cannot read. Only triangles are read, not materials and pictures.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from numpy.typing import NDArray
 from .mesh import Mesh
 from .nodes import Content, MeshFileError, Node, fanned, instances, joined, unrolled
 
-# Extensions that change looks, not shapes, or that are read here.
+# Extensions that do not change shapes, or that are supported here.
 _READ = re.compile(
     r"KHR_materials_|KHR_techni|\w+_texture_|KHR_texture|KHR_lights|KHR_mesh_quantization"
 )
@@ -35,9 +34,9 @@ _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
 
 def read_gltf(data: bytes, path: Path) -> Content:
-    """Read the default scene of a file, or all nodes where it has no scenes.
+    """Read the default scene of a file, or all nodes if it has no scenes.
 
-    Buffers that are files are read from beside `path` and below, and from nowhere else.
+    Buffer files are read only from the folder of `path` and below.
     """
     header, body = _chunks(data)
     _check(header)
@@ -70,12 +69,12 @@ def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
     return header, body
 
 
-_OLD = "is glTF 1.0, which is not read: convert it to glTF 2.0"
+_OLD = "is glTF 1.0, which is not supported: convert it to glTF 2.0"
 
 
 def _check(header: dict[str, Any]) -> None:
-    """Refuse other versions, and what moves vertices besides the places of their nodes."""
-    # Files of version 1.0 name their parts, instead of numbering them.
+    """Refuse other versions, and features that move vertices other than by nodes."""
+    # Version 1.0 names parts, instead of numbering them.
     if str(header.get("asset", {}).get("version", "2")).startswith("1") or isinstance(
         header.get("nodes"), dict
     ):
@@ -93,13 +92,13 @@ def _check(header: dict[str, Any]) -> None:
             )
         if "skin" in node:
             raise MeshFileError(
-                "moves vertices by a skeleton, which is not followed: apply the pose, then export"
+                "moves vertices by a skeleton, which is not supported: apply the pose, then export"
             )
         mesh = header["meshes"][node["mesh"]]
         morphs = any("targets" in primitive for primitive in mesh["primitives"])
         if morphs and any(node.get("weights", mesh.get("weights", ()))):
             raise MeshFileError(
-                "has morph targets in effect, which are not followed: apply them, then export"
+                "has active morph targets, which are not supported: apply them, then export"
             )
 
 
@@ -121,7 +120,7 @@ class _Reader:
         self._buffer = cache(self._read_buffer)
 
     def node(self, index: int) -> Node[int]:
-        """Node `index`; one without a name is called as its mesh."""
+        """Node `index`; without a name it gets that of its mesh."""
         found = self._header["nodes"][_natural(index)]
         name, children = str(found.get("name") or ""), found.get("children", ())
         if "mesh" not in found:
@@ -217,7 +216,7 @@ class _Reader:
 
 
 def _natural(number: Any) -> int:
-    """Check a count or an index; a negative one would be taken from the end."""
+    """Check a count or an index; a negative index would count from the end."""
     if type(number) is not int or number < 0:
         raise ValueError(f"{number!r} is given as an index or a count")
     return number
@@ -253,7 +252,7 @@ def _unpacked(data: bytes) -> tuple[NDArray[Any], NDArray[np.int64]]:
 
 
 def _beside(uri: str, path: Path) -> bytes:
-    """Read a buffer that is a file: names are escaped by the standard, by some programs not."""
+    """Read a buffer file: names are escaped by the standard, but not by all programs."""
     folder = path.parent.resolve()
     shown = repr(uri[:80])
     target = folder
@@ -271,6 +270,6 @@ def _beside(uri: str, path: Path) -> bytes:
         raise MeshFileError(
             f"takes data from {shown}, which is not there: put it beside, or export as .glb"
         )
-    if not target.is_file():  # a pipe would wait for ever
+    if not target.is_file():  # reading a pipe would wait for ever
         raise MeshFileError(f"takes data from {shown}, which is not a file")
     return target.read_bytes()

@@ -1,4 +1,4 @@
-"""One named triangle mesh: what mesh files and made-up shapes become before they are a scene."""
+"""One named triangle mesh, from a mesh file or a generated shape."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Mesh:
     Parameters
     ----------
     name
-        What the object is called.
+        Name of the object.
     vertices
         float64 (v, 3), metres, Z-up, finite.
     faces
@@ -29,7 +29,7 @@ class Mesh:
     ------
     LidarpoolError
         If there is no triangle, a shape is wrong, a coordinate is NaN or infinite, or a face
-        names a vertex that does not exist.
+        refers to a vertex that does not exist.
     """
 
     name: str
@@ -48,13 +48,13 @@ class Mesh:
             raise LidarpoolError(f"Object {self.name!r} has no triangles.")
         if faces.min() < 0 or faces.max() >= len(self.vertices):
             raise LidarpoolError(
-                f"The faces of {self.name!r} name vertices {faces.min()} to {faces.max()}; "
+                f"The faces of {self.name!r} refer to vertices {faces.min()} to {faces.max()}; "
                 f"there are {len(self.vertices)}, counted from 0."
             )
         object.__setattr__(self, "faces", np.ascontiguousarray(faces, dtype=np.int64))
 
     def moved(self, name: str, linear: NDArray[np.float64], offset: NDArray[np.float64]) -> Mesh:
-        """Return it under a name and at p -> linear @ p + offset, its faces facing outward."""
+        """Return a renamed copy at p -> linear @ p + offset, with faces still outward."""
         faces = self.faces[:, ::-1] if np.linalg.det(linear) < 0 else self.faces
         return Mesh(name, self.vertices @ linear.T + offset, faces)
 

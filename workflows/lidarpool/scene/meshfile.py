@@ -21,9 +21,8 @@ from .polygon_files import read_obj, read_off, read_ply_mesh, read_stl
 from .threemf import read_3mf
 from .transform import UP_AXES, Transform
 
-# A reader takes the content of a file and its path. It raises MeshFileError for what it refuses,
-# and whatever it stumbles over in a file that is broken. Each is our own; why no library serves is
-# said in its module.
+# A reader gets the content of a file and its path. It raises MeshFileError for unsupported content,
+# and any error for a broken file. All are our own; their modules say why no library is used.
 _READERS: dict[str, Callable[[bytes, Path], Content]] = {
     ".glb": read_gltf,
     ".gltf": read_gltf,
@@ -35,9 +34,9 @@ _READERS: dict[str, Callable[[bytes, Path], Content]] = {
     ".3mf": read_3mf,
 }
 SUFFIXES = tuple(_READERS)
-UNITLESS = (".obj", ".stl", ".ply", ".off")  # that cannot say in which unit their numbers are
+UNITLESS = (".obj", ".stl", ".ply", ".off")  # formats without a unit
 
-_Y_UP = (".glb", ".gltf")  # whose standard says so
+_Y_UP = (".glb", ".gltf")  # by their standard
 GENERATOR = "lidarpool"  # that files of our own name, which are Y-up
 
 # Nothing on Earth is farther from the origin of its map; see also `sections.Coordinate`.
@@ -58,14 +57,13 @@ def load_meshes(
 ) -> tuple[Mesh, ...]:
     """Read all objects of a mesh file.
 
-    Every instance of a scene graph is a mesh of its own, named by its node; files without
-    names give one object named by the file. Objects that their nodes scale to nothing are left
-    out.
+    Every instance of a scene graph is a mesh, named by its node; files without names give one
+    object named by the file. Objects that their nodes scale to zero are left out.
 
     Parameters
     ----------
     path
-        One of `SUFFIXES`, whatever the case.
+        One of `SUFFIXES`, in any case.
     unit
         One of `UNITS_M`; None takes the file's own (.dae, .3mf, .glb and .gltf), else metres.
     up_axis
@@ -74,20 +72,20 @@ def load_meshes(
     transform
         Placement in the world, in metres, after unit and up axis.
     tell
-        Called with a line on what was left out, or seems to lie on its side; by default a warning
-        of this module's logger.
+        Called with a line on objects left out, or a scene that seems to lie on its side; by default
+        this module's logger warns.
     remark
-        Called with a line on what is as it should be, and yet may surprise.
+        Called with a line on correct but possibly surprising results.
 
     Returns
     -------
-    Meshes in world coordinates. All arithmetic is in double precision; formats that store
-    single precision (.glb, .gltf, binary .stl) are only as good as what they hold.
+    Meshes in world coordinates. All arithmetic is in double precision; .glb, .gltf and binary .stl
+    store single precision.
 
     Raises
     ------
     LidarpoolError
-        If the file cannot be read whole, or there are no triangles in it.
+        If the file cannot be read completely, or has no triangles.
     """
     path = Path(path)
     if unit is not None and unit not in UNITS_M:
@@ -95,7 +93,9 @@ def load_meshes(
     if up_axis is not None and up_axis not in UP_AXES:
         raise LidarpoolError(f"up_axis is {up_axis!r}; it must be x, y or z.")
     data = _bytes_of(path)
-    with np.errstate(all="ignore"):  # of broken numbers in files; what is not finite is refused
+    with np.errstate(
+        all="ignore"
+    ):  # of broken numbers in files; infinite and NaN values are refused
         content = _read_whole(path, data)
         unit_m = UNITS_M[unit] if unit else content.unit_m or 1.0
         upright = Transform(UP_AXES[up_axis or content.up_axis or "z"] * unit_m, np.zeros(3))
@@ -105,7 +105,7 @@ def load_meshes(
             raise LidarpoolError(f"{path}: {error}") from error
     if content.skipped:
         names = ", ".join(content.skipped[:3]) + ", …" * (len(content.skipped) > 3)
-        tell(f"{path} scales {names} to nothing: left out")
+        tell(f"{path} scales {names} to zero: left out")
     if up_axis is None and path.suffix.lower() in _Y_UP and content.generator != GENERATOR:
         why = _lies(content, meshes)
         (tell if why else remark)(
@@ -117,7 +117,7 @@ def load_meshes(
 
 
 def _lies(content: Content, meshes: Sequence[Mesh]) -> str:
-    """Say why a file that was turned from Y-up seems to have been Z-up; empty if it does not."""
+    """Say why a file rotated from Y-up seems to have been Z-up; empty if it does not."""
     if "trimesh" in content.generator:
         return ", and trimesh wrote it, which keeps the axes that it is given"
     low = np.min([mesh.vertices.min(axis=0) for mesh in meshes], axis=0)
@@ -128,7 +128,7 @@ def _lies(content: Content, meshes: Sequence[Mesh]) -> str:
 
 
 def _read_whole(path: Path, data: bytes) -> Content:
-    """Read a file, whatever it is: at least one mesh, or LidarpoolError."""
+    """Read any file: returns at least one mesh, or raises LidarpoolError."""
     try:
         for beginning, what in _FOREIGN:
             if beginning.match(data):
@@ -149,7 +149,7 @@ def _read_whole(path: Path, data: bytes) -> Content:
         ) from error
     if not content.meshes:
         if content.skipped:
-            raise LidarpoolError(f"{path} holds no triangles that are not scaled to nothing.")
+            raise LidarpoolError(f"{path} has no triangles that are not scaled to zero.")
         raise LidarpoolError(
             f"{path} holds no triangles: it is empty, or has only points, lines or other things "
             "that reflect no light."
@@ -158,7 +158,7 @@ def _read_whole(path: Path, data: bytes) -> Content:
 
 
 def _bytes_of(path: Path) -> bytes:
-    """Content of a file of a known kind."""
+    """Content of a file of a known format."""
     if path.suffix.lower() not in SUFFIXES:
         raise LidarpoolError(
             f"{path} has the ending {path.suffix or '(none)'}, which is not a mesh format that "
@@ -170,16 +170,16 @@ def _bytes_of(path: Path) -> bytes:
         raise LidarpoolError(
             f"{path} does not exist: check the name and the folder.{_like(path)}"
         ) from error
-    except (OSError, ValueError) as error:  # a zero in the name
+    except (OSError, ValueError) as error:  # a NUL in the name
         reason = getattr(error, "strerror", None) or error
         raise LidarpoolError(f"{path} cannot be read: {reason}.") from error
     if not data:
         raise LidarpoolError(f"{path} is empty (0 bytes): export the mesh again.")
-    return data.removeprefix(codecs.BOM_UTF8)  # which editors put before text
+    return data.removeprefix(codecs.BOM_UTF8)  # the byte order mark of text editors
 
 
 def _like(path: Path) -> str:
-    """Mesh file beside a name that is not there, whose name is much the same."""
+    """Existing mesh file with a similar name."""
     try:
         beside = [other.name for other in path.parent.iterdir()]
     except OSError:
@@ -187,19 +187,22 @@ def _like(path: Path) -> str:
     return did_you_mean(path.name, [name for name in beside if name.lower().endswith(SUFFIXES)])
 
 
-# What files that are no meshes begin with.
+# Beginnings of files that are not meshes.
 _FOREIGN = (
     (re.compile(rb"\x1f\x8b|BZh|\xfd7zXZ\0|7z\xbc\xaf"), "is packed: unpack it first"),
     (
         re.compile(rb"(?i)\s*(<!doctype html|<html)"),
-        "is a page of the web: download the file itself",
+        "is a web page: download the file itself",
     ),
-    (re.compile(rb"version https://git-lfs"), "only points to a mesh: get it with git lfs pull"),
+    (
+        re.compile(rb"version https://git-lfs"),
+        "is a Git LFS pointer: get the mesh with git lfs pull",
+    ),
 )
 
 
 def _placed(mesh: Mesh, stem: str, upright: Transform, transform: Transform | None) -> Mesh:
-    """Mesh in the world, its name fit for terminals and files."""
+    """Mesh in the world, with a name that is safe for terminals and files."""
     name = _printable(mesh.name) or _printable(stem)
     mesh = mesh.moved(name, upright.linear, upright.offset)
     if transform is not None:
@@ -208,12 +211,12 @@ def _placed(mesh: Mesh, stem: str, upright: Transform, transform: Transform | No
     if reach > FARTHEST_M:
         raise LidarpoolError(
             f"Object {mesh.name!r} reaches {reach:.3g} m from the origin, farther than anything "
-            "on Earth: check its unit and where it is placed."
+            "on Earth: check its unit and placement."
         )
     return mesh
 
 
 def _printable(text: str) -> str:
-    """Text from a file on one line of bounded length, without codes that a terminal obeys."""
+    """Text from a file as one line of limited length, without control characters."""
     kept = "".join(c if c.isprintable() else " " for c in text)
     return " ".join(kept.split())[:_LETTERS]

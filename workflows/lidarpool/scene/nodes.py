@@ -14,34 +14,34 @@ from .mesh import Mesh
 
 K = TypeVar("K", bound=Hashable)
 
-MOST_NODES = 200_000  # of a scene, each counted in each place where it stands
+MOST_NODES = 200_000  # most nodes of a scene, counting every instance
 
 
 class MeshFileError(Exception):
-    """What is wrong with a mesh file, as a clause that follows its name."""
+    """An error of a mesh file, as a clause that follows its name."""
 
 
 @dataclass
 class Content:
-    """What a mesh file holds.
+    """Content of a mesh file.
 
     `meshes` are in the file's unit and axes.
     """
 
     meshes: list[Mesh]
-    unit_m: float | None = None  # metres in its unit; None where it states none
-    up_axis: str | None = None  # 'x', 'y' or 'z'; None where neither it nor its format states one
-    generator: str = ""  # what wrote it, where it says so
-    skipped: list[str] = field(default_factory=list)  # names of what nodes scale to nothing
+    unit_m: float | None = None  # metres in its unit; None if unknown
+    up_axis: str | None = None  # 'x', 'y' or 'z'; None if neither it nor its format states one
+    generator: str = ""  # the program that wrote it, if known
+    skipped: list[str] = field(default_factory=list)  # names of objects that nodes scale to zero
 
 
 @dataclass
 class Node(Generic[K]):
-    """A place for meshes and for other nodes."""
+    """A node, which places meshes and other nodes."""
 
     name: str  # empty where the file has none
     matrix: NDArray[np.float64]  # (4, 4), from its coordinates to those of its parent
-    # Makes the meshes that stand here, in the node's coordinates; called for each of its places.
+    # Makes the node's meshes, in its coordinates; called for each instance.
     meshes: Callable[[], Iterable[Mesh]] = list
     children: Iterable[K] = ()  # keys of the nodes in it
 
@@ -49,15 +49,15 @@ class Node(Generic[K]):
 def instances(roots: Iterable[K], node_of: Callable[[K], Node[K]], stem: str) -> Content:
     """Place all meshes of a scene graph.
 
-    A node may stand in several others; each time is an object of its own, named by the nearest
-    node that has a name.
+    A node may be in several others; each instance is an object, named by the nearest node with a
+    name.
 
     Parameters
     ----------
     roots
         Keys of the outermost nodes.
     node_of
-        Gives the node of a key.
+        Returns the node of a key.
     stem
         Name for meshes that have none.
 
@@ -97,7 +97,7 @@ def instances(roots: Iterable[K], node_of: Callable[[K], Node[K]], stem: str) ->
 
 
 def joined(name: str, parts: Iterable[tuple[NDArray[np.float64], NDArray[np.int64]]]) -> list[Mesh]:
-    """One mesh of several (vertices, faces); none where there is no face."""
+    """Join several (vertices, faces) to one mesh; none without faces."""
     kept = [(vertices, faces) for vertices, faces in parts if len(faces)]
     if not kept:
         return []

@@ -1,9 +1,9 @@
-"""Files of one list of vertices and of polygons: .obj, .off, .ply and .stl, with all their digits.
+"""Files of vertices and polygons: .obj, .off, .ply and .stl, with all their digits.
 
-trimesh reads all four, but fills polygons that are not convex beyond their outline, drops what it
-does not understand, and of .obj backward numbers of several objects, of .ply binary files with
-triangles and quadrangles. assimp and Open3D keep single precision. plyfile believes what headers
-announce, and its licence would become that of a program with it.
+trimesh reads all four, but fills non-convex polygons beyond their outline, drops what it does not
+understand, and refuses negative indices in .obj files of several objects and binary .ply files with
+triangles and quadrangles. assimp and Open3D keep single precision. plyfile trusts the counts of
+headers, and its licence would apply to a program that uses it.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Int = NDArray[np.int64]
 
 
 def _mesh(name: str, vertices: Float, corners: Int, sizes: Int) -> list[Mesh]:
-    """One mesh of polygons, with the vertices that it uses; none where there are no polygons."""
+    """One mesh of polygons, with the vertices that it uses; none without polygons."""
     faces = triangulated(vertices, corners, sizes)
     if not len(faces):
         return []
@@ -41,16 +41,16 @@ def _mesh(name: str, vertices: Float, corners: Int, sizes: Int) -> list[Mesh]:
 
 @dataclass
 class _Part:
-    """Faces of one object: the vertices of all, from 0, and how many corners each has."""
+    """Faces of one object: all their vertices, from 0, and the corners of each."""
 
     corners: array[int] = field(default_factory=lambda: array("q"))
     sizes: array[int] = field(default_factory=lambda: array("q"))
 
 
 def read_obj(data: bytes, path: Path) -> Content:
-    """Read a Wavefront file: an object for each name after 'o', or 'g' where there is no 'o'.
+    """Read a Wavefront file: an object for each name after 'o', or 'g' without any 'o'.
 
-    Objects come in the order in which they begin; materials divide nothing.
+    Objects are in order of their first face; materials do not divide them.
     """
     text = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     text = text.replace(b"\\\n", b" ").replace(b"\t", b" ")
@@ -85,15 +85,15 @@ def _obj_corners(rest: bytes, count: int, line: bytes) -> list[int]:
     if b"/" in rest:
         words = [word.partition(b"/")[0] for word in words]
     numbers = list(map(int, words))
-    if numbers and min(numbers) <= 0:  # rare, and told of by this one look
+    if numbers and min(numbers) <= 0:  # rare, and found by this one check
         if 0 in numbers or min(numbers) < -count:
-            raise ValueError(f"'{_shown(line)}' names a vertex that is not there")
+            raise ValueError(f"'{_shown(line)}' refers to a missing vertex")
         return [number - 1 if number > 0 else count + number for number in numbers]
     return [number - 1 for number in numbers]
 
 
 def _text(name: bytes) -> str:
-    """Name in UTF-8, or as old programs of the west wrote it."""
+    """Name in UTF-8, or in Latin-1 from old programs."""
     try:
         return name.decode("utf-8")
     except UnicodeDecodeError:
@@ -107,7 +107,7 @@ def _shown(line: bytes) -> str:
 # -- .off ----------------------------------------------------------------------------------------
 
 # Normals (N), colours (C) and texture coordinates (ST) may follow the position of a vertex. Some
-# files have their counts right behind the word.
+# files have the counts on the line of the word.
 _OFF = re.compile(rb"(?:ST)?C?N?OFF(?![A-Z])", re.IGNORECASE)
 
 
@@ -117,14 +117,14 @@ def read_off(data: bytes, path: Path) -> Content:
     found = _OFF.match(text)
     text = text[found.end() if found else 0 :]
     if text.lstrip().upper().startswith(b"BINARY"):
-        raise MeshFileError("is binary OFF, which is not read: export it as text, or as .ply")
+        raise MeshFileError("is binary OFF, which is not supported: export it as text, or as .ply")
     lines = [line.split() for line in text.splitlines() if line.strip()]
     counts = lines.pop(0) if lines else []
     if len(counts) < 2 or not all(count.isdigit() for count in counts):
         raise ValueError("no OFF header with the numbers of vertices and faces")
     points, polygons = map(int, counts[:2])
     if len(lines) != points + polygons:
-        # Without colours, by which only lines can be told apart, any white space divides.
+        # Only colours make line ends significant; otherwise any white space separates.
         lines = _rows([word for line in lines for word in line], points, polygons)
     vertices, corners, sizes = array("d"), array("q"), array("q")
     for line in lines[:points]:
@@ -153,7 +153,7 @@ def _rows(words: list[bytes], points: int, polygons: int) -> list[list[bytes]]:
         at += size
     if len(rows) != points + polygons:
         raise ValueError(
-            f"{points:,} vertices and {polygons:,} faces announced, and other than that is there"
+            f"{points:,} vertices and {polygons:,} faces announced, but the content differs"
         )
     return rows
 
@@ -162,9 +162,9 @@ def _rows(words: list[bytes], points: int, polygons: int) -> list[list[bytes]]:
 
 
 def read_stl(data: bytes, path: Path) -> Content:
-    """Read a stereolithography file: one mesh if it is binary, one a solid if it is text."""
+    """Read a stereolithography file: one mesh if binary, one for each solid if text."""
     announced = int.from_bytes(data[80:84], "little")
-    # A few more bytes may follow; of a text, the number does not fit.
+    # A few more bytes may follow; in a text file the number does not fit.
     if len(data) >= 84 and 0 <= len(data) - 84 - 50 * announced < 50:
         rows = np.frombuffer(data, np.uint8, 50 * announced, 84).reshape(-1, 50)
         corners = np.ascontiguousarray(rows[:, 12:48]).view("<f4").astype(np.float64)
@@ -184,7 +184,7 @@ def read_stl(data: bytes, path: Path) -> Content:
         words = re.findall(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", body, re.IGNORECASE)
         vertices = np.array(list(map(float, chain.from_iterable(words)))).reshape(-1, 3)
         if len(vertices) != 3 * len(re.findall(rb"\bendfacet", body, re.IGNORECASE)):
-            raise ValueError("a facet is no triangle")
+            raise ValueError("a facet is not a triangle")
         meshes += _stl_mesh(_text(head.strip()) or path.stem, vertices)
     return Content(meshes)
 
@@ -207,7 +207,7 @@ _PLY_LISTS = ("vertex_indices", "vertex_index")
 
 @dataclass
 class _Element:
-    """What a .ply header says of an element."""
+    """An element of a .ply header."""
 
     name: str
     count: int
@@ -235,7 +235,7 @@ def read_ply_mesh(data: bytes, path: Path) -> Content:
         numbers, sizes = rows[kind][name]
         corners = numbers.astype(np.int64)
         if not np.array_equal(corners, numbers):
-            raise ValueError("faces name vertices by fractions")
+            raise ValueError("vertex indices of faces are not whole numbers")
         if kind == "tristrips":
             corners = _ply_strips(corners, sizes)
             sizes = np.full(len(corners) // 3, 3)
@@ -266,7 +266,7 @@ def _ply_header(data: bytes) -> tuple[list[_Element], str, bytes]:
             case [] | ["comment" | "obj_info", *_]:
                 pass
             case _:
-                raise ValueError(f"'{line[:60]}' is no line of a PLY header")
+                raise ValueError(f"'{line[:60]}' is not a line of a PLY header")
     return elements, order, data[found.end() :]
 
 
@@ -277,8 +277,8 @@ _Rows = dict[str, dict[str, tuple[NDArray[Any], Int]]]
 def _ply_rows(elements: list[_Element], order: str, body: bytes) -> _Rows:
     """All rows of all elements.
 
-    Text becomes numbers in double precision first, whatever its header calls them: georeferenced
-    vertices are often called `float` and have more digits.
+    Text is read in double precision, whatever type its header states: georeferenced vertices are
+    often declared `float` and have more digits.
     """
     if not order:
         words = np.array(list(map(float, body.split())))
@@ -301,7 +301,7 @@ def _ply_rows(elements: list[_Element], order: str, body: bytes) -> _Rows:
 def _element_rows(
     element: _Element, order: str, body: bytes, at: int
 ) -> tuple[dict[str, tuple[NDArray[Any], Int]], int]:
-    """Numbers and lengths of all properties, and where the rows end."""
+    """Numbers and lengths of all properties, and the end of the rows."""
     count, names = element.count, list(element.properties)
     kinds = {name: np.dtype(order + kind) for name, (kind, _) in element.properties.items()}
     first, end = (
@@ -309,7 +309,7 @@ def _element_rows(
     )
     row: list[
         Any
-    ] = []  # dtype of a row as long as the first: mostly all are, and are taken at once
+    ] = []  # dtype of a row as long as the first: usually all are, and are read at once
     for (name, (_, length)), (_, n) in zip(element.properties.items(), first, strict=True):
         row += [(f"{name} length", order + length, (1,))] if length else []
         row += [(name, kinds[name], (n,))]
@@ -340,7 +340,7 @@ def _element_rows(
 def _ply_row(
     element: _Element, kinds: dict[str, np.dtype[Any]], order: str, body: bytes, at: int
 ) -> tuple[list[tuple[int, int]], int]:
-    """Where the numbers of each property of a row begin, and how many they are; the row's end."""
+    """Start and count of the numbers of each property of a row; the row's end."""
     out = []
     for name, (_, length) in element.properties.items():
         n = 1
@@ -352,7 +352,9 @@ def _ply_row(
         out.append((at, n))
         at += n * kinds[name].itemsize
     if at > len(body):
-        raise ValueError(f"{element.count:,} rows of {element.name[:20]} announced, and less there")
+        raise ValueError(
+            f"{element.count:,} rows of {element.name[:20]} announced, but there are fewer"
+        )
     return out, at
 
 

@@ -1,4 +1,4 @@
-"""Polygons to triangles, also those that are not convex, such as a wall with a door in it."""
+"""Triangulates polygons, also non-convex ones, such as a wall with a door."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import mapbox_earcut
 import numpy as np
 from numpy.typing import NDArray
 
-# One that crosses itself all over takes the clipper their cube, 20 seconds for this many;
-# outlines with more are rather files gone wrong.
+# For an outline that crosses itself everywhere, the clipper's time grows with their cube: 20 s for
+# so many. Larger outlines are probably broken files.
 MOST_CORNERS = 5000
 
 _FLAT = 1e-12  # a corner turns back if its sine, of a plane polygon, is below minus this
@@ -16,10 +16,10 @@ _FLAT = 1e-12  # a corner turns back if its sine, of a plane polygon, is below m
 def triangulated(
     vertices: NDArray[np.float64], corners: NDArray[np.int64], sizes: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Cut polygons into triangles with the same corners and the same outside.
+    """Cut polygons into triangles with the same corners and orientation.
 
-    Convex ones and quadrangles become fans, all of one size at once; of others ears are clipped
-    off by mapbox_earcut.
+    Convex polygons and quadrangles become fans, all of one size at once; mapbox_earcut clips the
+    ears of others.
 
     Parameters
     ----------
@@ -28,18 +28,18 @@ def triangulated(
     corners
         int64 (sum of sizes,): the corners of all polygons one after the other.
     sizes
-        int64 (p,): how many corners each polygon has; those with less than three give nothing.
+        int64 (p,): corners of each polygon; polygons with fewer than three are dropped.
 
     Returns
     -------
     int64 (t, 3), in the order of the polygons: of each two triangles less than it has corners.
-    There are fewer where an outline crosses or touches itself or runs back on itself, such as
-    around a hole: what it encloses is filled, and parts without area are left out.
+    There are fewer if an outline crosses or touches itself or runs back on itself, such as around
+    a hole: the enclosed area is filled, and parts without area are left out.
 
     Raises
     ------
     ValueError
-        If a corner names no vertex, or a polygon that is not convex has too many corners.
+        If a corner refers to no vertex, or a non-convex polygon has too many corners.
     """
     _check(vertices, corners)
     first = np.cumsum(sizes) - sizes
@@ -57,16 +57,16 @@ def triangulated(
         if size > 4:
             for i in np.flatnonzero(_turns(vertices[rows]).any(axis=1)).tolist():
                 clipped = with_holes(vertices, [rows[i]])
-                if len(clipped):  # else it has no area, and the fan has none that matters
+                if len(clipped):  # else it has no area, nor has the fan
                     out[places[i]] = -1
                     out[places[i, : len(clipped)]] = clipped
     return out[out[:, 0] >= 0]
 
 
 def _begun_well(vertices: NDArray[np.float64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Quadrangles (p, 4) that begin at the corner that turns back, if one does: a fan fills them.
+    """Rotate quadrangles (p, 4) to begin at their reflex corner, if any, so that a fan fills them.
 
-    The clipper would leave out half of one that is so warped that its view crosses itself.
+    The clipper would leave out half of a quadrangle so warped that its projection crosses itself.
     """
     back = _turns(vertices[rows])
     begin = np.where(back.sum(axis=1) == 1, back.argmax(axis=1), 0)
@@ -76,7 +76,7 @@ def _begun_well(vertices: NDArray[np.float64], rows: NDArray[np.int64]) -> NDArr
 def with_holes(vertices: NDArray[np.float64], rings: list[NDArray[np.int64]]) -> NDArray[np.int64]:
     """Clip the ears off one polygon: an outline, and the outlines of holes in it.
 
-    The triangles (t, 3) have the same outside as the outline; none where it has no area.
+    The triangles (t, 3) have the orientation of the outline; none if it has no area.
 
     Raises
     ------
@@ -87,7 +87,9 @@ def with_holes(vertices: NDArray[np.float64], rings: list[NDArray[np.int64]]) ->
     if len(corners) > MOST_CORNERS:
         raise ValueError(f"a face has {len(corners):,} corners and is not convex: triangulate it")
     _check(vertices, corners)
-    points = vertices[corners] - vertices[corners[0]]  # far from zero nothing is lost
+    points = (
+        vertices[corners] - vertices[corners[0]]
+    )  # local coordinates, so that far ones lose no digits
     outline = points[: len(rings[0])]
     normal = np.cross(outline, np.roll(outline, -1, axis=0)).sum(axis=0)  # Newell
     drop = int(np.abs(normal).argmax())
@@ -103,13 +105,13 @@ def with_holes(vertices: NDArray[np.float64], rings: list[NDArray[np.int64]]) ->
 def _check(vertices: NDArray[np.float64], corners: NDArray[np.int64]) -> None:
     if len(corners) and not 0 <= corners.min() <= corners.max() < len(vertices):
         raise ValueError(
-            f"faces name vertices {corners.min()} to {corners.max()}, counted from 0, of "
+            f"faces refer to vertices {corners.min()} to {corners.max()}, counted from 0, of "
             f"{len(vertices)}"
         )
 
 
 def _turns(points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which of the corners (p, k, 3) turn back, against the sense of the whole polygon: (p, k)."""
+    """Whether corners (p, k, 3) are reflex, against the sense of the polygon: (p, k)."""
     points = points - points[:, :1]
     into = points - np.roll(points, 1, axis=1)
     out_of = np.roll(into, -1, axis=1)

@@ -1,4 +1,4 @@
-"""The scene: all triangles of all objects, near a local origin."""
+"""The scene: triangles of all objects, near a local origin."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from .meshfile import load_meshes
 from .shapes import seed_objects
 from .transform import Transform
 
-# Single precision, which ray casters use, resolves a millimetre up to here.
+# Single precision, which ray casters use, resolves a millimetre up to this distance.
 FAR_FROM_ZERO_M = 10_000.0
 
 
 @dataclass(frozen=True, eq=False)
 @checked_fields
 class Scene:
-    """Triangles to be scanned, and which object each belongs to.
+    """Triangles to scan, and the object of each.
 
     Coordinates are local: world = `vertices` + `origin`. The origin is zero unless the scene
     lies farther than 10 km from zero (georeferenced data); then it is a point of whole metres
@@ -40,11 +40,11 @@ class Scene:
     face_object
         int32 (f,), for each triangle the index of its object in `names`.
     names
-        Names of the objects, each one once.
+        Names of the objects, without duplicates.
     origin
         float64 (3,), whole metres.
     actors
-        What moves; as objects they are numbered after the others.
+        Moving objects, numbered after the others.
 
     Raises
     ------
@@ -121,25 +121,25 @@ class Scene:
             Axis of the file that points up: x, y or z. None takes what the file or its format
             states, else z.
         transform
-            Where the mesh stands in the world, in metres, after unit and up axis: a
+            Placement of the mesh in the world, in metres, after unit and up axis: a
             `lidarpool.scene.transform.Transform`.
 
         Raises
         ------
         LidarpoolError
-            If the file cannot be read whole, or there are no triangles in it.
+            If the file cannot be read completely, or has no triangles.
         """
         return cls.from_meshes(load_meshes(path, unit=unit, up_axis=up_axis, transform=transform))
 
     @classmethod
     @checked
     def from_meshes(cls, meshes: Iterable[Mesh]) -> Scene:
-        """Put objects together, each mesh one object.
+        """Make a scene of objects, each mesh one object.
 
         Parameters
         ----------
         meshes
-            In world coordinates. Names that occur twice are numbered: Shelf, Shelf.2.
+            In world coordinates. Duplicate names are numbered: Shelf, Shelf.2.
 
         Raises
         ------
@@ -180,7 +180,7 @@ class Scene:
 
     @property
     def triangles(self) -> int:
-        """How many there are, those of actors included."""
+        """Number of triangles, including those of actors."""
         return len(self.faces) + sum(len(actor.mesh.faces) for actor in self.actors)
 
     def solid(self, time_ns: float | None = None) -> Scene:
@@ -240,7 +240,7 @@ class Scene:
 
     @cached_property
     def footprints(self) -> NDArray[np.float64]:
-        """Circle that holds each object seen from above, local: (objects, 3) as x, y, radius.
+        """Circle around each object seen from above, local: (objects, 3) as x, y, radius.
 
         The circle is centred on the object's bounding rectangle and reaches its farthest
         vertex: exact for discs and rectangles, at most 1.42 times too wide for other outlines.
@@ -256,8 +256,8 @@ class Scene:
 def local_origin(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
     """Choose the origin for world coordinates (v, 3): zero, or whole metres in their middle.
 
-    Whole metres are exact in double precision, so that subtracting them and adding them again
-    gives the same coordinates.
+    Whole metres are exact in double precision, so that subtracting and adding them again gives the
+    same coordinates.
     """
     middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     if np.abs(middle).max() <= FAR_FROM_ZERO_M:
@@ -266,7 +266,7 @@ def local_origin(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def unique_names(names: Sequence[str]) -> tuple[str, ...]:
-    """Make names unique by numbering those that occur before: Shelf, then Shelf.2.
+    """Make names unique by numbering repeated ones: Shelf, then Shelf.2.
 
     Examples
     --------

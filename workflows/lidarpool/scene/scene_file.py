@@ -21,20 +21,20 @@ SUFFIXES = (".ply", ".glb", ".obj")
 
 
 def write_scene(path: str | Path, scene: Scene) -> Path:
-    """Write a scene to a mesh file that `Scene.load` reads again.
+    """Write a scene to a mesh file that `Scene.load` can read.
 
     Parameters
     ----------
     path
         One of `SUFFIXES`. A .ply holds one object without a name; .glb and .obj keep objects
-        and names. All store metres; .glb is turned to Y-up, as its standard asks, the others
-        are Z-up. Coordinates are those of the world; .ply and .glb hold single precision.
+        and names. All store metres; .glb is Y-up, by its standard, the others are Z-up.
+        Coordinates are those of the world; .ply and .glb have single precision.
     scene
-        What to write.
+        The scene.
 
     Returns
     -------
-    The path. What was there before is replaced only when the new file is whole.
+    The path. An existing file is replaced only by a complete one.
 
     Raises
     ------
@@ -56,12 +56,12 @@ def write_scene(path: str | Path, scene: Scene) -> Path:
 
 
 def check_target(path: Path) -> None:
-    """Check that a scene can be written there, before it is made.
+    """Check that a scene can be written to a path, before it is made.
 
     Raises
     ------
     LidarpoolError
-        If the ending is not one of `SUFFIXES`, or there is no such folder or no right to write.
+        If the ending is not one of `SUFFIXES`, or the folder is missing or not writable.
     """
     if path.suffix.lower() not in SUFFIXES:
         raise LidarpoolError(
@@ -90,12 +90,12 @@ def _encoded(suffix: str, scene: Scene) -> bytes:
 
 
 def _name_the_writer(tree: dict[str, Any]) -> None:
-    """Say in a glTF who wrote it: files of trimesh's own are mostly not Y-up, and this one is."""
+    """Name lidarpool as the writer of a glTF, because trimesh's files are often not Y-up."""
     tree["asset"]["generator"] = GENERATOR
 
 
 def _objects(scene: Scene, turn: np.ndarray[Any, np.dtype[np.float64]]) -> trimesh.Scene:
-    """Every object as a geometry and node of its own, vertices turned by a matrix (3, 3)."""
+    """Each object as a geometry and node, vertices rotated by a matrix (3, 3)."""
     out = trimesh.Scene()
     for mesh in scene.meshes():
         geometry = trimesh.Trimesh(mesh.vertices @ turn.T, mesh.faces, process=False)

@@ -1,4 +1,4 @@
-"""Made-up objects: surfaces of revolution, and the six of the default survey."""
+"""Generated objects: surfaces of revolution, and the six of the default survey."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ SEED_OUTLINES: dict[str, tuple[tuple[float, float], ...]] = {
         (0.0, 0.0), (0.25, 0.0), (0.5, 0.6), (2.2, 1.7), (2.2, 2.1), (0.9, 2.6), (0.4, 3.6),
         (0.6, 3.9), (0.3, 4.3), (0.0, 4.3),
     ),
-    # Low, since the pawn stands behind it as seen from the default poses.
+    # Low, because the pawn is behind it as seen from the default poses.
     "Bowl": (
         (0.0, 0.0), (1.1, 0.0), (1.1, 0.0), (1.0, 0.25), (0.5, 0.4), (0.5, 0.55), (1.9, 0.7),
         (2.2, 1.6), (2.0, 2.2), (1.85, 2.2), (2.0, 1.6), (1.7, 0.95), (0.0, 0.8),
@@ -52,8 +52,8 @@ SEED_OUTLINES: dict[str, tuple[tuple[float, float], ...]] = {
 def seed_objects(rings: int = SEED_RINGS, segments: int = SEED_SEGMENTS) -> tuple[Mesh, ...]:
     """Make the six objects of the default survey: sphere, vase, bell, pawn, spindle, bowl.
 
-    Each stands on z = 0 at its place in `SEED_POSITIONS`, is `SEED_RADIUS_M` in radius and has
-    `2 * rings * segments` triangles: 76,800 in all as they come.
+    Each stands on z = 0 at its position in `SEED_POSITIONS`, has a radius of `SEED_RADIUS_M` and
+    `2 * rings * segments` triangles: by default 76,800 in all.
     """
     angles = np.linspace(-np.pi / 2, np.pi / 2, rings + 2)
     sphere = SEED_RADIUS_M * np.stack([np.cos(angles), 1 + np.sin(angles)], axis=1)
@@ -69,7 +69,7 @@ def seed_objects(rings: int = SEED_RINGS, segments: int = SEED_SEGMENTS) -> tupl
 
 
 def revolve(profile: ArrayLike, segments: int, name: str = "Revolved") -> Mesh:
-    """Turn a profile about the z axis into a closed surface.
+    """Rotate a profile about the z axis to a closed surface.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Made-up hills and mountains."""
+"""Generated hills and mountains."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Float = NDArray[np.float64]
 
 LEAST_TRIANGLES = 2
 MOST_TRIANGLES = 100_000_000
-LONGEST_M = 1e7  # what is farther from the middle than 1e8 m is refused when it is read
+LONGEST_M = 1e7  # files reject coordinates beyond 1e8 m
 _COARSEST = 4  # cells of the first octave along a side
 _OCTAVES = 11
 _ROUGHNESS = 0.5  # height of each octave over that of the one before
@@ -30,7 +30,7 @@ def terrain(triangles: int = 2_000_000, seed: int = 0, side_m: float = 1000.0) -
     Parameters
     ----------
     triangles
-        At least 2. The scene has as many as fill a grid with them: up to one row fewer.
+        At least 2. The scene has a full grid of them: up to one row fewer.
     seed
         The same numbers give the same terrain.
     side_m
@@ -87,7 +87,7 @@ def _heights(x: Float, y: Float, rng: np.random.Generator) -> Float:
         ridge = 1 - np.abs(_noise(x * cells, y * cells, rng))
         ridge *= ridge * damping
         total += _ROUGHNESS**octave * ridge
-        # What lies high is rough: there the next octave counts in full.
+        # High ground is rough: the next octave counts fully there.
         np.clip(1.6 * ridge, 0, 1, out=damping)
     total -= total.min()
     highest = total.max()

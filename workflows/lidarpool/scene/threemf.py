@@ -1,8 +1,8 @@
 """3MF files, after its core specification and production extension by the 3MF Consortium (2018).
 
-Read here and not by trimesh, which follows nested components only so far and takes parts of inner
-files for each other; nor by assimp 5.4, which reads no parts of inner files, passes over what a
-file requires, and ends the process on a property index that is out of range.
+This is not trimesh, which follows nested components only to some depth and confuses parts of inner
+files; nor assimp 5.4, which reads no parts of inner files, ignores required extensions, and ends
+the process on a property index that is out of range.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _UNITS_M = {
     "foot": 0.3048,
     "meter": 1.0,
 }
-# Required extensions that change looks, or that are read here.
+# Required extensions that do not change shapes, or that are supported here.
 _READ = re.compile(r"/(material|production|securecontent)/")
 
 _Key = tuple[str, str]  # inner file and number of an object
@@ -52,7 +52,7 @@ class _Placement:
 
 
 def read_3mf(data: bytes, path: Path) -> Content:
-    """Read what a file builds."""
+    """Read the build items of a file."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         package = _Package(archive)
         root = package.model(_start(archive))
@@ -105,15 +105,15 @@ class _Package:
     def object(self, key: _Key) -> _Object:
         objects = self.model(key[0]).objects
         if key[1] not in objects:
-            raise ValueError(f"object {key[1][:20]!r} is placed and is not there")
+            raise ValueError(f"object {key[1][:20]!r} is placed, but missing")
         return objects[key[1]]
 
 
 class _Model:
-    """Objects of an inner file, and what it builds of them.
+    """Objects of an inner file, and its build items.
 
-    The parser makes no tree, which would take ten times the file's size, and expands no entities
-    without end.
+    The parser makes no tree, which would take ten times the file's size, and limits the expansion
+    of entities.
     """
 
     def __init__(self, name: str, text: bytes) -> None:
@@ -122,7 +122,7 @@ class _Model:
         self.items: list[_Placement] = []
         self._name = name
         self._object = _Object("")
-        # Without namespaces, since slicers leave out the declaration of some.
+        # Without namespaces, because slicers omit the declaration of some.
         parser = expat.ParserCreate()
         parser.StartElementHandler = self._begin
         parser.Parse(text, True)
@@ -145,9 +145,9 @@ class _Model:
             for prefix in attributes.get("requiredextensions", "").split():
                 extension = attributes.get(f"xmlns:{prefix}", prefix)
                 if not _READ.search(extension):
-                    raise MeshFileError(f"needs {extension[:80]}, which is not read")
+                    raise MeshFileError(f"needs {extension[:80]}, which is not supported")
         elif tag in ("beamlattice", "booleanshape", "levelset"):
-            raise MeshFileError(f"has a <{tag}>, which is not read: export it as triangles")
+            raise MeshFileError(f"has a <{tag}>, which is not supported: export it as triangles")
 
     def _placement(self, attributes: dict[str, Any]) -> _Placement:
         path = next((v for k, v in attributes.items() if k.rpartition(":")[2] == "path"), "")

@@ -1,4 +1,4 @@
-"""Units, up axes and placements: from the coordinates of a mesh file to those of the world."""
+"""Units, up axes and placements: from mesh file coordinates to world coordinates."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ..base.errors import LidarpoolError
 from ..sensor import Pose
 
 # Proper rotations that take the named axis to +z; the rows hold only 0 and ±1, so that
-# turning large coordinates loses no digit.
+# rotating large coordinates loses no digit.
 UP_AXES = {
     "x": np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]),
     "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
@@ -61,7 +61,7 @@ class Transform:
         rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0),
         scale: float | tuple[float, float, float] = 1.0,
     ) -> Transform:
-        """Scale, then turn about the world's x, y and z axes in this order, then move.
+        """Scale, then rotate about the world's x, y and z axes in this order, then move.
 
         Parameters
         ----------
@@ -79,7 +79,7 @@ class Transform:
 
     @classmethod
     def from_matrix(cls, matrix: ArrayLike) -> Transform:
-        """Take a transform from a homogeneous (4, 4) matrix whose last row is 0 0 0 1."""
+        """Make a transform of a homogeneous (4, 4) matrix whose last row is 0 0 0 1."""
         array = np.asarray(matrix, dtype=np.float64)
         if array.shape != (4, 4) or not np.array_equal(array[3], [0, 0, 0, 1]):
             raise LidarpoolError(
