@@ -25,7 +25,8 @@ MOST_TRIANGLES = 100_000  # 60 bytes each, whenever their colours have changed
 MOST_PIECES = 60_000  # that large ones are divided into, where hits are shown
 TITLE = "hits per square metre; grey: none"
 _INWARDS = 1e-4  # of the scene's diagonal
-_MOST_INWARDS_OF = 200.0  # metres: two centimetres are enough for any scene
+_DEPTHS = 5  # of objects that are neighbours: walls that cross have sides in one plane
+_MOST_INWARDS_OF = 200.0  # metres: some centimetres are enough for any scene
 _GREYS = np.linspace(0.1, 1.0, 256)
 SWAP_S = 1.5  # a browser needs a moment to load a mesh
 
@@ -74,7 +75,8 @@ class Surface:
         lengths = np.linalg.norm(normals, axis=1, keepdims=True)
         normals = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0)
         size = float(np.linalg.norm(np.ptp(scene.bounds, axis=0)))
-        self.corners = corners - (_INWARDS * min(size, _MOST_INWARDS_OF)) * normals[:, None]
+        depth = _INWARDS * min(size, _MOST_INWARDS_OF) * (1 + self._objects % _DEPTHS / 2)
+        self.corners = corners - (depth[:, None] * normals)[:, None].astype(np.float32)
 
     def coloured(
         self, by: str, hit_counts: NDArray[Any], points: NDArray[np.float32]
