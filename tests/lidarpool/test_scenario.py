@@ -231,7 +231,7 @@ BAD = [
     ("sensor: {model: velodyne/vlp16, min_range_m: 200}", "max_range_m is 130"),
     ("sensor: [1]", r"sensor is \[1\]; input should be a valid dictionary"),
     ("poses: []", r"poses is \[\]; .* at least 1 item"),
-    ("poses: [0, 0, 1]", r"poses\[0\] is 0; input should be a valid dictionary"),
+    ("poses: [0, 0, 1]", r"poses\[0\]: a pose is x, y and z in metres.* given is 0"),
     ("poses: [[0, 0]]", r"poses\[0\]\.position\[2\] is missing"),
     ("poses: [[0, 0, x]]", r"poses\[0\]\.position\[2\] is 'x'; input should be a valid number"),
     ("poses: [{yaw_deg: 0}]", r"poses\[0\]\.position is missing"),

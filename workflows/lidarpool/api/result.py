@@ -14,6 +14,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
 from typing import TYPE_CHECKING
 
+from ..base.arguments import checked
 from ..base.notebook import cell_display
 from ..base.words import counted
 from ..export.ply import save_cloud
@@ -38,6 +39,7 @@ class Result(RunResult):
         """Names of the objects, in the order of the column `object`."""
         return self.scene.all_names
 
+    @checked
     def report(
         self,
         folder: str | Path,
@@ -81,6 +83,7 @@ class Result(RunResult):
             if isinstance(place, Storage):
                 upload(local, place, report["files"])
 
+    @checked
     def pictures(
         self,
         folder: str | Path,
@@ -115,6 +118,7 @@ class Result(RunResult):
 
         return list(draw_pictures(self._pictured, self._cloud_file, folder, only, size, colour))
 
+    @checked
     def view(self, *, port: int = 8080, browser: bool = True) -> None:
         """Show it in the browser, as `lidarpool view` does, until Ctrl-C.
 

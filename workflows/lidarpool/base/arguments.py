@@ -119,7 +119,7 @@ def _with_article(name: str) -> str:
 def _hints(thing: Any) -> dict[str, Any]:
     """Annotations of what can be checked."""
     if isinstance(thing, type):
-        names = {name for name, field in thing.__dict__["__dataclass_fields__"].items()}
+        names = set(thing.__dict__["__dataclass_fields__"])
         hints = {name: hint for name, hint in get_type_hints(thing).items() if name in names}
     else:
         hints = {name: hint for name, hint in get_type_hints(thing).items() if name != "return"}
@@ -153,7 +153,9 @@ def _fits(value: object, hint: Any) -> bool:
     if hint in _KINDS:
         return isinstance(value, _KINDS[hint][0]) and (hint is bool or not isinstance(value, bool))
     if getattr(hint, "_is_protocol", False):
-        return all(hasattr(value, name) for name in vars(hint) if not name.startswith("_"))
+        # Of the class first: a property may take its time.
+        names = [name for name in vars(hint) if not name.startswith("_")]
+        return all(hasattr(type(value), name) or hasattr(value, name) for name in names)
     return not isinstance(hint, type) or isinstance(value, hint)
 
 

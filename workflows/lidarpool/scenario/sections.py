@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, Strict, model_validator
 
+from ..base.arguments import shown
 from ..base.vocabulary import BACKENDS, FORMATS, LAYOUTS, columns_needed
 from ..columns.table import COORDINATES, OPTIONAL
 from ..scene.transform import Transform
@@ -272,9 +273,19 @@ class PoseSection(Section):
     roll_deg: Annotated[Angle, Field(description="rotation about the new x, last")] = 0.0
 
 
+def _pose(value: Any) -> Any:
+    if isinstance(value, list):
+        return {"position": value}
+    if not isinstance(value, (dict, PoseSection)):
+        raise ValueError(
+            f"a pose is x, y and z in metres, [0, 0, 1], or position and angles, {{position: "
+            f"[0, 0, 1], yaw_deg: 90}}; given is {shown(value)}."
+        )
+    return value
+
+
 PoseEntry = Annotated[
-    PoseSection,
-    _short(lambda v: isinstance(v, list), lambda v: {"position": v}, Triple | PoseSection),
+    PoseSection, BeforeValidator(_pose, json_schema_input_type=Triple | PoseSection)
 ]
 
 
