@@ -1,1 +1,1 @@
-"""What Python programs use: `simulate`, and the result with all that can be made of it."""
+"""The Python interface: `simulate`, and its result."""

@@ -97,13 +97,13 @@ class Result(RunResult):
         Parameters
         ----------
         folder
-            Where they go; made if it is not there.
+            Their folder; made if it does not exist.
         only
             Which: scene, intensity, cloud, path; by default all.
         size
             Width and height in pixels.
         colour
-            Column that the points of the cloud are coloured by.
+            Column to colour the points of the cloud by.
 
         Returns
         -------
@@ -127,7 +127,7 @@ class Result(RunResult):
         Parameters
         ----------
         port
-            Port on 127.0.0.1, or the next that is free; 0 for any.
+            Port on 127.0.0.1, or the next free one; 0 for any.
         browser
             Whether to open a browser where there is a desktop.
         """
@@ -150,7 +150,7 @@ class Result(RunResult):
 
     @cached_property
     def _cloud_file(self) -> Path:
-        """The cloud as a file, in a folder that goes with this object."""
+        """The cloud as a file, in a folder that is removed with this object."""
         folder = mkdtemp(prefix="lidarpool-")
         weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
         path = Path(folder) / "cloud.ply"
@@ -181,7 +181,7 @@ class Result(RunResult):
         )
 
     def _figures(self) -> Iterator[tuple[str, str]]:
-        """Names and values of what a reader looks for first."""
+        """Names and values of the main figures."""
         yield (
             "survey",
             f"{self.survey.scan_count:,} scans, {self.rays:,} rays, {self.hits:,} hits on "

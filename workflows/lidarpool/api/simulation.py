@@ -53,51 +53,51 @@ def simulate(
     parts: str | Path | None = None,
     resume: bool = False,
 ) -> Result:
-    """Scan a scene on a partitioned cluster and plan a path meanwhile.
+    """Scan a scene on a partitioned cluster, and plan a path at the same time.
 
     Parameters
     ----------
     scene, survey
-        What to scan, and how; poses in the scene's local coordinates.
+        The scene and the survey; poses in the scene's local coordinates.
     planning
         A path to plan on the OTHER partition while the survey runs; None for none.
     client
         Client of a cluster whose workers declare the resources GPU, LIDAR and OTHER. Its dashboard
-        has a page of partitions meanwhile; the log says where. Without a client, a local cluster
-        is started on the loopback interface and stopped in the end.
+        has a page of partitions during the run; the log has its address. Without a client, a local
+        cluster is started on the loopback interface and stopped at the end.
     backend
         Ray-casting backend of stage 2: auto, cuda, embree or numpy.
     on_frame
         Called with each frame, in scan order, while the survey runs; its points are in storage by
-        then, see `Frame.points`. It is called in this thread: while it takes its time the
-        pipeline waits, and nothing is lost.
+        then, see `Frame.points`. It is called in this thread: a slow callback makes the pipeline
+        wait, and nothing is lost.
     on_progress
-        Called some ten times a second with how far things are. Without it there are bars in a
-        notebook and at a terminal.
+        Called some ten times a second with the progress. Without it there are bars in a notebook
+        and at a terminal.
     live
         Show the run in the browser meanwhile, as `lidarpool run --live` does; in a notebook, in the
         cell. `Result.view` shows the result afterwards.
     queue_capacity
-        Items that stage 1 may be ahead of stage 2.
+        How many items stage 1 may be ahead of stage 2.
     collectors
         Tasks of stage 4.
     gpu_workers, other_workers
-        Workers of a local cluster; by default what suits the machine.
+        Workers of a local cluster; by default chosen for the machine.
     tls
         Encrypt the traffic of a local cluster, with a certificate made for it.
     wait_s, patience_s
-        How long to wait for partitions that are still empty, and for those that become empty,
-        seconds.
+        How long to wait for partitions that are empty at the start, and for those that become
+        empty later, seconds.
     folder
-        A folder to keep the run in, so that nothing is lost should this process or its machine
-        die; the one that it lies in must exist. It stays there in the end: remove it with
-        `remove_run` once the result is where it belongs. Without one, the points are in a
-        temporary folder as long as the result is in use. It may be a URL that fsspec opens, such
+        A folder to keep the run in, so that nothing is lost if this process or its machine dies;
+        its parent must exist. The run stays there at the end: remove it with `remove_run` once
+        the result is saved. Without a folder, the points are in a temporary one as long as the
+        result is in use. It may be a URL that fsspec opens, such
         as ``s3://bucket/run``: then the last seconds before this process died are done again.
     parts
-        Where the points go, part by part: a folder that the workers see, or a URL that fsspec
-        opens, such as ``s3://bucket/survey``. It takes a `folder`, whose database says which
-        parts there are; `remove_run` removes both. By default they go into `folder`.
+        Place of the parts: a folder that the workers see, or a URL that fsspec opens, such as
+        ``s3://bucket/survey``. It needs a `folder`, whose database lists the parts; `remove_run`
+        removes both. By default they are in `folder`.
     resume
         Go on from what an earlier run has left in `folder`; from the beginning if there is
         nothing. `on_frame` gets the frames that it has not had yet, but for those of the last
@@ -112,7 +112,7 @@ def simulate(
     Raises
     ------
     LidarpoolError
-        If the cluster lacks something or a task fails, if `folder` holds an unfinished run and
+        If the cluster lacks something or a task fails, if `folder` has an unfinished run and
         `resume` is not set, if that is damaged, or of another scene, survey, planning or
         version; one or two lines say which and what to do. KeyboardInterrupt passes through
         once everything has been stopped.

@@ -1,4 +1,4 @@
-"""Arguments of the wrong kind, told of as a scenario's are: what was given and what is allowed."""
+"""Checks arguments of Python calls: errors name the value given and the values allowed."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 C = TypeVar("C", bound=type)
 
-# {annotation: what a value has to be, in words}
+# {annotation: description of allowed values}
 _KINDS: dict[Any, tuple[tuple[type, ...], str]] = {
     int: ((Integral,), "a whole number"),
     float: ((Real,), "a number"),
@@ -30,7 +30,7 @@ _KINDS: dict[Any, tuple[tuple[type, ...], str]] = {
     Path: ((os.PathLike,), "a path"),
     NoneType: ((NoneType,), "None"),
 }
-# {class: how one comes by it}
+# {class: an example}
 _EXAMPLES = {
     "Beams": "Beams.even(32, 40)",
     "Material": "Material('Window*', reflectance=0.1)",
@@ -49,12 +49,12 @@ _PLAIN = (*(kind for kind in _KINDS if kind is not Path), list, tuple, dict, byt
 
 
 def checked(function: Callable[P, R]) -> Callable[P, R]:
-    """Have a function refuse arguments that are not of the annotated kinds.
+    """Let a function refuse arguments that do not fit their annotations.
 
     Raises
     ------
     LidarpoolError
-        From the function: which argument, what was given, and what it must be.
+        From the function: the argument, its value, and what it must be.
     """
     signature = inspect.signature(function)
 
@@ -63,7 +63,7 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
         try:
             given = signature.bind(*args, **kwargs).arguments
         except TypeError:
-            return function(*args, **kwargs)  # Python tells of too many, too few and unknown ones
+            return function(*args, **kwargs)  # Python reports too many, too few and unknown ones
         hints = _hints(function)
         for name, value in given.items():
             if name in hints and value is not signature.parameters[name].default:
@@ -74,9 +74,9 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def checked_fields(cls: C) -> C:
-    """Have a dataclass refuse values that are not of the annotated kinds, in subclasses as well.
+    """Let a dataclass refuse values that do not fit their annotations, also in subclasses.
 
-    It stands below `dataclass`, which calls `__post_init__` only of a class that has one.
+    Apply it before `dataclass`, which calls `__post_init__` only if the class has one.
     """
     after: Callable[[Any], None] = getattr(cls, "__post_init__", lambda self: None)
 
@@ -93,7 +93,7 @@ def checked_fields(cls: C) -> C:
 
 
 def as_array(name: str, values: ArrayLike, dtype: DTypeLike = np.float64) -> NDArray[Any]:
-    """Return values as an array of numbers; LidarpoolError if they are none."""
+    """Return values as an array of numbers; LidarpoolError if they are not numbers."""
     try:
         return np.asarray(values, dtype)
     except (TypeError, ValueError, OverflowError) as error:
@@ -103,7 +103,7 @@ def as_array(name: str, values: ArrayLike, dtype: DTypeLike = np.float64) -> NDA
 
 
 def shown(value: object) -> str:
-    """Show what was given: plain values as they are, cut to a readable length; else its type."""
+    """Show a value: plain values cut to a readable length, others by their type."""
     if isinstance(value, _PLAIN):
         short = reprlib.Repr()
         short.maxstring = short.maxother = 60
@@ -117,7 +117,7 @@ def _with_article(name: str) -> str:
 
 @cache
 def _hints(thing: Any) -> dict[str, Any]:
-    """Annotations of what can be checked."""
+    """Annotations that can be checked."""
     if isinstance(thing, type):
         names = set(thing.__dict__["__dataclass_fields__"])
         hints = {name: hint for name, hint in get_type_hints(thing).items() if name in names}
@@ -144,7 +144,7 @@ def _fits(value: object, hint: Any) -> bool:
     if origin in (Sequence, Iterable, tuple):
         if isinstance(value, (str, bytes, Mapping)) or not isinstance(value, Iterable):
             return False
-        # What can be read only once is for the function to look at.
+        # An iterator can be read only once: leave it to the function.
         return origin is Iterable or all(_fits(one, args[0]) for one in value)
     if origin is Callable:
         return callable(value)
@@ -160,7 +160,7 @@ def _fits(value: object, hint: Any) -> bool:
 
 
 def _words(hint: Any) -> str:
-    """Say what a value must be; empty for what is not checked here, such as arrays."""
+    """Describe allowed values; empty if they are not checked here, such as arrays."""
     origin, args = get_origin(hint), get_args(hint)
     if origin in (Union, UnionType):
         words = [_words(one) for one in args]

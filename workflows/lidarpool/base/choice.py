@@ -1,4 +1,4 @@
-"""An even choice of some of many."""
+"""An evenly spaced sample."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from numpy.typing import NDArray
 def one_of_each_part(
     count: int, most: int, rng: np.random.Generator | None = None
 ) -> NDArray[np.int64]:
-    """At most `most` of the numbers below `count`, in order, one from each of equal parts.
+    """Choose at most `most` numbers below `count`, in order, one from each of equal parts.
 
-    Which of each part is left to chance: of points that are ordered by scan and ray, every n-th
-    could always be of the same few rings, or look one way.
+    The choice within each part is random: in points ordered by scan and ray, every n-th could
+    always be of the same few rings or directions.
 
     Parameters
     ----------
     count, most
-        Of how many, and how many at most; all of them where they are no more.
+        Size of the population, and of the sample; all numbers if they are no more.
     rng
-        What chooses; without it the choice is the same each time.
+        Random generator; without it the choice is always the same.
     """
     rng = np.random.default_rng(0) if rng is None else rng
     parts = min(count, most)

@@ -1,4 +1,4 @@
-"""Random numbers that follow from what they are for, and not from who draws them when.
+"""Random numbers that depend only on their purpose, not on the order of drawing.
 
 Each is a hash of (seed, purpose, scan, ray, number): the same on every worker and in every batch.
 """
@@ -34,8 +34,7 @@ def raw(
     seed, purpose
         Whole numbers from 0 to 2**63.
     scan, ray, number
-        (n,) or one for all: the ray within its scan, below 2**32, and which of its numbers,
-        below 256.
+        (n,) or one for all: the ray within its scan, below 2**32, and the number, below 256.
 
     Returns
     -------
@@ -74,5 +73,5 @@ def _quantiles() -> NDArray[np.float64]:
     shares = (np.arange(2**15) + 0.5) / 2**16
     low = np.array([NormalDist().inv_cdf(share) for share in shares])
     table = np.concatenate([low, -low[::-1]])
-    # To single precision, of which no machine's logarithm is in doubt.
+    # To single precision, in which logarithms are the same on every machine.
     return (table / np.sqrt((table**2).mean())).astype(np.float32).astype(np.float64)

@@ -1,4 +1,4 @@
-"""The one exception that users are meant to read."""
+"""The exception for errors of users."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ MISTAKES_TOLD = 20
 
 
 class LidarpoolError(Exception):
-    """Something the user can put right: bad input, a missing partition, a full disk.
+    """An error that the user can correct: bad input, a missing partition, a full disk.
 
     The message is one or two lines that say what was given, what was expected and what to
     do. The command prints it without a traceback and exits with code 2.

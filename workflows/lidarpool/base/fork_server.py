@@ -1,8 +1,8 @@
-"""The process that a cluster on this machine forks its workers from.
+"""The process from which a local cluster forks its workers.
 
-A worker that is spawned imports Dask, NumPy and our packages for itself, which takes a second of
-a core. The fork server imports them once, beside the driver, and then forks each worker in 20 ms,
-also one that takes the place of another.
+A spawned worker imports Dask, NumPy and our packages itself, which takes a second of a core. The
+fork server imports them once, in parallel to the driver, and forks each worker in 20 ms, also after
+a restart.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ _KEPT = {-1: 256 << 20, -3: 256 << 20}
 
 
 def start_fork_server() -> bool:
-    """Have the fork server running, which ends when this process and all workers have ended.
+    """Start the fork server, which ends when this process and all workers have ended.
 
-    Returns False where libraries do not stand being forked, as on macOS.
+    Returns False on systems whose libraries cannot be forked, such as macOS.
     """
     if sys.platform != "linux":
         return False
@@ -42,18 +42,18 @@ def start_fork_server() -> bool:
 
 
 def keep_freed_memory() -> None:
-    """Have this process, and those that are forked from it, keep the memory of large arrays.
+    """Let this process, and those forked from it, keep the memory of large arrays.
 
-    Handed back to the system each time, it is made of pages that have to be faulted in again. Of
-    eight seconds that pictures take, that was one.
+    If it is returned to the system, its pages have to be faulted in again. That took one of the
+    eight seconds of the pictures.
     """
-    if mallopt := getattr(ctypes.CDLL(None), "mallopt", None):  # which only glibc has
+    if mallopt := getattr(ctypes.CDLL(None), "mallopt", None):  # only in glibc
         for option, size in _KEPT.items():
             mallopt(option, size)
 
 
 def stop_fork_server() -> None:
-    """End the fork server at once; what it and its workers took counts as this process's."""
+    """End the fork server at once; its time and its workers' counts for this process."""
     server: Any = forkserver._forkserver
     if server._forkserver_pid is not None:
         os.kill(server._forkserver_pid, signal.SIGKILL)  # it would wait for the last worker

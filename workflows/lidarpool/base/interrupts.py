@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM, SIGHUP: once stops cleanly, twice stops now, and none hits a worker."""
+"""Ctrl-C, SIGTERM, SIGHUP: the first stops cleanly, the second at once; workers get none."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from multiprocessing import resource_tracker
 from types import FrameType
 from typing import NoReturn
 
-INTERRUPTED = 130  # exit code, as shells give it to whatever Ctrl-C ended
+INTERRUPTED = 130  # exit code of shells for a program ended by Ctrl-C
 STOPPED = "interrupted; everything was stopped"
 UNTOUCHED = f"{STOPPED}, and the output folder is as it was."
 
 # From the keyboard, from a job manager, and from a terminal that is closed (not on Windows).
 _NAMES = ("SIGINT", "SIGTERM", "SIGHUP")
 _SIGNALS = tuple(getattr(signal, name) for name in _NAMES if hasattr(signal, name))
-_IMPATIENT_S = 1.0  # a second signal sooner than this is the first one's twin
+_IMPATIENT_S = 1.0  # a second signal sooner than this counts as the first
 _AGAIN_S = 0.01
 
 
@@ -42,7 +42,7 @@ class _Interrupt:
 
 
 def _is_in_del(frame: FrameType | None) -> bool:
-    """Whether an object is being let go of, as futures often are: Python drops what it raises."""
+    """Whether an object is being finalised: Python drops errors raised there."""
     while frame is not None and frame.f_code.co_name != "__del__":
         frame = frame.f_back
     return frame is not None
@@ -57,7 +57,7 @@ def _interrupt_main_thread() -> None:
 
 
 def end_on_signals() -> None:
-    """Let these signals end the process at once: as long as nothing has been started."""
+    """Let these signals end the process at once, while nothing has been started."""
     _on_signals(lambda number, frame: _exit(f"lidarpool: {UNTOUCHED}\n".encode()))
 
 
@@ -68,7 +68,7 @@ def interrupt_on_signals() -> None:
 
 def _on_signals(handler: Callable[[int, FrameType | None], object]) -> None:
     for number in _SIGNALS:
-        # `nohup` has a run go on when its terminal is closed.
+        # With `nohup` a run survives the closing of its terminal.
         if signal.getsignal(number) is not signal.SIG_IGN or number == signal.SIGINT:
             signal.signal(number, handler)
 
@@ -83,17 +83,17 @@ def _exit(message: bytes) -> NoReturn:
 def deferred_interrupts() -> Iterator[None]:
     """Hold signals back while the body runs, then raise KeyboardInterrupt if there was one.
 
-    For what must be done whole or not at all: starting processes, stopping them, moving a
-    result into place. Only the main thread of a program gets signals; elsewhere this does
-    nothing. A second signal to a program that was interrupted by a first is not held back.
+    For indivisible actions: starting processes, stopping them, moving a result into place. Only
+    the main thread of a program gets signals; elsewhere this does nothing. A second signal to an
+    interrupted program is not held back.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     seen: list[int] = []
     before = {n: signal.getsignal(n) for n in _SIGNALS}
-    # What raises nothing any more cannot break the body, and somebody is impatient. What a
-    # program around this interpreter has installed (None) could not be put back.
+    # Handlers that raise nothing cannot break the body, and the user is impatient. A handler from
+    # outside of Python (None) could not be restored.
     held = [
         number
         for number, handler in before.items()
@@ -112,19 +112,19 @@ def deferred_interrupts() -> Iterator[None]:
 
 @contextmanager
 def children_spared() -> Iterator[None]:
-    """Start processes in the body, and threads that start some later, which Ctrl-C spares.
+    """Protect processes and threads started in the body from Ctrl-C.
 
     A terminal sends SIGINT and SIGQUIT to the whole process group, and SIGHUP when it is closed.
-    Workers that are hit die, with a traceback each, before whoever started them can stop them
-    in good order; and what is to clear up behind them would die as well. A blocked signal stays
-    blocked in threads and processes that come after, also in a worker that a nanny starts again.
+    Workers would die with a traceback each before they can be stopped cleanly, and so would their
+    nannies. A blocked signal stays blocked in later threads and processes, also in a worker that a
+    nanny restarts.
     """
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP, signal.SIGQUIT})
     try:
-        # It is started with the first process, and whoever starts it has SIGINT unblocked after.
+        # It starts with the first process, and starting it unblocks SIGINT.
         resource_tracker.ensure_running()
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         yield

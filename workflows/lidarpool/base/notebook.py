@@ -1,4 +1,4 @@
-"""Notebooks: whether this is one, and what is shown in its cells."""
+"""Detects notebooks, and displays in their cells."""
 
 from __future__ import annotations
 

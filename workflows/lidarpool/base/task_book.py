@@ -1,4 +1,4 @@
-"""The tasks of a run in bounded memory: totals of all, and records of some thousands."""
+"""The tasks of a run in bounded memory: totals, and some thousand records."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 
 from poolpart import TaskRecord
 
-RECORDS_MOST = 4096  # of one stage; beyond that every other one is dropped, again and again
-RECENT = 1024  # records that are known when they come again
-MISPLACED_MOST = 20  # kept of each stage; all are counted
+RECORDS_MOST = 4096  # of one stage; beyond that every second one is dropped, repeatedly
+RECENT = 1024  # recent records, to recognise duplicates
+MISPLACED_MOST = 20  # kept for each stage; all are counted
 SPANS_MOST = 2048
 
 
@@ -21,19 +21,19 @@ class StageTotals:
     Parameters
     ----------
     stage, partition
-        Its name and where it belongs.
+        Name and partition.
     tasks, items, seconds
-        Tasks, what they count, and their time added up.
+        Number of tasks, their items, and their total time.
     start, stop
         First start and last stop, seconds since the epoch.
     workers
         Names of the workers that ran some.
     resources
-        {resource: tasks that ran on workers which have it}; "none" for those without any.
+        {resource: tasks that ran on workers with it}; "none" for workers without.
     violations, misplaced
-        How many ran outside their partition, and the first of these.
+        Number of tasks outside their partition, and the first of these.
     busy
-        When at least one was running, as far as it is known: (start, stop), in order.
+        Times when at least one was running, as far as known: (start, stop), in order.
     """
 
     stage: str
@@ -50,7 +50,7 @@ class StageTotals:
     busy: list[tuple[float, float]] = field(default_factory=list)
     _records: list[TaskRecord] = field(default_factory=list, repr=False)
     _every: int = 1  # which records are kept
-    _gap: float = 1e-4  # seconds between spans that are taken for one
+    _gap: float = 1e-4  # seconds between spans that are joined
 
     def add(self, record: TaskRecord) -> None:
         """Count a task."""
@@ -72,19 +72,19 @@ class StageTotals:
         self.busy.append((record.start, record.stop))
         while len(self.busy) > SPANS_MOST:
             self.busy = union(self.busy, self._gap)
-            # Coarser until it halves: not again after each of the next records.
+            # Coarser until the number halves, so that this is not repeated for each record.
             if len(self.busy) > SPANS_MOST // 2:
                 self._gap *= 2
                 self.busy = union(self.busy, self._gap)
 
     @property
     def records(self) -> Sequence[TaskRecord]:
-        """Records of the tasks, or of every so many where there are thousands."""
+        """Records of the tasks, or of every n-th if there are thousands."""
         return self._records
 
 
 class TaskBook:
-    """Keeps the tasks of a run, whatever their number, in bounded memory."""
+    """Records the tasks of a run in bounded memory."""
 
     def __init__(self) -> None:
         self.stages: dict[str, StageTotals] = {}
@@ -92,7 +92,7 @@ class TaskBook:
         self._known: set[TaskRecord] = set()
 
     def add(self, record: TaskRecord) -> bool:
-        """Enter a task; False if it was there: a result that is fetched twice brings its own."""
+        """Add a task; False for a duplicate, from a result that is fetched twice."""
         if record in self._known:
             return False
         self._known.add(record)
@@ -107,12 +107,12 @@ class TaskBook:
 
     @property
     def records(self) -> list[TaskRecord]:
-        """Records of the tasks, stage by stage, of every so many where there are thousands."""
+        """Records of the tasks, stage by stage, or of every n-th if there are thousands."""
         return [record for totals in self.stages.values() for record in totals.records]
 
 
 def union(spans: Iterable[tuple[float, float]], gap: float = 0.0) -> list[tuple[float, float]]:
-    """Merge spans that overlap, or lie no further apart than `gap`; in order."""
+    """Merge spans that overlap or are at most `gap` apart; in order."""
     merged: list[tuple[float, float]] = []
     for start, stop in sorted(spans):
         if merged and start <= merged[-1][1] + gap:

@@ -1,4 +1,4 @@
-"""Points that a run passes, told to whoever watches."""
+"""Trace points of a run, for tests."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ _sink: Sink | None = None  # of this process
 
 
 def trace(point: str, /, **fields: Any) -> None:
-    """Say that a run has come to a named point; does nothing unless somebody listens.
+    """Report that a run has reached a named point; does nothing without a listener.
 
     Parameters
     ----------
     point
         Name of the point, ``stage.event``.
     fields
-        What there is to tell; plain values.
+        Plain values to report.
     """
     if _sink is not None:
         _sink(point, fields)
 
 
 def trace_to(sink: Sink | None) -> None:
-    """Call `sink(point, fields)` at each point that this process passes; None for nobody.
+    """Call `sink(point, fields)` at each point of this process; None stops this.
 
-    It is called in the thread that passes the point, and before that goes on: it can log the
-    point as well as hold the thread there, or end the process.
+    It is called in the thread that reaches the point, before that continues: it can log the
+    point, hold the thread, or end the process.
     """
     global _sink
     _sink = sink

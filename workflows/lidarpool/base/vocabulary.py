@@ -1,12 +1,12 @@
-"""Names and figures that scenario files, commands and functions share; importing it costs nothing.
+"""Names and figures shared by scenario files, commands and functions; quick to import.
 
-The command's help and the completion of its words at a terminal read no other module.
+Help and completion of the command import no other module.
 """
 
 from __future__ import annotations
 
 BACKENDS = ("auto", "cuda", "embree", "numpy")
-PICTURES = ("scene", "intensity", "cloud", "path")  # that are drawn
+PICTURES = ("scene", "intensity", "cloud", "path")  # drawn pictures
 
 # Metres in one of each unit.
 UNITS_M = {
@@ -22,9 +22,9 @@ UNITS_M = {
     "mi": 1609.344,
 }
 
-WAIT_S = 10.0  # for partitions that are empty when a run begins
+WAIT_S = 10.0  # for partitions that are empty at the start of a run
 QUEUE_S = 3600.0  # for either, where workers are jobs in a queue
-PATIENCE_S = 60.0  # for those that become empty; a nanny needs a few seconds
+PATIENCE_S = 60.0  # for partitions that become empty; a nanny needs a few seconds
 
 # Formats that a cloud is exported to: the file or folder of each in that of a result, and the
 # columns that it needs. Those that need `scan` store single sweeps.

@@ -1,1 +1,1 @@
-"""Runs: simulate, checks before a run, what is kept, resume, progress."""
+"""Runs: checks before a run, stored runs, resuming, progress."""

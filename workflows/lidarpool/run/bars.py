@@ -14,13 +14,13 @@ from .progress import STAGES, Progress, Show, in_words, is_sure, time_in_words
 
 
 class Pace:
-    """Rate of a count since it was first seen, and the time that the rest of it takes."""
+    """Rate of a count since it was first seen, and the time left."""
 
     def __init__(self) -> None:
         self._first: tuple[float, int] | None = None
 
     def told(self, seconds: float, count: int, whole: int) -> str:
-        """Rate and time left; empty as long as nothing has come."""
+        """Rate and time left; empty until something has been counted."""
         begin, before = self._first = self._first or (seconds, count)
         if count == before or seconds == begin:
             return ""
@@ -31,14 +31,14 @@ class Pace:
 
 
 def standing_still(progress: Progress) -> str:
-    """Why no more scans come; empty where they do."""
+    """Why the run waits; empty if it does not."""
     slots = progress.waits_for
     return f"waits for slots of {slots}, which other runs hold" if slots else ""
 
 
 @contextmanager
 def bars(console: Console) -> Iterator[Show]:
-    """Bars by stage with rates and time left; gives the function that moves them."""
+    """Bars by stage with rates and time left; yields the function that moves them."""
     columns = (
         TextColumn("{task.description:<11}"),
         BarColumn(bar_width=None),

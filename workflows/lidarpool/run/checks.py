@@ -1,4 +1,4 @@
-"""Questions asked before a run starts, so that it need not fail in the middle."""
+"""Checks before a run starts, so that it does not fail in the middle."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from ..scan import COLLECT, GENERATE, GPU, LIDAR, OTHER, SORT
 from ..scene.scene import Scene
 from ..sensor import Survey
 
-AUTO_TAKES = "Backend 'auto' takes what works."
+AUTO_TAKES = "Backend 'auto' takes one that works."
 LOOK_EVERY_S = 0.2
 TELL_EVERY_S = 5.0  # and less often in a long wait
 
 
 class TooFewWorkersError(LidarpoolError):
-    """A partition lacks workers or slots; more may come."""
+    """A partition lacks workers or slots; more may join."""
 
 
 def slots_needed(collectors: int, planning: bool) -> dict[str, int]:
-    """Slots that a run needs of each partition: {name: slots}."""
+    """Slots that a run needs in each partition: {name: slots}."""
     return {GPU: 1, LIDAR: 2 + collectors} | ({OTHER: 1} if planning else {})
 
 
@@ -49,7 +49,7 @@ def check_precision(scene: Scene, survey: Survey) -> None:
 
 def check_backend_here(wanted: str, advice: str = AUTO_TAKES) -> None:
     """Refuse a backend that this machine lacks, before a local cluster is started for it."""
-    # Within an extension module's first lines an interrupt would pass for one that is missing.
+    # An interrupt during the import of an extension module would look like a missing one.
     with deferred_interrupts():
         backends = {"auto": "", **available_backends()}
     if wanted not in backends:
@@ -71,27 +71,27 @@ def find_workers(
     wait_s: float = 0.0,
     tell: Callable[[str], None] = lambda words: None,
 ) -> tuple[Pool, list[WorkerInfo], str]:
-    """Find all workers, those that cast among them, and the backend that these have.
+    """Find all workers, the casting ones among them, and their backend.
 
     Parameters
     ----------
     client
         Client of the cluster.
     collectors, planning
-        Tasks of stage 4, and whether there is something to plan.
+        Tasks of stage 4, and whether there is planning.
     wanted
         Backend.
     advice
-        End of the message where that is not to be had.
+        End of the message if it is not available.
     wait_s
-        How long to wait for workers that are not there, or have just died, seconds.
+        How long to wait for missing workers, or ones that just died, seconds.
     tell
-        Called, every few seconds, with what is waited for.
+        Called every few seconds with a message while it waits.
 
     Raises
     ------
     LidarpoolError
-        If there are no workers, other versions, too few slots in a partition, or not the backend.
+        If workers, slots or the backend are missing, or versions differ.
     """
     if client.asynchronous:
         raise LidarpoolError("The client is asynchronous: give one made without asynchronous=True.")
@@ -113,19 +113,19 @@ def find_workers(
 
 
 def _survey_pool(client: Client, needed: Mapping[str, int]) -> Pool:
-    """All workers of the cluster, once it is sure that they are enough for a survey."""
+    """All workers of the cluster, after checking that they suffice for a survey."""
     workers = worker_identities(client)
     if not workers:
         raise TooFewWorkersError(
             f"The cluster at {client.scheduler.address} has no workers: start some, for "
             f'example dask worker {client.scheduler.address} --resources "GPU=1"'
         )
-    # Only those that are to work: a cluster may have others' workers, with other packages.
+    # Only those that will work: a cluster may have other workers, with other packages.
     _check_versions(client, [a for a, w in workers.items() if {*needed} & {*w["resources"]}])
     try:
         pool = Pool.from_client(client, declaring=set(needed))
         pool.require(dict.fromkeys(needed, 0))  # that none declares two
-    except PoolError as error:  # what more workers do not put right
+    except PoolError as error:  # errors that more workers do not correct
         raise LidarpoolError(str(error)) from error
     purpose = {
         GPU: "stage 2 casts the rays",
@@ -142,7 +142,7 @@ def _survey_pool(client: Client, needed: Mapping[str, int]) -> Pool:
 def _check_versions(client: Client, workers: Sequence[str]) -> None:
     """Check that the workers at these addresses have this version of lidarpool."""
 
-    # Nested, so that it travels by value: a worker that lacks the package can still run it.
+    # Nested, so that it is sent by value: a worker without the package can still run it.
     def version() -> str:
         from lidarpool._version import __version__
 
@@ -166,13 +166,13 @@ def common_backend(
 ) -> str:
     """Name of the ray-casting backend to use on all these workers.
 
-    "auto" is settled here, once: if each worker chose for itself, a cloud would depend on
-    which of them casts which scan. `advice` ends the message where one is not to be had.
+    "auto" is resolved here, once: if each worker chose for itself, a cloud would depend on which
+    worker casts which scan. `advice` ends the message if the backend is not available.
 
     Raises
     ------
     LidarpoolError
-        If the backend wanted is not there on all of them.
+        If a worker lacks the requested backend.
     """
     answers: Mapping[str, Any] = ask_workers(
         client, available_backends, [worker.address for worker in workers]
@@ -182,7 +182,7 @@ def common_backend(
             raise answer
     if not answers:
         raise TooFewWorkersError(
-            "The workers of partition 'GPU' left before the run started: see in their logs why."
+            "The workers of partition 'GPU' left before the run started: their logs say why."
         )
     if wanted == "auto":
         names = next(iter(answers.values()))

@@ -126,7 +126,7 @@ def connected(scheduler: str, files: TlsFiles | None = None) -> Iterator[Client]
     Raises
     ------
     LidarpoolError
-        If no scheduler answers at this address, or the certificates do not do.
+        If no scheduler answers at this address, or the certificates are wrong.
     """
     if ":" not in scheduler.rpartition("//")[2] and not scheduler.startswith("inproc"):
         raise LidarpoolError(
@@ -145,7 +145,7 @@ def connected(scheduler: str, files: TlsFiles | None = None) -> Iterator[Client]
             scheduler, security=security, timeout=CONNECT_TIMEOUT_S, set_as_default=False
         )
     except Exception as error:
-        # What is there may be no scheduler, and what it answers may make any error.
+        # Another program may listen there, and its answer may cause any error.
         cause: BaseException = error
         while cause.__cause__ or cause.__context__:
             cause = cause.__cause__ or cause.__context__  # type: ignore[assignment]
@@ -160,7 +160,7 @@ def connected(scheduler: str, files: TlsFiles | None = None) -> Iterator[Client]
 
 
 async def _knock(address: str, security: Security) -> None:
-    """See whether a scheduler answers; a client waits for ever for one that says nothing."""
+    """Check that a scheduler answers; a client waits for ever for a silent one."""
     comm = await connect(
         address, timeout=CONNECT_TIMEOUT_S, **security.get_connection_args("client")
     )

@@ -1,4 +1,4 @@
-"""What makes the bytes of a result: two runs that agree in it give the same cloud."""
+"""Identity of a result: runs with the same identity give the same bytes."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ _CONTENT = ("scene", "survey", "planning")
 
 
 def identity_of(job: Job) -> dict[str, str]:
-    """Fingerprints of the inputs of a run, and the versions of what computes with them.
+    """Fingerprints of the inputs of a run, and versions of the software.
 
     Raises
     ------
     LidarpoolError
-        If a sensor, column or trajectory holds something that has no fingerprint.
+        If a sensor, column or trajectory has a field without a fingerprint.
     """
     scene, survey = job.scene, job.survey
     return {
@@ -46,7 +46,7 @@ def identity_of(job: Job) -> dict[str, str]:
 
 
 def difference(here: Mapping[str, str], there: Mapping[str, str]) -> str:
-    """In what an earlier run differs from this one, as a clause; empty where it does not."""
+    """Describe the difference of an earlier run in a clause; empty if there is none."""
     for name, value in here.items():
         if there.get(name) != value:
             if name in _CONTENT:

@@ -1,4 +1,4 @@
-"""What a run is to do; it does not change while it is done."""
+"""The immutable description of a run."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ from .checks import check_precision
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """A survey, beside it perhaps a planning, and how both are to be run.
+    """A survey, possibly a planning, and how to run both.
 
     Parameters
     ----------
     scene, survey, planning
-        What to scan, how, and what to plan meanwhile.
+        The scene, how to scan it, and what to plan.
     backend
         Ray-casting backend of stage 2: auto, cuda, embree or numpy.
     queue_capacity
-        Items that stage 1 may be ahead of stage 2.
+        How many items stage 1 may be ahead of stage 2.
     collectors
         Tasks of stage 4.
     wait_s
-        How long to wait for partitions that are still empty when the run begins, seconds.
+        How long to wait for partitions that are empty at the start, seconds.
     patience_s
-        How long to wait for partitions that become empty, seconds.
+        How long to wait for partitions that become empty later, seconds.
 
     Raises
     ------
     LidarpoolError
-        If a number is below 1, the survey's precision too fine for the scene, a material one
-        of no object, or an object without a material where others have one.
+        If a number is below 1, the survey's precision too fine for the scene, a material is for
+        no object, or an object lacks a material while others have one.
     """
 
     scene: Scene
@@ -64,14 +64,14 @@ class Job:
 
     @property
     def trials(self) -> int:
-        """Planning trials that there are to be."""
+        """Number of planning trials."""
         return self.planning.trials if self.planning else 0
 
 
 def make_job(
     scenario: Scenario, backend: str | None = None, no_plan: bool = False, **options: Any
 ) -> Job:
-    """Read the scene and put together what a scenario asks for; options go first.
+    """Read the scene and make the job of a scenario; options override it.
 
     Raises
     ------

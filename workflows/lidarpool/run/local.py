@@ -1,4 +1,4 @@
-"""The cluster that a survey starts on this machine: how many workers each partition has."""
+"""The local cluster of a survey: the number of workers of each partition."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ def usable_cores() -> int:
 def default_workers(cores: int, gpus: int) -> dict[str, int]:
     """Worker processes of the GPU and OTHER partitions for a machine.
 
-    One worker a GPU, and OTHER has the rest of the cores. Without GPUs the GPU partition falls
-    back to CPU workers, for three quarters of the cores. The LIDAR stages mostly wait and share
-    one process.
+    One worker for each GPU, and OTHER has the remaining cores. Without GPUs the GPU partition has
+    CPU workers for three quarters of the cores. The LIDAR stages mostly wait, so they share one
+    process.
 
     Examples
     --------
@@ -49,14 +49,14 @@ def local_cluster(
     Parameters
     ----------
     gpu_workers
-        Workers of the GPU partition, one thread each; by default one a GPU, or for three
-        quarters of the cores where there is no GPU.
+        Workers of the GPU partition, one thread each; by default one for each GPU, or without GPUs
+        for three quarters of the cores.
     lidar_slots
         Threads, and slots, of the one LIDAR worker.
     other_workers
-        Workers of the OTHER partition, one thread each; by default what is left. 0 for none.
+        Workers of the OTHER partition, one thread each; by default the remaining cores. 0 for none.
     **options
-        What `poolpart.local_cluster` takes besides.
+        Further options of `poolpart.local_cluster`.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What the pictures of a result are drawn from, beside the cloud, kept in a file of its own."""
+"""The data of a result's pictures, except the cloud, in a separate file."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from .result import RunResult
 
 PICTURE_FILE = "pictures.npz"
 
-MODELS_MOST = 4  # sensors that are named in a picture
-PLACES_MOST = 1000  # of a sensor or an actor that moves
+MODELS_MOST = 4  # sensors named in a picture
+PLACES_MOST = 1000  # positions of a moving sensor or actor
 _FORMAT = 3
 _ACTOR = ("vertices", "faces", "times", "positions", "quaternions")
 _PLAN_NUMBERS = ("length", "shortest_possible", "clearance", "trial", "trials")
@@ -35,18 +35,18 @@ _PLAN_NUMBERS = ("length", "shortest_possible", "clearance", "trial", "trials")
 
 @dataclass(frozen=True, eq=False)
 class SensorWay:
-    """Where a sensor is in the course of time.
+    """Positions of a sensor over time.
 
     Parameters
     ----------
     times_ns
         float64 (k,), ascending, nanoseconds since the survey's start.
     positions
-        float64 (k, 3): where it is then, metres, local coordinates.
+        float64 (k, 3): its positions then, metres, local coordinates.
     moves
-        Whether it moves from each place to the next; else it stands there until its time.
+        Whether it moves from each position to the next; else it stands until the next time.
     name, model
-        What it is called, "" where there is one; and what it is.
+        Its name, "" for a single sensor; and its model.
     """
 
     times_ns: NDArray[np.float64]
@@ -56,7 +56,7 @@ class SensorWay:
     model: str = ""
 
     def at(self, time_ns: float) -> NDArray[np.float64]:
-        """Where it is at a time, (3,)."""
+        """Its position at a time, (3,)."""
         if self.moves:
             return np.array([np.interp(time_ns, self.times_ns, x) for x in self.positions.T])
         last = int(np.searchsorted(self.times_ns, time_ns, "right")) - 1
@@ -65,25 +65,25 @@ class SensorWay:
 
 @dataclass(frozen=True, eq=False)
 class Pictured:
-    """What the pictures of a result show, but for the points of the cloud.
+    """Content of a result's pictures, except the points.
 
     Parameters
     ----------
     scene
-        What was scanned; trajectories of its actors are a thousand poses at most.
+        The scene; trajectories of its actors have a thousand poses at most.
     sensors
-        Where they were.
+        Their positions.
     hit_counts
         int64 (f,): hits of each triangle, those of actors after the others.
     sample_rays
         float32 (k, 2, 3): ends of some rays, metres, local coordinates.
     planning, plan
-        What was planned and the best path; None where nothing was.
+        The planning and the best path; None without planning.
     trials
-        What the best path was chosen from, float64 (w, 2) each: corners of the paths between the
-        two ends, metres, local coordinates.
+        All trials, float64 (w, 2) each: corners of the paths between the two ends, metres, local
+        coordinates.
     duration_ns
-        How long the survey lasted, by its own clock.
+        Duration of the survey, by its own clock.
     reflectance
         float64 (objects,): share of light that each object reflects, actors after the others;
         None if it is not known.
@@ -122,7 +122,7 @@ class Pictured:
 
     @property
     def when(self) -> str:
-        """Say how many sensors there are, and at what time pictures show what moves: halfway."""
+        """Describe the sensors, and the time of pictures with motion: half of the survey."""
         sensors, actors = len(self.sensors), len(self.scene.actors)
         if any(way.moves for way in self.sensors):
             words = f"{counted(sensors, 'sensor')} on {'its' if sensors == 1 else 'their'} way"
@@ -135,13 +135,13 @@ class Pictured:
 
     @property
     def models(self) -> str:
-        """Say what the sensors are, by their names where they have one."""
+        """Models of the sensors, with their names if they have any."""
         words = [f"{way.name}: {way.model}" if way.name else way.model for way in self.sensors]
         more = len(words) - MODELS_MOST
         return " · ".join(words[:MODELS_MOST]) + (f" · and {more:,} more" if more > 0 else "")
 
     def names_of(self, column: Column) -> Sequence[str]:
-        """Names of the values 0, 1, 2, … of a column, where they have some."""
+        """Names of the values 0, 1, 2, … of a column, if any."""
         if column.name == "sensor":
             return [way.name for way in self.sensors]
         return self.scene.all_names if column.name == "object" else ()
@@ -165,7 +165,7 @@ class Pictured:
             "vertices": self.scene.vertices,
             "faces": self.scene.faces,
             "face_object": self.scene.face_object,
-            # Strings of NumPy are all as long as the longest, and lose zeros at their end.
+            # NumPy strings all have the length of the longest, and lose trailing zeros.
             "names": np.frombuffer(json.dumps(names).encode(), np.uint8),
             "origin": self.scene.origin,
             "duration_ns": self.duration_ns,
@@ -193,7 +193,7 @@ class Pictured:
                 "waypoints": np.array(self.trials),
             }
             arrays |= {name: getattr(self.plan, name) for name in _PLAN_NUMBERS}
-        # At the end of a full disk an archive that is written directly leaves a handle behind.
+        # On a full disk, an archive that is written directly would leave an open handle.
         memory = io.BytesIO()
         np.savez_compressed(memory, **arrays)
         path.write_bytes(memory.getbuffer())
@@ -257,7 +257,7 @@ class Pictured:
 
 
 def sensor_ways(survey: Survey) -> list[SensorWay]:
-    """Where each sensor was: at each station, or now and then on its way."""
+    """Positions of each sensor: at each station, or samples of its trajectory."""
     path, ways, first = survey.path, [], 0
     for carried, steps in zip(survey.carried, survey.steps_each, strict=True):
         end = first + steps * path.stations
@@ -274,9 +274,9 @@ def sensor_ways(survey: Survey) -> list[SensorWay]:
 def ways_of(
     sensors: Sequence[SensorWay], actors: Sequence[Actor], duration_ns: float
 ) -> list[NDArray[np.float64]]:
-    """Where something happens in a scene: ways (k, 3) of sensors, else of actors and their sensors.
+    """Trajectories (k, 3) of moving sensors, else of actors and the sensors; none without motion.
 
-    There are none where nothing moves.
+    Pictures and pages look at their surroundings.
     """
     moving = [way.positions for way in sensors if way.moves]
     if moving or not actors:

@@ -1,11 +1,11 @@
-"""How far a run has come, and how that is said."""
+"""Progress of a run, and its texts."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
-# What is shown of a run: label, name of the count so far, and of the total, which is the unit.
+# Lines of progress: label, name of the count, and of the total, which is the unit.
 STAGES: tuple[tuple[str, str, str], ...] = (
     ("1 generate", "generated", "scans"),
     ("2 intersect", "cast", "scans"),
@@ -14,14 +14,14 @@ STAGES: tuple[tuple[str, str, str], ...] = (
     ("planning", "trials_done", "trials"),
 )
 
-# The first items are slow, as workers warm up: what is left is told after this share of them, or
-# after this time.
+# The first items are slow, because workers warm up: the time left is shown after this share of
+# items, or after this time.
 SURE_SHARE, SURE_S = 0.05, 20.0
 
 
 @dataclass(frozen=True)
 class Progress:
-    """Counts at one moment of a run.
+    """Counts of a run at one moment.
 
     `generated`, `cast`, `framed` and `collected` are scans that have passed stage 1 to 4, out
     of `scans`; `trials_done` are planning trials out of `trials`. `seconds` is since the start,
@@ -46,17 +46,17 @@ Show = Callable[[Progress], None]
 
 
 def is_sure(count: float, whole: float, seconds: float) -> bool:
-    """Whether enough is done, after so many seconds, to say how long the rest will take."""
+    """Whether enough is done, after so many seconds, to estimate the time left."""
     return count >= SURE_SHARE * whole or seconds >= SURE_S
 
 
 def in_words(rate: float) -> str:
-    """Rate with as many digits as say something: 0.25, 3.1, 52, 1,234."""
+    """Rate with two significant digits at least: 0.25, 3.1, 52, 1,234."""
     return f"{rate:,.0f}" if rate >= 10 else f"{rate:.2g}"
 
 
 def time_in_words(seconds: float) -> str:
-    """Time as somebody who waits would say it: 8 s, 3 min, 2 h 05 min."""
+    """Time in words: 8 s, 3 min, 2 h 05 min."""
     if seconds < 100:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)

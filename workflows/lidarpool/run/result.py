@@ -26,29 +26,29 @@ class RunResult:
     Parameters
     ----------
     scene, survey, planning
-        What was scanned and how, and what was planned; None for nothing.
+        The scene, the survey, and the planning or None.
     points
-        The points, in parts: to be read in order a piece at a time, or written with `save_cloud`.
+        The points, in parts: read in order a piece at a time, or written with `save_cloud`.
     plan, trials
-        The best path and all trials; None and empty where nothing was planned.
+        The best path and all trials; None and empty without planning.
     backend
         Name of the ray-casting backend that was used.
     rays, hits
         Rays fired, and those that hit something.
     records
-        Tasks of the run: where each ran and when; of a stage with thousands, every so many.
+        Tasks of the run, with worker and time; every n-th of a stage with thousands.
     stages
         All tasks of each stage together.
     seconds, survey_seconds, planning_seconds
         Wall time of all, of the survey and of the planning.
     replayed, duplicates_dropped
-        Batches that had to be offered again, and scans that came twice because of it.
+        Batches that were offered again, and scans that arrived twice for that reason.
     resumed
-        Scans whose points are of an earlier run. `records` and seconds are of this run only.
+        Scans from an earlier run. `records` and seconds are of this run only.
     notes
-        What a user should know, such as that the GPU partition had no GPU.
+        Remarks for the user, such as that the GPU partition had no GPU.
     identity
-        Fingerprints of scene, survey and planning, and versions of what computed with them.
+        Fingerprints of scene, survey and planning, and versions of the software.
     """
 
     scene: Scene
@@ -81,7 +81,7 @@ class RunResult:
 
     @cached_property
     def cloud(self) -> Cloud:
-        """The points in memory, read when first asked for."""
+        """The points in memory, read on first use."""
         return self.points.load()
 
     @cached_property

@@ -1,4 +1,4 @@
-"""A run on a cluster: the survey and, beside it, the planning, stepped in turn."""
+"""A run on a cluster: steps the survey and the planning in turn."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ from .trials import TrialPump
 
 T = TypeVar("T")
 
-# What Dask raises, here or there, once the scheduler is gone.
+# Errors that Dask raises once the scheduler is gone.
 _CLUSTER_LOST = (OSError, CommClosedError, FutureCancelledError, PipeClosed, PipeFailed)
 
 PROGRESS_EVERY_S = 0.1
-SAVE_EVERY_S = 1.0  # how many frames were handed out
+SAVE_EVERY_S = 1.0  # stores the number of frames handed out
 LOST_S = 0.5  # for a client to notice that its scheduler is gone
 LONGEST_PAUSE_S = 0.05  # while nothing moves
 
@@ -57,9 +57,9 @@ class Run:
     client
         Client of the cluster.
     store
-        Where parts and receipts go, and what an earlier run has left there.
+        Store of parts and receipts, with what an earlier run has left.
     tell
-        Called, every few seconds, with what the run waits for.
+        Called every few seconds with a message while the run waits.
 
     Raises
     ------
@@ -76,7 +76,7 @@ class Run:
         job = store.job
         self.client, self.job, self.store = client, job, store
         self._tell = tell
-        # For when it is lost; a client that was never connected is refused in a moment.
+        # For errors about a lost cluster; a client that was never connected is refused below.
         self.address: str = getattr(client.scheduler, "address", "")
         try:
             pool, casting, backend = find_workers(
@@ -89,10 +89,12 @@ class Run:
                 tell=tell,
             )
             store.backend = backend
-            assign_devices(client, casting)  # all at once: those that see few of them choose first
+            assign_devices(
+                client, casting
+            )  # all at once: workers that see few devices choose first
         except LidarpoolError:
             raise
-        except Exception as error:  # which one, depends on what was being asked
+        except Exception as error:  # the kind depends on the request
             if client.status != "running" or isinstance(error, CommClosedError):
                 raise self._told_lost() from error
             raise
@@ -111,9 +113,9 @@ class Run:
 
     @contextmanager
     def partitions_page(self) -> Iterator[None]:
-        """Say where the page of partitions is, which is there as long as the body runs.
+        """Show the page of partitions while the body runs, and print its address.
 
-        Nothing happens where the scheduler serves no pages.
+        Does nothing if the scheduler serves no pages.
         """
         with suppress(PoolError):
             self._tell(f"partitions page: {self._pool.page(stay=False)}")
@@ -129,7 +131,7 @@ class Run:
         on_frame: Callable[[Frame], None] | None,
         on_progress: Callable[[Progress], None] | None,
     ) -> RunResult:
-        """Run to the end; whatever is raised, everything has been stopped by then."""
+        """Run to the end; on any error, everything has been stopped."""
         started = time.monotonic()
         pumps: list[SurveyDriver | TrialPump] = []
         trials = None
@@ -148,7 +150,7 @@ class Run:
                 pump.finish()
             self.notes += survey.notes
         except BaseException as error:
-            # A client that loses its scheduler cancels all futures: tasks seem to be cancelled.
+            # A client that loses its scheduler cancels all futures, so tasks look cancelled.
             # After some seconds it gives up and closes, and any call of it makes any error.
             lost = _is_lost(self.client, error)
             reason = str(error) or type(error).__name__
@@ -194,7 +196,7 @@ class Run:
         )
 
     def _call(self, callback: Callable[[T], None], argument: T) -> None:
-        """Call back the caller; an OSError of theirs must not be taken for the cluster's."""
+        """Call a callback of the caller; its OSError must not look like the cluster's."""
         try:
             callback(argument)
         except BaseException as error:
@@ -209,7 +211,7 @@ class Run:
         on_progress: Callable[[Progress], None] | None,
         started: float,
     ) -> dict[type, float]:
-        """Step the pumps until all have finished; returns when each did, in seconds."""
+        """Step the pumps until all have finished; returns the time of each, in seconds."""
         pause_s = 0.0
         watch = Watch(
             self.client,
@@ -257,7 +259,7 @@ class Run:
 def make_result(
     store: RunStore, books: Sequence[TaskBook] = (), notes: Iterable[str] = (), **figures: Any
 ) -> RunResult:
-    """Put the result together once everything is committed; `figures` are others of `RunResult`."""
+    """Make the result once all is committed; `figures` are other fields of `RunResult`."""
     job = store.job
     trials = tuple(sorted(store.db.trials, key=lambda trial: trial.trial))
     return RunResult(
@@ -292,13 +294,13 @@ def _is_lost(client: Client, error: BaseException) -> bool:
 
 
 def _stop(client: Client, pumps: list[SurveyDriver | TrialPump], reason: str) -> None:
-    """Stop what can be stopped; the cluster may be gone, and then nothing can."""
+    """Stop everything, as far as the cluster can be reached."""
     if client.status != "running":  # Dask would try for half a minute to reach it
         return
     for pump in pumps:
         for step in (lambda pump=pump: pump.stop(reason), pump.finish):
             try:
-                # The first error is the one to tell of.
+                # Report the first error.
                 with suppress(OSError, CommClosedError, FutureCancelledError, RuntimeError):
                     step()
             except Exception:

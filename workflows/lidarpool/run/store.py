@@ -30,7 +30,7 @@ from .progress import Progress
 from .remote import OWNER, RemoteRun, fetch_database
 
 PARTS = "parts"  # the folder of the parts, in the run's folder
-RUN_FOLDER = "run"  # the run's folder in that of the output, until the result is whole
+RUN_FOLDER = "run"  # the run's folder in the output folder, until the result is complete
 SAMPLE_RAYS = 400  # of the pictures
 
 # On the command line, and in Python.
@@ -44,15 +44,15 @@ class RunStore:
     Parameters
     ----------
     job
-        What the run does.
+        The job of the run.
     place
         Where they are kept, a folder or a URL; None for a temporary folder that goes with the
         last user of the points.
     parts
-        Another place for the parts, a path or URL, in which they get a folder of their own. A
-        run that is resumed goes on where its parts are.
+        Another place for the parts, a path or URL, in which they get their own folder. A resumed
+        run uses the place of its parts.
     resume
-        Whether to go on from what is there; if not, there must be nothing.
+        Whether to continue an existing run; otherwise there must be none.
 
     Raises
     ------
@@ -77,7 +77,7 @@ class RunStore:
             )
         self.job = job
         self.lasting = place is not None
-        self.notes: list[str] = []  # what a user should know
+        self.notes: list[str] = []  # remarks for the user
         self.on_parts: Callable[[list[Receipt]], None] | None = None  # called with new ones
         self._gone = False
         self.identity = here = identity_of(job)
@@ -119,7 +119,7 @@ class RunStore:
         self.resumed = self.db.scans_done  # scans whose points are of an earlier run
 
     def _open(self, here: dict[str, str], parts: str | Path | None) -> RunDatabase:
-        """Open the database, a new one unless something is committed in that which is there."""
+        """Open the database, or a new one if nothing is committed in it."""
         path, count = self._folder / FILE, self.job.survey.scan_count
         durable = self.lasting and self._remote is None
         try:
@@ -144,7 +144,7 @@ class RunStore:
         return db
 
     def _go_on(self, here: dict[str, str], resume: bool, sizes: dict[str, int]) -> None:
-        """Check that this run may go on from what is there."""
+        """Check that this run may continue the existing one."""
         if other := difference(here, json.loads(self.db.meta["identity"])):
             raise LidarpoolError(
                 f"The run in {self.place} cannot be continued, {other}. Drop it with {_DROP}, or "
@@ -177,11 +177,11 @@ class RunStore:
                 f"{self.storage.url} cannot be looked at: {error.strerror or error}."
             ) from error
 
-    # -- what there is ---------------------------------------------------------------------
+    # -- reading ---------------------------------------------------------------------------
 
     @property
     def backend(self) -> str:
-        """Backend that casts the scans; empty until it is known."""
+        """Backend of the scans; empty until known."""
         return self.db.meta.get("backend", "")
 
     @backend.setter
@@ -191,7 +191,7 @@ class RunStore:
 
     @property
     def kept(self) -> str:
-        """What is committed, in words; empty if nothing is."""
+        """Committed scans and trials in words; empty for none."""
         if self.db.scans_done:
             return f"{self.db.scans_done:,} of {self.job.survey.scan_count:,} scans"
         if self.db.trials:
@@ -200,12 +200,12 @@ class RunStore:
 
     @property
     def complete(self) -> bool:
-        """Whether this is all that a result is made of."""
+        """Whether everything for a result is committed."""
         return self.db.complete and len(self.db.trials) == self.job.trials
 
     @property
     def advice(self) -> str:
-        """What to do where the backend is not to be had, for the end of a message."""
+        """Advice if the backend is not available, for the end of a message."""
         if not self.resumed:
             return AUTO_TAKES
         return (
@@ -214,7 +214,7 @@ class RunStore:
         )
 
     def progress(self) -> Progress:
-        """How far a run is that goes on from here, before it does."""
+        """Progress of a resumed run at its start."""
         db = self.db
         return Progress(
             scans=self.job.survey.scan_count,
@@ -230,12 +230,12 @@ class RunStore:
 
     @property
     def _cloud_origin(self) -> NDArray[np.float64]:
-        """Of the points' coordinates: that of the scene, or none in a sensor's."""
+        """Origin of the points: that of the scene, or none in sensor coordinates."""
         world = self.job.survey.coordinates == "world"
         return self.job.scene.origin if world else np.zeros(3)
 
     def points(self) -> StoredCloud:
-        """Points that are committed so far."""
+        """Points committed so far."""
         parts = self.db.ordered
         survey = self.job.survey
         return StoredCloud(
@@ -251,7 +251,7 @@ class RunStore:
         )
 
     def points_of_scan(self, scan: int) -> Cloud:
-        """Points of a scan that is committed."""
+        """Points of a committed scan."""
         part = self.db.part_of(scan)
         columns = read_part(self.storage, part.name)
         ends = np.cumsum(columns.counts)
@@ -268,7 +268,7 @@ class RunStore:
         return counts
 
     def sample_rays(self) -> NDArray[np.float32]:
-        """First and last point of some rays, (k, 2, 3), metres, local coordinates."""
+        """Return the ends of some rays, (k, 2, 3), metres, local coordinates."""
         survey = self.job.survey
         samples = samples_of_scan(survey.scan_count)
         kind = summary_type(samples)
@@ -299,13 +299,13 @@ class RunStore:
             self._remote.save(self.db, now=now)
 
     def tidy(self) -> None:
-        """Remove parts that are not of the result: their collectors died, or were not needed."""
+        """Remove parts that are not in the result, of dead or superseded collectors."""
         ours = {part.name for part in self.db.parts.values()}
         with suppress(OSError, LidarpoolError):
             self.storage.remove([n for n in self._sizes() if SUFFIX in n and n not in ours])
 
     def remove(self) -> None:
-        """Remove all of it: the result is where it belongs."""
+        """Remove the store: the result is in place."""
         if self._remote:
             self._remote.check()
         self._gone = True
@@ -314,13 +314,13 @@ class RunStore:
 
     @contextmanager
     def kept_on_error(self) -> Iterator[None]:
-        """Add to an error of the body how to go on; without anything committed all is removed."""
+        """Add to an error of the body how to resume; remove the store if nothing is committed."""
         try:
             yield
         except BaseException as error:
             if self._gone or not self.lasting:
                 raise
-            with suppress(LidarpoolError):  # the first error is the one to tell of
+            with suppress(LidarpoolError):  # report the first error
                 self.save(now=True)
             self.db.close()
             if self._remote and self._remote.lost:
@@ -340,7 +340,7 @@ def _storage(place: str | Path, parts: str, *, durable: bool = True) -> Storage:
 
 @checked
 def remove_run(folder: str | Path) -> None:
-    """Remove what a run has kept in a folder, and its parts, wherever they are; nothing else.
+    """Remove a stored run and its parts, wherever they are, and nothing else.
 
     Parameters
     ----------

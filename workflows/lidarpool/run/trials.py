@@ -1,4 +1,4 @@
-"""The driver's side of planning: trials on the OTHER partition, a few under way at a time."""
+"""The driver's side of planning: trials on the OTHER partition, a few at a time."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class TrialPump:
     client
         Client of the cluster.
     partition
-        Where the trials run.
+        Partition of the trials.
     planning
         What to plan.
     done
@@ -52,7 +52,7 @@ class TrialPump:
         self._running: dict[Future, int] = {}  # {future: number of the trial}
         self._rounds: Counter[int] = Counter()  # {number: how often it was submitted}
         self._looked_at = time.monotonic()
-        # One waits behind each that runs: no slot idles, and a dying worker takes few along.
+        # One waits behind each running trial: no slot idles, and a dying worker loses few.
         self._most = 2 * max(1, partition.slots)
 
     @property
@@ -103,7 +103,7 @@ class TrialPump:
     def _take_failure(self, future: Future, number: int) -> None:
         if future.status == "cancelled":
             raise LidarpoolError(f"Planning trial {number} was cancelled from outside this run.")
-        # Dask gives up what was on several workers that died, whoever ended them.
+        # Dask gives up tasks after several deaths of their workers, whatever the cause.
         if was_killed(future) and self._rounds[number] < ROUNDS_MOST:
             self._waiting.append(number)
             return
@@ -111,21 +111,21 @@ class TrialPump:
         raise LidarpoolError(f"Planning trial {number} failed: {error}")
 
     def _leave_silent_workers(self) -> None:
-        """Run trials elsewhere whose workers give no sign of life, or have gone."""
+        """Rerun trials whose workers are silent or have gone."""
         self._looked_at = time.monotonic()
         keys = [future.key for future in self._running]
         seen = look_for_tasks(self.client, self.partition.name, keys)
         heard = sorted(seen.members - seen.silent)
-        # One that was bound to a worker which has gone since waits for it for ever.
+        # A trial bound to a worker that has gone waits for ever.
         waiting = {key for key, place in seen.tasks.items() if place.state == "no-worker"}
         lost = [f for f in self._running if f.key in waiting or seen.out_of_reach(f.key)]
         for place, future in enumerate(lost if heard else []):
             self._submit(self._running.pop(future), heard[place % len(heard)])
 
     def stop(self, reason: str) -> None:
-        """Start no more trials; those that run end by themselves in a fraction of a second."""
+        """Start no more trials; running ones end in a fraction of a second."""
         self.client.cancel(list(self._running))
 
     def finish(self) -> None:
-        """Let go of everything on the scheduler."""
+        """Release everything on the scheduler."""
         self._running.clear()
