@@ -81,6 +81,7 @@ class View:
         self._reflectance = reflectance
         self._poses = places_of(sensors)
         self._actors = () if scene is None else scene.actors
+        self._actor_names = () if scene is None else scene.all_names[len(scene.names) :]
         self._origin, self._ground = origin, float(bounds[0, 2])
         near = around_ways(bounds, ways_of(sensors, self._actors, duration_ns))
         from_near = near is not None
@@ -292,13 +293,15 @@ class View:
         with self._page.atomic():
             for marker, way in zip(self._markers, self._sensors, strict=True):
                 marker.position = way.at(time_ns)
-            for body, actor in zip(self._bodies, self._actors, strict=True):
+            for body, actor, name in zip(
+                self._bodies, self._actors, self._actor_names, strict=True
+            ):
                 positions, rotations = actor.trajectory.poses(0, np.array([time_ns]))
                 body.position = positions[0]
                 if rotations is not None:
                     body.wxyz = np.roll(quaternions_of(rotations)[0], 1)
                 top = float(actor.mesh.vertices[:, 2].max())
-                self._labels.put(actor.name, positions[0] + [0.0, 0.0, top])
+                self._labels.put(name, positions[0] + [0.0, 0.0, top])
 
     def _follow_carrier(self, time_ns: float) -> None:
         """Move all cameras as the carrier has moved."""
