@@ -530,7 +530,7 @@ def test_a_cloud_is_saved_in_the_format_of_its_ending(cloud, sweeps, tmp_path):
 
     before = sorted(tmp_path.rglob("*"))
     for told, path, more in (
-        (r"ends as no format does: use .ply, .las, .*, or give a format", "x.xyz", {}),
+        (r"has no format: use .ply, .las, .*, or give a format", "x.xyz", {}),
         ("There is no format 'xyz': use", "x", {"format": "xyz"}),
         ("There is no layout 'sick': use velodyne", "x.mcap", {"layout": "sick"}),
         ("is a folder: remove it, or give another path", "kitti", {"format": "kitti"}),

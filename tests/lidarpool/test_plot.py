@@ -202,7 +202,7 @@ def test_a_result_without_a_plan(unplanned, tmp_path):
 
 def test_a_result_in_storage(result, tmp_path):
     url = f"memory://{tmp_path.name}/result"
-    with pytest.raises(LidarpoolError, match=f"^{url} holds no whole result, which has a report"):
+    with pytest.raises(LidarpoolError, match=f"^{url} has no complete result, which has a report"):
         plot(url, "--only", "path")
     for name in ("cloud.ply", PICTURE_FILE):
         Storage.at(url).put(result / name, name)

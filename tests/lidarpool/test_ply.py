@@ -136,7 +136,7 @@ def test_a_faulty_write_leaves_the_earlier_result(tmp_path, monkeypatch, fault):
 
     monkeypatch.setattr(ply, "_write_open3d", faulty)
     expected = {
-        "cut": (LidarpoolError, "could not be written whole"),
+        "cut": (LidarpoolError, "could not be written"),
         "fewer": (LidarpoolError, "999 of 1,000 points"),
         "interrupted": (KeyboardInterrupt, None),
         "no space": (LidarpoolError, "No space left"),

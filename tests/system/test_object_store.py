@@ -183,7 +183,7 @@ def test_a_result_goes_to_the_bucket(cluster, lidarpool, tmp_path, environment):
     Storage.at(url).remove(["report.json"])
     for command in (["plot"], ["export", "--format", "pcd"], ["view"]):
         half = lidarpool(*command, url)
-        assert half.code == 2 and f"{url} holds no whole result" in half.err
+        assert half.code == 2 and f"{url} has no complete result" in half.err
 
 
 @pytest.mark.parametrize(

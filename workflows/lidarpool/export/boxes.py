@@ -1,4 +1,4 @@
-"""Boxes of actors in single sweeps: what labels of data sets and markers are made of."""
+"""Boxes of actors in single sweeps, for labels of data sets and markers."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from .sweeps import Floats, Sweeps
 
 @dataclass(frozen=True, eq=False)
 class Boxes:
-    """Boxes of all actors in a sweep, where they were when their points were measured.
+    """Boxes of all actors in a sweep, at the time of their points.
 
-    An actor drives on while the head turns. Its box is where it was at the mean time of its
-    points, by their scans, so that it holds them; at the sweep's begin where it has none.
+    An actor moves during a sweep. Its box is at its pose at the mean time of its points, by their
+    scans, or at the start of the sweep if it has none.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ class Boxes:
         pair = [before, min(before + 1, own[-1])]
         share = np.zeros((count, 1))
         if len(own) > 1:
-            # Of all sweeps, one that no pause follows says how long a scan takes.
+            # A sweep without a following pause gives the duration of a scan.
             scan_ns = (np.diff(sweeps.begins_ns[own]) / np.diff(sweeps.scans)[own[:-1]]).min()
             since, apart = sweeps.begins_ns[[sweep, pair[1]]] - sweeps.begins_ns[before]
             share = (since + passed[:, None] * scan_ns) / apart

@@ -1,4 +1,4 @@
-"""A cloud in a PLY file, whose points stay on disk until they are chosen."""
+"""A cloud in a PLY file, whose points stay on disk until they are selected."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ from .ply_format import AXES, layout
 
 
 class CloudFile:
-    """A cloud in PLY format, whose points stay on disk until they are chosen.
+    """A cloud in PLY format, whose points stay on disk until they are selected.
 
     Parameters
     ----------
     path
         The file.
     own
-        Descriptions of its columns that are not in the table of columns, where they are known:
-        the file has no place for a unit.
+        Descriptions of its columns that are not in the table of columns, if known: the file cannot
+        store units.
 
     Raises
     ------
     LidarpoolError
-        If it cannot be read, or is no point cloud of ours.
+        If it cannot be read, or is not a point cloud of lidarpool.
     """
 
     def __init__(self, path: Path, own: Sequence[Column] = ()) -> None:
         try:
             start, count, dtype = layout(path)
-            # Nothing cannot be mapped.
+            # An empty file cannot be mapped.
             self._rows: NDArray[np.void] = (
                 np.memmap(path, dtype, "r", start, (count,)) if count else np.empty(0, dtype)
             )
@@ -48,7 +48,7 @@ class CloudFile:
         scans = self._rows["scan"] if "scan" in (dtype.names or ()) else np.empty(0, np.int32)
         some = scans[one_of_each_part(len(scans), 100_000)]
         ordered = scans.dtype.kind in "iu" and bool((np.diff(some) >= 0).all())
-        # First and last scan; none where the points are not in their order.
+        # First and last scan; None if the points are not in scan order.
         self.scans = (int(scans[0]), int(scans[-1])) if ordered and len(scans) else (0, 0)
 
     def __len__(self) -> int:
@@ -62,7 +62,7 @@ class CloudFile:
         return np.stack([np.min(lows, axis=0), np.max(highs, axis=0)])
 
     def chunks(self, points: int = CHUNK_POINTS) -> Iterator[Cloud]:
-        """Give the points in order, at most so many at a time."""
+        """Yield the points in order, at most so many at a time."""
         for first in range(0, len(self), points):
             rows = self._rows[first : first + points]
             positions = np.stack([rows[axis] for axis in AXES], axis=1)
@@ -70,20 +70,20 @@ class CloudFile:
             yield Cloud(positions, columns, self.table)
 
     def choose(self, most: int, scans: tuple[int, int] | None = None) -> tuple[Cloud, int]:
-        """Choose at most so many points, evenly; of the first to the last of these scans.
+        """Select at most so many evenly spaced points, from the first to the last scan.
 
         Returns
         -------
         cloud
             The points in order. Those without finite coordinates are left out.
         count
-            How many there are.
+            Number of points in these scans.
         """
         low, high = (0, len(self)) if scans is None else self.rows_of(scans)
         return self._cloud(self._rows[low + one_of_each_part(high - low, most)]), high - low
 
     def rows_of(self, scans: tuple[float, float]) -> tuple[int, int]:
-        """First row of these scans and the first after them; all where they are in no order."""
+        """First row of these scans and the first after them; all rows if not in scan order."""
         if self.scans[0] >= self.scans[1] or scans == self.scans:
             return 0, len(self)
         of = self._rows["scan"]

@@ -27,7 +27,7 @@ def write_e57(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
             _write(file, cloud, sweeps)
             file.close()
         except libe57.E57Exception as error:
-            del file.image_file  # to close it would fail again
+            del file.image_file  # closing it would fail again
             raise OSError(f"{str(error).splitlines()[0]}; the disk may be full") from error
 
 
@@ -52,7 +52,7 @@ def _write(file: Any, cloud: CloudLike, sweeps: Sweeps) -> None:
 
 @contextmanager
 def _named_by(content: str) -> Iterator[None]:
-    """Have the GUIDs of a file and its scans follow from a text: pye57 draws them by chance."""
+    """Derive the GUIDs of a file and its scans from a text: pye57 draws random ones."""
     numbers, drawn = count(), pye57.e57.uuid
     pye57.e57.uuid = SimpleNamespace(
         uuid4=lambda: uuid.uuid5(uuid.NAMESPACE_OID, f"{content} {next(numbers)}")

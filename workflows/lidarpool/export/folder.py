@@ -1,4 +1,4 @@
-"""The folder that results and exports are written to: one writer at a time, nothing half done."""
+"""The folder of results and exports: one writer at a time, no partial files."""
 
 from __future__ import annotations
 
@@ -15,22 +15,24 @@ from pathlib import Path
 from ..base.errors import LidarpoolError
 from ..columns.storage import Storage, is_url
 
-LAST_FILE = "report.json"  # of a result: whatever has it is whole
-_WRITING = ".writing-"  # folder of what is being made; one of a killed program goes at the next
+LAST_FILE = "report.json"  # a result with this file is complete
+_WRITING = (
+    ".writing-"  # folder of unfinished files; the next writer removes one of a killed program
+)
 
 
 def output_place(text: str | Path) -> Path | Storage:
-    """Where a result is or goes: a folder, or storage where a URL is given."""
+    """Place of a result: a folder, or storage for a URL."""
     return Storage.at(text) if is_url(text) else Path(text)
 
 
 @contextmanager
 def result_folder(place: Path | Storage) -> Iterator[Path]:
-    """Claim a folder for a result or export: made if it is not there, writable, ours alone.
+    """Lock a folder for a result or export: made if missing, writable, exclusive.
 
-    What a killed run or export was writing there is removed; and, if the body ends without
-    leaving anything, folders that were made for it. For storage it is a temporary folder, whose
-    files are to be put into the storage.
+    Leftovers of a killed run or export are removed; and, if the body ends without leaving files,
+    folders that were made for it. For storage it is a temporary folder, whose files the caller
+    puts into the storage.
 
     Raises
     ------
@@ -72,12 +74,12 @@ def result_folder(place: Path | Storage) -> Iterator[Path]:
 
 @contextmanager
 def local_result(place: Path | Storage, names: Sequence[str]) -> Iterator[Path]:
-    """Give the folder of a result: for one in storage, a temporary copy of some of its files.
+    """Yield the folder of a result: from storage, a temporary copy of some of its files.
 
     Raises
     ------
     LidarpoolError
-        If the storage cannot be read, or holds no whole result.
+        If the storage cannot be read, or has no complete result.
     """
     with local_folder(place) as folder:
         if not isinstance(place, Storage):
@@ -87,7 +89,7 @@ def local_result(place: Path | Storage, names: Sequence[str]) -> Iterator[Path]:
             there = place.sizes()
             if LAST_FILE not in there:
                 raise LidarpoolError(
-                    f"{place.url} holds no whole result, which has a {LAST_FILE}: give the URL of "
+                    f"{place.url} has no complete result, which has a {LAST_FILE}: give the URL of "
                     "a finished run (its --out); lidarpool run --resume continues an unfinished "
                     "one."
                 )
@@ -102,7 +104,7 @@ def local_result(place: Path | Storage, names: Sequence[str]) -> Iterator[Path]:
 
 
 def send(path: Path, place: Path | Storage) -> str:
-    """Put what was made in the folder of a place into its storage, if it has one.
+    """Copy a file or folder of a place into its storage, if it has one.
 
     Parameters
     ----------
@@ -113,7 +115,7 @@ def send(path: Path, place: Path | Storage) -> str:
 
     Returns
     -------
-    Path or URL that it can be found at, for people.
+    Its path or URL, for messages.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The formats that a cloud is exported to, and what they have in common."""
+"""The export formats of clouds, and their common parts."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .folder import staging
 from .ply import save_cloud
 from .sweeps import Sweeps
 
-# The module of each that writes it, and what has to be installed for it.
+# The module that writes each format, and the packages that it needs.
 _MODULES = {
     "las": ("las", "las"),
     "laz": ("las", "las"),
@@ -41,7 +41,7 @@ _PACKAGES = {
     "ros": ("rosbags",),
 }
 _ENDINGS = {Path(file).suffix: name for name, (file, _) in FORMATS.items() if "." in file}
-# Columns that are held, of those formats that do not hold all.
+# Columns that a format can hold, unless it holds all.
 _HELD = {
     "e57": {"intensity"},
     "kitti": {"object", "intensity", "class"},
@@ -61,7 +61,7 @@ class Format:
     name
         One of `lidarpool.base.vocabulary.FORMATS`.
     layout
-        Of the points of mcap and rosbag2: velodyne, autoware or ouster.
+        Layout of points in mcap and rosbag2: velodyne, autoware or ouster.
 
     Raises
     ------
@@ -98,7 +98,7 @@ class Format:
 
     @property
     def _laid_out(self) -> bool:
-        """Whether the layout counts."""
+        """Whether it has layouts."""
         return _MODULES[self.name][0] == "ros"
 
     @property
@@ -113,7 +113,7 @@ class Format:
         return [name for name in names if name not in held]
 
     def notes(self, cloud: CloudLike) -> list[str]:
-        """Return what a user should know of the cloud in this format: a sentence, or none."""
+        """Return a note for the user on the cloud in this format, or none."""
         left = ", ".join(self.left_out(cloud))
         return [f"{self.name} does not hold {left}"] if left else []
 
@@ -128,7 +128,7 @@ class Format:
             )
 
     def check(self, path: Path, cloud: CloudLike, *, overwrite: bool = False) -> None:
-        """Check what `write` needs, before anything is written; LidarpoolError if it lacks."""
+        """Check the needs of `write` before anything is written, or raise LidarpoolError."""
         self.check_installed()
         if path.exists() and not overwrite:
             raise LidarpoolError(f"{path} exists: give another place with --out, or --overwrite.")
@@ -144,7 +144,7 @@ class Format:
     def write(
         self, path: Path, cloud: CloudLike, sweeps: Sweeps, *, overwrite: bool = False
     ) -> None:
-        """Write a cloud whole, or not at all.
+        """Write a cloud completely, or not at all.
 
         Parameters
         ----------
@@ -155,7 +155,7 @@ class Format:
         sweeps
             When and where its sweeps began.
         overwrite
-            Whether what is there may be replaced.
+            Whether existing files may be replaced.
 
         Raises
         ------
@@ -166,13 +166,13 @@ class Format:
         writers = import_module(f".{_MODULES[self.name][0]}", __package__)
         more: dict[str, Any] = {"layout": self.layout} if self._laid_out else {}
         beside = staging(path.parent)
-        staged = beside / path.name  # bags hold the name of their file
+        staged = beside / path.name  # bags contain the name of their file
         try:
             try:
                 beside.mkdir()
                 getattr(writers, f"write_{self.name}")(staged, cloud, sweeps, **more)
                 flush(staged)
-                if path.is_dir() or staged.is_dir():  # files replace files at once
+                if path.is_dir() or staged.is_dir():  # files replace files atomically
                     remove(path)
                 staged.replace(path)
                 flush(path.parent)
@@ -190,7 +190,7 @@ def save(
         name = "ply" if path.suffix == ".ply" else _ENDINGS.get(path.suffix)
     if name is None:
         raise LidarpoolError(
-            f"{path} ends as no format does: use .ply, {', '.join(_ENDINGS)}, or give a format."
+            f"{path}: its ending has no format: use .ply, {', '.join(_ENDINGS)}, or give a format."
         )
     if precision_m is not None and not 0 < precision_m < np.inf:
         raise LidarpoolError(f"precision_m is {precision_m}; it must be a length in metres.")
@@ -204,7 +204,7 @@ def save(
         raise LidarpoolError(f"{path} is a folder: remove it, or give another path.")
     if cloud.sweeps is None and "scan" in one.needs:
         raise LidarpoolError(
-            f"{name} stores single sweeps, and this cloud knows of none: save the cloud of a "
+            f"{name} stores single sweeps, but this cloud has none: save the cloud of a "
             "Result, or one that was read from the folder of a result."
         )
     one.write(path, cloud, sweeps, overwrite=True)
@@ -212,7 +212,7 @@ def save(
 
 
 def remove(path: Path) -> None:
-    """Remove a file or folder, if it is there."""
+    """Remove a file or folder, if it exists."""
     if path.is_dir():
         shutil.rmtree(path)
     else:

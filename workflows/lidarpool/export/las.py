@@ -19,8 +19,8 @@ from ..columns.table import TABLE
 from .sweeps import Sweeps
 
 ANGLE_DEG = 0.006  # of one step of the format's scan angle
-FULL = 65_535  # the format's intensity of 1, and all that is brighter
-_OF_FORMAT = ("return_number", "returns", "azimuth")  # held by fields of the format alone
+FULL = 65_535  # the format's intensity for 1 and above
+_OF_FORMAT = ("return_number", "returns", "azimuth")  # stored only in fields of the format
 _FAR = 2**31 - 1  # steps from the offset to the farthest point
 
 
@@ -35,13 +35,13 @@ def write_laz(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
 
 
 def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> None:
-    """Write a cloud: what the format has a field for goes there, the rest into extra bytes.
+    """Write a cloud: columns with a field of the format there, the others in extra bytes.
 
     `time` is the GPS time in seconds, `return_number` and `returns` are as they are, `azimuth`
-    (-180 to 180 degrees) is the scan angle, `sensor` + 1 the point source. Intensity is the
-    column `intensity` times 65,535, at most that, and classification `class` where it is below
-    256; as those lose something, both columns are in the extra bytes as well. Return numbers are
-    15 at most, and angles in steps of 0.006 degrees.
+    (-180 to 180 degrees) is the scan angle, `sensor` + 1 the point source. Intensity is the column
+    `intensity` times 65,535, at most that, and classification `class` if it is below 256; because
+    of these limits, both columns are in the extra bytes as well. Return numbers are 15 at most,
+    and angles in steps of 0.006 degrees.
     """
     header = laspy.LasHeader(version="1.4", point_format=6)
     header.generating_software = "lidarpool"
@@ -69,12 +69,12 @@ def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> N
     names = [column.name for column in extra]
     try:
         with (
-            path.open("wb+") as file,  # laspy leaves one open that cannot be written to its end
+            path.open("wb+") as file,  # laspy leaves a file open that it cannot finish
             laspy.open(file, "w", header=header, do_compress=compress, closefd=False) as writer,
         ):
             for chunk in cloud.chunks():
                 points = _points(chunk, header, names)
-                with deferred_interrupts():  # lazrs makes errors of its own of those within
+                with deferred_interrupts():  # lazrs replaces errors raised within it
                     writer.write_points(points)
             with deferred_interrupts():
                 writer.close()

@@ -1,4 +1,4 @@
-"""Point clouds as binary PLY: written whole or not at all, whatever their size."""
+"""Point clouds of any size as binary PLY, written completely or not at all."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from ..columns.table import TABLE, Column, check_names
 from .ply_format import AXES, as_held, header, layout, row_type
 from .sweeps import SWEEPS_FILE, Sweeps
 
-# Single precision positions are kept where they err by less than this part of the precision.
+# Positions are stored in single precision if the error is below this part of the precision.
 _ROUNDING_SHARE = 0.05
 
 
@@ -31,13 +31,13 @@ _ROUNDING_SHARE = 0.05
 def save_cloud(path: str | Path, cloud: CloudLike, *, precision_m: float = 0.01) -> int:
     """Write a cloud, in memory or on disk, to a binary PLY file through Open3D.
 
-    About a million points are in memory at a time: Open3D writes each such piece to a file of
-    its own, which is appended to the others below one header. The bytes are those that Open3D
-    would write at once.
+    About a million points are in memory at a time: Open3D writes each such piece to a separate
+    file, which is appended to the others below one header. The bytes are the same as if Open3D
+    wrote all points at once.
 
-    The file is written under a temporary name in the same folder, flushed to the disk, and only
-    then given its name: there is either the whole new file or what was there before. The same
-    points give the same bytes.
+    The file is written under a temporary name in the same folder, flushed to the disk, and then
+    renamed: there is either the complete new file or the old one. The same points give the same
+    bytes.
 
     Parameters
     ----------
@@ -45,9 +45,9 @@ def save_cloud(path: str | Path, cloud: CloudLike, *, precision_m: float = 0.01)
         The file; its folder must exist.
     cloud
         A `Cloud`, or the `points` of a `Result`. float64 positions are stored in single
-        precision where that errs by less than a twentieth of `precision_m`, else in double.
+        precision if the error is below a twentieth of `precision_m`, else in double.
     precision_m
-        What the positions were rounded to, in metres.
+        Step to which the positions were rounded, metres.
 
     Returns
     -------
@@ -56,11 +56,11 @@ def save_cloud(path: str | Path, cloud: CloudLike, *, precision_m: float = 0.01)
     Raises
     ------
     LidarpoolError
-        If it cannot be written whole; no temporary file is left.
+        If it cannot be written completely; no temporary file is left.
     """
     path = Path(path)
     real = real_type(cloud.bounds, precision_m)
-    # The ending stays, since Open3D picks the format by it.
+    # Keep the ending, by which Open3D chooses the format.
     temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.tmp.ply")
     try:
         _check_target(path, cloud.table)
@@ -79,12 +79,12 @@ def save_cloud(path: str | Path, cloud: CloudLike, *, precision_m: float = 0.01)
 def read_cloud(path: str | Path) -> Cloud:
     """Read a point cloud that a run or `Cloud.save` wrote as .ply, with all its columns.
 
-    In the folder of a result it knows its sweeps, and can be saved in all formats.
+    From the folder of a result it has sweeps, and can be saved in all formats.
 
     Raises
     ------
     LidarpoolError
-        If the file is missing, cut, or not a binary PLY with x, y and z.
+        If the file is missing, truncated, or not a binary PLY with x, y and z.
     """
     path = Path(path)
     try:
@@ -107,7 +107,7 @@ def read_cloud(path: str | Path) -> Cloud:
 
 
 def _narrowed(name: str, values: NDArray[Any]) -> NDArray[Any]:
-    """Values in the type of their column, where the file had to hold them in another."""
+    """Values in the type of their column, if the file has another type."""
     return values.astype(TABLE[name].dtype) if name in TABLE else values
 
 
@@ -125,7 +125,7 @@ def _check_target(path: Path, table: Sequence[Column]) -> None:
     if path.is_dir():
         raise LidarpoolError(f"{path} is a folder: give the name of a .ply file.")
     if path.suffix.lower() != ".ply":
-        raise LidarpoolError(f"{path} must end in .ply, the format that is written.")
+        raise LidarpoolError(f"{path} must end in .ply.")
     if not path.parent.is_dir():
         raise LidarpoolError(f"The folder {path.parent} does not exist: make it first.")
 
@@ -160,13 +160,13 @@ def _check_room(path: Path, needed: int) -> None:
     free = shutil.disk_usage(path.parent).free
     if free < needed:
         raise LidarpoolError(
-            f"{path} could not be written whole, which takes {needed:,} bytes; the disk has "
+            f"{path} could not be written, which takes {needed:,} bytes; the disk has "
             f"{free:,} bytes free. Make room, or write to another folder."
         )
 
 
 class _Held(NamedTuple):
-    """Points as a file holds them: in names and types that Open3D writes."""
+    """Points with the names and types of files."""
 
     positions: NDArray[np.floating]
     columns: dict[str, NDArray[Any]]
@@ -178,8 +178,8 @@ def _as_held(cloud: Cloud, real: np.dtype[np.floating]) -> _Held:
 
 
 def _write_open3d(path: Path, cloud: _Held) -> None:
-    """Write `cloud` to `path`; whether it worked is for the reading back to say."""
-    o3d = load_open3d()  # here, for read_cloud has no use for it
+    """Write `cloud` to `path`; reading back shows whether it worked."""
+    o3d = load_open3d()  # here, because read_cloud does not need it
     points = o3d.t.geometry.PointCloud()
     points.point.positions = o3d.core.Tensor(np.ascontiguousarray(cloud.positions))
     for name, values in cloud.columns.items():
@@ -195,7 +195,7 @@ def _write_open3d(path: Path, cloud: _Held) -> None:
 
 
 def _start_of_rows(piece: Path, path: Path, count: int) -> int:
-    """Where the rows of a piece begin: Open3D says True also when the disk was full."""
+    """Start of the rows of a piece; checks them, because Open3D ignores a full disk."""
     try:
         start, found, _ = layout(piece)
         if found != count:
@@ -203,7 +203,7 @@ def _start_of_rows(piece: Path, path: Path, count: int) -> int:
     except ValueError as error:
         free = shutil.disk_usage(path.parent).free
         raise LidarpoolError(
-            f"{path} could not be written whole ({error}); the disk has {free:,} bytes free. "
+            f"{path} could not be written ({error}); the disk has {free:,} bytes free. "
             "Make room, or write to another folder."
         ) from error
     return start

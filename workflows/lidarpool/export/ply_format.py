@@ -24,25 +24,25 @@ _PLY_TYPES = {
 }  # fmt: skip
 
 
-# Types that Open3D writes as they are; the others are held in a wider one.
+# Types that Open3D writes; others become wider ones.
 _HELD = {"u1": "u1", "u2": "<u2", "i1": "<i4", "i2": "<i4", "i4": "<i4", "f4": "<f4", "f8": "<f8",
          "u4": "<f8", "i8": "<f8", "u8": "<f8"}  # fmt: skip
 _NAMES = {"<f4": "float", "<f8": "double", "<i4": "int", "<u2": "uint16", "|u1": "uchar"}
-_EXACT = 2**53  # whole numbers up to here are themselves in double precision
+_EXACT = 2**53  # whole numbers up to here are exact in double precision
 
 
 def held_type(column: Column) -> np.dtype[Any]:
-    """Type that a column has in a file."""
+    """Type of a column in a file."""
     return np.dtype(_HELD.get(np.dtype(column.dtype).str[1:], "<f8"))
 
 
 def as_held(column: Column, values: NDArray[Any]) -> NDArray[Any]:
-    """Values of a column in the type that it has in a file.
+    """Values of a column in its type in a file.
 
     Raises
     ------
     LidarpoolError
-        If a value is too large to be held exactly.
+        If a value is too large to be exact.
     """
     wanted = held_type(column)
     if wanted == np.float64 and values.dtype.kind in "iu" and len(values):
@@ -69,16 +69,16 @@ def header(row: np.dtype[np.void], count: int) -> bytes:
 
 
 def layout(path: Path) -> tuple[int, int, np.dtype[np.void]]:
-    """Find where the points of a PLY file begin, how many there are, and the type of a row.
+    """Find the start of the points of a PLY file, their number, and the type of a row.
 
     Raises
     ------
     OSError
         If the file cannot be read.
     ValueError
-        If it is not a whole binary PLY file with our properties; the message is a clause.
+        If it is not a complete binary PLY file with our properties; the message is a clause.
     """
-    if path.is_fifo():  # waits for a writer, and cannot be read anywhere but in order
+    if path.is_fifo():  # would wait for a writer, and has no random access
         raise ValueError("it is a pipe")
     with path.open("rb") as file:
         head, found, _ = file.read(_HEADER_LIMIT).partition(b"end_header\n")

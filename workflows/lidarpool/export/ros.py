@@ -41,7 +41,7 @@ _LAYOUTS: dict[str, tuple[int, tuple[tuple[str, str, int], ...]]] = {
 
 
 def write_rosbag2(path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str) -> None:
-    """Write a bag, a folder that `ros2 bag play` takes; see `write_mcap`."""
+    """Write a bag, a folder for `ros2 bag play`; see `write_mcap`."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
         topics: dict[str, Any] = {}
@@ -63,7 +63,7 @@ def write_mcap(path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str) -> Non
     Layouts of a point: `velodyne` (22 bytes; its time in seconds since the sweep began),
     `autoware` (PointXYZIRCAEDT, 32 bytes; angles in radians, time_stamp in ns since the sweep
     began) and `ouster` (48 bytes; range in mm, t in ns since the sweep began). Whole numbers of
-    intensity and reflectivity are of 255 and 65,535 at 1, and no more than that.
+    intensity and reflectivity are 255 and 65,535 at 1 and above.
     """
     folder = path.with_name(f"{path.name}.bag")
     try:
@@ -140,7 +140,7 @@ def _rows(row: np.dtype[np.void], points: Cloud, sweeps: Sweeps, sweep: int) -> 
 
 
 class _Messages:
-    """Parts of messages that several have."""
+    """Common parts of messages."""
 
     def __init__(self, types: Any) -> None:
         self._types = types
@@ -154,7 +154,7 @@ class _Messages:
         return self._types["std_msgs/msg/Header"](self.stamp(time_ns), frame)
 
     def transforms(self, frames: list[tuple[str, Placed]], sweep: int, time_ns: int) -> Any:
-        """Where frames are in the world when a sweep begins."""
+        """Frames in the world at the start of a sweep."""
         kind = "geometry_msgs/msg/"
         vector, turn = self._types[f"{kind}Vector3"], self._types[f"{kind}Quaternion"]
         transform, stamped = self._types[f"{kind}Transform"], self._types[f"{kind}TransformStamped"]

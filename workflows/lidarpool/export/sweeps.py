@@ -1,4 +1,4 @@
-"""When and where each sweep began: what formats of single sweeps need beside points."""
+"""Time and pose of each sweep, for formats of single sweeps."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _FORMAT = 1
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """Where something was when each sweep began.
+    """Poses of something at the start of each sweep.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ class Placed:
     quaternions: Floats
 
     def inward(self, sweep: int, points: Floats) -> Floats:
-        """Points (k, 3) of the world in its axes when a sweep began."""
+        """Convert points (k, 3) of the world to its axes at the start of a sweep."""
         turn = matrices(self.quaternions[sweep, None])[0]
         turned: Floats = (points - self.positions[sweep]) @ turn
         return turned
@@ -57,21 +57,21 @@ class Sweeps:
     scans
         int64 (n + 1,): the first scan of each, and one past the last of all.
     begins_ns
-        float64 (n,): when each begins, nanoseconds since the survey's start.
+        float64 (n,): start of each, nanoseconds since the survey's start.
     sensor
-        uint8 (n,): which sensor it is of.
+        uint8 (n,): number of its sensor.
     pose
-        Where that was.
+        Poses of the sensors.
     sensors, objects, actors
         Names; those of actors follow those of objects in the column `object`.
     actor_poses
-        Where each actor was.
+        Poses of each actor.
     actor_bounds
         float64 (a, 2, 3): corners of each actor's box in its own axes, metres.
     coordinates
         Of the cloud's points, "world" or "sensor".
     precision_m
-        What positions were rounded to, metres.
+        Step to which positions were rounded, metres.
     """
 
     scans: NDArray[np.int64]
@@ -90,7 +90,7 @@ class Sweeps:
         return len(self.begins_ns)
 
     def in_sensor(self, sweep: int, points: NDArray[np.floating]) -> Floats:
-        """Points (k, 3) of a sweep in its sensor's axes: when it began, or as they were kept."""
+        """Points (k, 3) of a sweep in its sensor's axes: at its start, or as stored."""
         exact = points.astype(np.float64)
         return exact if self.coordinates == "sensor" else self.pose.inward(sweep, exact)
 
@@ -101,7 +101,7 @@ class Sweeps:
 
     @classmethod
     def unknown(cls) -> Sweeps:
-        """Return none at all, for points whose survey nobody knows; in steps of a millimetre."""
+        """Return no sweeps, for points of an unknown survey, in steps of a millimetre."""
         none = Placed(np.empty((0, 3)), np.empty((0, 4)))
         return cls(
             np.zeros(1, np.int64), np.empty(0), np.empty(0, np.uint8), none, (), (), (), (),
@@ -151,7 +151,7 @@ class Sweeps:
         )
 
     def points(self, cloud: CloudLike) -> Iterator[Cloud]:
-        """Give the points of each sweep in order, also of those without any.
+        """Yield the points of each sweep in order, also of empty ones.
 
         Raises
         ------
@@ -199,7 +199,7 @@ class Sweeps:
         for number, placed in enumerate(self.actor_poses):
             arrays[f"actor{number}_positions"] = placed.positions
             arrays[f"actor{number}_quaternions"] = placed.quaternions
-        memory = io.BytesIO()  # NumPy leaves a file open that it opened itself and cannot write
+        memory = io.BytesIO()  # NumPy leaves its own file open if it cannot write it
         np.savez_compressed(memory, **arrays)
         path.write_bytes(memory.getbuffer())
 
@@ -244,7 +244,7 @@ class Sweeps:
 
 
 def plain_names(names: Iterable[str]) -> list[str]:
-    """Names as ROS and folders take them, each once.
+    """Make unique names for ROS and folders.
 
     Examples
     --------
@@ -263,10 +263,10 @@ def plain_names(names: Iterable[str]) -> list[str]:
 
 
 def _of_head(sensor: Sensor, steps: int) -> tuple[NDArray[np.int64], Floats]:
-    """First time step of each sweep of so many, and when they begin since the station did."""
+    """First time step of each of so many sweeps, and their starts since that of the station."""
     begins = sensor.begins_ns(np.array([sensor.firings(step)[0] for step in range(steps)]))
     rate_hz = getattr(sensor.head, "rate_hz", None)
-    if rate_hz is None:  # a head of one's own: nobody knows when it has been everywhere
+    if rate_hz is None:  # a user's head: its cycle is unknown
         return np.arange(steps), begins + sensor.lead_ns
     turn = np.floor((begins - sensor.start_ns) * (rate_hz / 1e9) + 1e-6)
     firsts = np.flatnonzero(np.diff(turn, prepend=-1))

@@ -1,4 +1,4 @@
-"""Formats of many files: each file is written in one of a few threads."""
+"""Formats of many files: writes the files in a few threads."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from typing import TypeVar
 from ..columns.cloud import Cloud
 
 Made = TypeVar("Made")
-# NumPy, pyarrow and the disk's system calls hold Python's lock for a sixteenth of the time or
-# less; each thread has a piece of the cloud in memory.
+# NumPy, pyarrow and system calls for the disk hold Python's lock at most 6 % of the time;
+# each thread has a piece of the cloud in memory.
 THREADS = min(4, os.cpu_count() or 1)
 
 
@@ -21,7 +21,7 @@ def write_each(write: Callable[[int, Cloud], Made], pieces: Iterable[Cloud]) -> 
 
     Returns
     -------
-    What it returned, in the order of the pieces. After an error or interrupt no call goes on.
+    Results in the order of the pieces. After an error or interrupt no call continues.
     """
     made: list[Made] = []
     under_way: deque[Future[Made]] = deque()

@@ -1,1 +1,1 @@
-"""Pictures by our own ray caster: what a camera sees of a scene, and points over it."""
+"""Pictures by our own ray caster: scenes seen by a camera, and points over them."""

@@ -1,4 +1,4 @@
-"""The picture of a sensor's beams: where its first rays go, and when they are fired."""
+"""The picture of a sensor's beams: directions and times of its first rays."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ FIRINGS = 8  # shown, where each is many rays
 
 
 def draw_beams(path: Path, sensor: Sensor) -> None:
-    """Draw where a sensor's first rays go, coloured by time.
+    """Draw the directions of a sensor's first rays, coloured by time.
 
-    These are the rays of some firings; where a firing is one ray, those of a frame, or two cycles
-    of a mirror. Of a sensor that looks down, whose rays lie in a plane, the angle over time.
+    These are the rays of some firings; if a firing is one ray, those of a frame, or of two cycles
+    of a mirror. For a sensor that looks down, whose rays lie in a plane, the angle over time.
 
     Raises
     ------

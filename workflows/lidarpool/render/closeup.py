@@ -1,4 +1,4 @@
-"""The part of a scene around the way of a carrier: what happens there would be lost in a city."""
+"""The part of a scene around a trajectory, which would be too small in a picture of a city."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from ..scene.scene import Scene
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-# Room on each side of a way: a share of its diagonal, times its height above the scene's lowest
-# point, and metres at least.
+# Margin on each side of a trajectory: a share of its diagonal, times its height above the scene's
+# lowest point, and least metres.
 _SHARE, _HEIGHTS, _LEAST_M = 0.35, 2.0, 25.0
-_MOST = 0.5  # of the scene's ground: then all of it is shown
+_MOST = 0.5  # share of the scene's ground from which all of it is shown
 
-CUT = 0.5  # where what stands under a roof is cut, as a share of the way up to it
-_ROOFED = 0.7  # of the steep rays from a sensor end in the scene: there is a roof over it
+CUT = 0.5  # cut under a roof, as a share of the height up to it
+_ROOFED = 0.7  # share of steep rays from a sensor that hit the scene if there is a roof
 _STEEP_DEG, _RAYS = 60.0, 64
 _TOUCHES = 1e-3  # of the scene's diagonal: a sensor on a surface does not stand under it
 _PLACES = 8  # that are asked
 
 
 def around_ways(bounds: Floats, ways: Sequence[Floats]) -> Floats | None:
-    """Box (2, 3) around ways, down to the ground; None if it has most of the scene's ground.
+    """Box (2, 3) around trajectories, down to the ground; None if it is most of the scene.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def around_ways(bounds: Floats, ways: Sequence[Floats]) -> Floats | None:
 def floor_and_roof(scene: Scene, places: Floats) -> tuple[float | None, float | None]:
     """Heights of the floor under places (p, 3) and of the roof over them, metres.
 
-    None where there is none: where they see the sky, or are over an abyss.
+    None if there is none: under the sky, or over an abyss.
     """
     some = places[np.linspace(0, len(places) - 1, min(len(places), _PLACES)).astype(int)]
     caster = RayCaster(scene.vertices, scene.faces)
@@ -70,20 +70,20 @@ def floor_and_roof(scene: Scene, places: Floats) -> tuple[float | None, float | 
 
 
 def cut_out(scene: Scene, box: Floats) -> tuple[Scene, Ints, Floats]:
-    """Cut what stands in a box (2, 3) out of a scene.
+    """Cut a box (2, 3) out of a scene.
 
-    Objects that are narrower than the box are there if their middle is; wider ones, as the
-    ground, are cut at its sides. All are cut at its top: else towers would hide the way. Objects
-    keep their numbers, also those of which nothing is left.
+    Objects narrower than the box are included if their middle is inside; wider ones, such as the
+    ground, are cut at its sides. All are cut at its top, because towers would hide the trajectory.
+    Objects keep their numbers, also if nothing of them is left.
 
     Returns
     -------
     scene
         The part; the scene itself if there is nothing in the box.
     parents
-        (f,): of each triangle that which it was in the scene.
+        (f,): the scene's triangle of each triangle.
     shares
-        (f,): how much of that it is, by area.
+        (f,): its share of that triangle's area.
     """
     boxes = scene.object_bounds[:, :, :2]
     middle = boxes.mean(axis=1)

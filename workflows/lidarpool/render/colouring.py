@@ -1,4 +1,4 @@
-"""Colours of points by one of their columns, and what a legend says of them."""
+"""Colours of points by one of their columns, and legends."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from ..columns.table import Column
 from .theme import mapped, object_colours
 
 TURBO = mapped("turbo", np.linspace(0.07, 0.95, 256))  # (256, 3); its very ends are nearly black
-MOST_ENTRIES = 12  # labels without names that have a colour each
+MOST_ENTRIES = 12  # most labels without names that have a colour each
 MOST_COLOURS = 1 << 16  # of labels
 
-_SPREAD = (0.5, 99.5)  # percentiles between which the colours of numbers are spread
+_SPREAD = (0.5, 99.5)  # percentiles at the ends of a colour scale
 _GREY = 0.5
 _SKEWED = 0.1  # a median this low in its range: the scale is logarithmic
-_TIMES = (("s", 1e9), ("ms", 1e6), ("µs", 1e3))  # that nanoseconds are told in
+_TIMES = (("s", 1e9), ("ms", 1e6), ("µs", 1e3))  # units for nanoseconds
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,9 +37,9 @@ class Colouring:
     logarithmic
         Whether the scale is.
     labels
-        (name, colour): labels there are, those of most points first where they are many.
+        (name, colour): existing labels, those with most points first if there are many.
     paint
-        Gives other values (m,) of the column their colours (m, 3) on the same scale.
+        Returns colours (m, 3) of other values (m,) of the column on the same scale.
     """
 
     colours: NDArray[np.float64]
@@ -57,9 +57,9 @@ class Colouring:
 def colours_of(values: NDArray[Any], column: Column, names: Sequence[str] = ()) -> Colouring:
     """Colour points by the values (n,) of a column.
 
-    Labels have a colour each. Those of more values than a legend can tell, and without names,
-    are on a scale like numbers. Numbers most of which are small among large ones, as intensities
-    are, have a logarithmic scale. What is NaN is grey.
+    Labels have a colour each; labels without names and with too many values for a legend are on a
+    scale like numbers. Numbers that are mostly small with a few large ones, such as intensities,
+    have a logarithmic scale. NaN is grey.
 
     Parameters
     ----------

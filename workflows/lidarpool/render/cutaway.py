@@ -1,4 +1,4 @@
-"""Look into buildings: take away the walls and roofs between the camera and the sensors."""
+"""Cutaways of buildings: removes walls and roofs between the camera and the sensors."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-MOST_SENSORS = 8  # that are asked what they see
-MAX_LAYERS = 12  # walls have two faces, roofs have beams; more than this is no wall
-ENCLOSED = 0.7  # of the level rays from the sensors end in the scene: they stand indoors
-HIDDEN = 0.65  # less than this of what the sensors see is seen by the camera
+MOST_SENSORS = 8  # sensors that are tested for what they see
+MAX_LAYERS = 12  # walls have two faces, roofs have beams; more surfaces are not a wall
+ENCLOSED = 0.7  # share of horizontal rays from indoor sensors that hit the scene
+HIDDEN = 0.65  # the camera sees less than this share of what the sensors see
 
 
 @dataclass(frozen=True, eq=False)
 class Cutaway:
-    """Which surfaces are taken away.
+    """The surfaces to remove.
 
-    A hit is taken away when its object surrounds the sensors seen from above, it lies in that
-    object's outer shell, and its plane has the camera on one side and most sensors on the
-    other. So near walls and the roof go, both of their faces, while far walls, the floor and
-    what stands inside stay, however the triangles are wound and grouped.
+    A hit is removed if its object surrounds the sensors seen from above, it lies in that object's
+    outer shell, and its plane has the camera on one side and most sensors on the other. So both
+    faces of near walls and the roof are removed, while far walls, the floor and things inside
+    stay, whatever the winding and grouping of triangles.
 
     """
 
@@ -38,19 +38,19 @@ class Cutaway:
 
     @classmethod
     def around(cls, surface: Surface, sensors: Floats, eye: Floats) -> Cutaway:
-        """Return what hides sensors at (p, 3) from a camera at `eye`."""
+        """Find the surfaces that hide sensors at (p, 3) from a camera at `eye`."""
         core = surface.scene.object_bounds.copy()
         flat = sensors[:, None, :2]
         inside = ((flat > core[None, :, 0, :2]) & (flat < core[None, :, 1, :2])).all(axis=2)
         width = np.where(np.isfinite(core).all(axis=1), core[:, 1] - core[:, 0], 0.0)
         core[:, 0, :2] += 0.06 * width[:, :2]
         core[:, 1, :2] -= 0.06 * width[:, :2]
-        # The roof and what hangs from it: all above the middle between sensors and top.
+        # The roof and things under it: all above the middle between sensors and top.
         core[:, 1, 2] = (core[:, 1, 2] + sensors[:, 2].max()) / 2
         return cls(surface, sensors, eye, inside.mean(axis=0) >= 0.5, core)
 
     def removes(self, points: Floats, triangle: Ints) -> Bools:
-        """Whether the hits at points (n, 3) on triangles (n,) are taken away."""
+        """Whether hits at points (n, 3) on triangles (n,) are removed."""
         owner = self.surface.scene.face_object[triangle]
         low, high = self.core[owner, 0], self.core[owner, 1]
         beside = (points[:, :2] < low[:, :2]) | (points[:, :2] > high[:, :2])
@@ -65,9 +65,9 @@ class Cutaway:
 
 
 def plan_cutaway(surface: Surface, poses: Floats, eye: Floats) -> Cutaway | None:
-    """Decide whether something must be taken away to see what the sensors at poses (p, 3) see.
+    """Decide whether to remove surfaces to show what the sensors at poses (p, 3) see.
 
-    None where the sensors stand in the open, or the camera sees most of it anyway.
+    None if the sensors are outdoors, or the camera sees most of it anyway.
     """
     if not len(poses):
         return None
@@ -100,7 +100,7 @@ def _probes(sensors: Floats, count: int, low_deg: float, high_deg: float) -> tup
 def cast_through(
     surface: Surface, cutaway: Cutaway | None, eye: Floats, directions: Floats
 ) -> tuple[Floats, Ints, Floats, Floats]:
-    """Closest hits that are not taken away.
+    """Closest hits on surfaces that are not removed.
 
     Returns
     -------
@@ -130,7 +130,7 @@ def cast_through(
 def blocked(
     surface: Surface, cutaway: Cutaway | None, origins: Floats, directions: Floats, reach: float
 ) -> Bools:
-    """Whether rays (n, 3) meet something within `reach` metres that is not taken away."""
+    """Whether rays (n, 3) hit a surface within `reach` metres that is not removed."""
     hits = surface.caster.cast(origins, directions, t_max=reach)
     met = np.asarray(hits.triangle >= 0)
     if cutaway is not None:

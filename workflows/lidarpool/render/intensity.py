@@ -1,4 +1,4 @@
-"""How densely a scene's surfaces were hit."""
+"""Density of hits on a scene's surfaces."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .theme import UNSEEN, rgb
 
 Floats = NDArray[np.float64]
 
-ENOUGH_HITS = 12  # a density is read off about so many hits
+ENOUGH_HITS = 12  # a density is estimated from about so many hits
 MOST_ROUNDS = 12
 WIDEST_RANGE = 300.0  # densest to sparsest colour
 
@@ -21,9 +21,9 @@ WIDEST_RANGE = 300.0  # densest to sparsest colour
 def hit_density(scene: Scene, hit_counts: NDArray[Any]) -> Floats:
     """Hits per square metre at each triangle, (f,).
 
-    Where triangles are so small that most were hit once or never, hits are shared with the
-    triangles around: each gives a third to each of its corners, each corner gives them back by
-    area, as often as it takes to read a density off a dozen hits. The total stays the same.
+    If triangles are so small that most have one hit or none, hits are shared with neighbours:
+    each triangle gives a third to each of its corners, each corner returns them by area, until a
+    density is estimated from a dozen hits. The total stays the same.
 
     Parameters
     ----------
@@ -39,12 +39,12 @@ def hit_density(scene: Scene, hit_counts: NDArray[Any]) -> Floats:
 
 
 def _rounds(hits: Floats) -> int:
-    """How often hits are to be shared with the neighbours."""
+    """Choose how many times to share hits with the neighbours."""
     hit = hits[hits > 0]
     if not len(hit):
         return 0
-    # Counts of one leave it open how many triangles were seen and missed: take three times
-    # as many as were hit, so that the rings of a sparse scan run together.
+    # Counts of one do not show how many triangles were missed: assume three times as many as
+    # were hit, so that the rings of a sparse scan merge.
     typical = hit.mean() if hit.mean() > 3 else hit.mean() / 3
     return min(MOST_ROUNDS, math.floor(ENOUGH_HITS / typical / 2))
 
@@ -57,12 +57,12 @@ def _share(faces: NDArray[np.int32], hits: Floats, area: Floats, vertices: int) 
         room += np.bincount(corner, weights=area, minlength=vertices)
     density = np.divide(given, room, out=np.zeros_like(given), where=room > 0)
     shared = area * density[faces].sum(axis=1)
-    # Triangles without area can hold no density; they keep what they have.
+    # Triangles without area have no density; they keep their hits.
     return np.where(area > 0, shared, hits)
 
 
 def density_range(density: Floats) -> tuple[float, float]:
-    """Choose the ends of a logarithmic scale over densities (f,), leaving strays out."""
+    """Choose the ends of a logarithmic scale over densities (f,), without outliers."""
     hit = density[density > 0]
     low, high = np.percentile(hit, [10, 99.5]) if len(hit) else (1.0, 10.0)
     low = max(low, high / WIDEST_RANGE)

@@ -1,4 +1,4 @@
-"""Light on a picture's surfaces: how much of sky and sun each point sees."""
+"""Light on surfaces: the visible part of sky and sun at each point."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from .surface import Surface, dot
 Floats = NDArray[np.float64]
 Reals = NDArray[np.float32]
 
-STRIDE = 2  # shadows are worked out at every second pixel of every second row
+STRIDE = 2  # shadows are computed at every second pixel of every second row
 SKY_LIGHTS, SUN_LIGHTS = 24, 4
 TURNS = 0.12, 0.02  # radians from a grid point's light to its neighbour's, of the sky and the sun
 SUN_RADIUS = 0.045  # radians: ten times the real one, for soft edges
-SUN_SHARE = 0.4  # of the light on level ground in the open
-THIN = 0.5  # openness of what is so thin that no grid point is on it
+SUN_SHARE = 0.4  # share of the light on open horizontal ground
+THIN = 0.5  # openness of surfaces too thin for a grid point
 AMBIENT, SKY, SUN = 0.24, 0.54, 0.36  # brightness of a surface that faces them
 
 
 @dataclass(frozen=True, eq=False)
 class LightMap:
-    """How much light reaches a grid of pixels, and on which surface each of them lies."""
+    """Light at a grid of pixels, and the surface of each."""
 
     camera: Camera
     sun: Floats  # (3,) unit vector towards it
-    openness: Reals  # (rows, columns) in 0 to 1: the share of the light that nothing keeps off
+    openness: Reals  # (rows, columns) in 0 to 1: the unblocked share of the light
     position: Reals  # (rows, columns, 3) metres; NaN where there is no surface
     normal: Reals  # (rows, columns, 3)
 
@@ -46,7 +46,7 @@ class LightMap:
         position, normal
             (n, 3).
         ground
-            bool (n,): whether they are of the ground, whose colour in the open is as it is.
+            bool (n,): whether they are on the ground, whose open parts keep their colour.
         """
         openness = self._openness_at(pixels, position, normal)
         facing = np.clip(normal @ self.sun.astype(np.float32), 0, None)
@@ -60,7 +60,7 @@ class LightMap:
         start = ((pixels - 0.5) / STRIDE - 0.5).astype(np.float32) - (STRIDE // 2) / STRIDE
         cell = np.floor(start).astype(np.int64)
         part = start - cell
-        # The mean of two by two, which the lights' turns are for, interpolated.
+        # The mean of two by two, because neighbours rotate the lights, interpolated.
         shares = 1 - part, np.ones_like(part), part
         total = np.full(len(pixels), 1e-3, np.float32)
         summed = np.full(len(pixels), 1e-3 * THIN, np.float32)
@@ -77,7 +77,7 @@ class LightMap:
 
 
 def alike(position: Reals, normal: Reals, spot: Reals, facing: Reals, tolerance: Reals) -> Reals:
-    """How much points (n, 3) are on one surface with spots (n, 3): 0 for not, to 0.4.
+    """How well points (n, 3) share a surface with spots (n, 3): from 0, for not, to 0.4.
 
     Those on it lie within `tolerance` (n,), in metres, of each other's plane.
     """
@@ -87,7 +87,7 @@ def alike(position: Reals, normal: Reals, spot: Reals, facing: Reals, tolerance:
 
 
 def plane_tolerance(camera: Camera, position: Reals, stride: int) -> Reals:
-    """How far in metres points of one surface, `stride` pixels apart, may be from its plane."""
+    """Tolerance in metres for points of one plane that are `stride` pixels apart."""
     offset = position - camera.eye.astype(np.float32)
     distance = np.sqrt(dot(offset, offset))
     return (3 * stride * camera.footprint(distance)).astype(np.float32)
@@ -110,13 +110,13 @@ def make_light_map(
 ) -> LightMap:
     """Cast rays from a grid of surface points to lights all over the sky, many of them the sun.
 
-    The same lights for all points: steps in brightness are too small to be seen, and need not
-    be smoothed as the grain of random directions would.
+    The same lights for all points: steps in brightness are invisible, while random directions
+    would need smoothing.
 
     Parameters
     ----------
     cutaway
-        What is taken away and casts no shadow.
+        Removed surfaces, which cast no shadow.
     position, normal
         (rows, columns, 3); NaN where there is no surface.
     reach
@@ -127,7 +127,7 @@ def make_light_map(
     at, facing = position[there].astype(np.float64), normal[there].astype(np.float64)
     # Rays start half a pixel off the surface, so that it does not shade itself.
     at += 0.5 * camera.footprint(np.sqrt(dot(at - camera.eye, at - camera.eye)))[:, None] * facing
-    # Neighbours turn the lights differently, and are averaged: so there are four times as many.
+    # Neighbours rotate the lights differently, and are averaged: like four times as many lights.
     row, column = np.nonzero(there)
     number = row % 2 + 2 * (column % 2)
     full, open_ = np.full(len(at), 1e-9), np.full(len(at), 1e-9)
@@ -145,7 +145,7 @@ def make_light_map(
 
 
 def _lights(sun: Floats) -> tuple[Floats, Floats, Floats]:
-    """Directions (k, 3) of lights, even over the sky and in the sun's disc, strengths and turns.
+    """Directions (k, 3) of lights, even over sky and sun's disc, strengths and rotations.
 
     The strengths (k,) of sky and sun together are 1 on level ground; turns (k,) in radians.
     """

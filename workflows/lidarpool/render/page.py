@@ -27,7 +27,7 @@ Floats = NDArray[np.float64]
 
 DPI = 200
 FONT = "DejaVu Sans"  # comes with matplotlib
-MANY_POSES = 40  # more than this are drawn as small dots
+MANY_POSES = 40  # more sensors than this are small dots
 PATH_PIECES = 200  # of which the way of a sensor is drawn
 MOST_NAMES = 12  # of actors beside what they name
 NAME_ABOVE, NAME_ROOM = 26.0, (150.0, 26.0)  # pixels of a picture 1600 wide
@@ -43,7 +43,7 @@ SHORTEST_AXIS = 36.0  # a shorter height axis has no room for numbers
 
 
 class Page:
-    """One picture being put together; its size is (width, height) in pixels."""
+    """One picture under construction; its size is (width, height) in pixels."""
 
     def __init__(self, size: tuple[int, int]) -> None:
         self.size = size
@@ -53,7 +53,7 @@ class Page:
     def show(self, shot: Shot, image: NDArray[np.floating]) -> Axes:
         """Fill the page with a painted shot, its ground's grid, its axes and its sensors.
 
-        The axes that come back have the shot's pixels as coordinates.
+        The returned axes have the shot's pixels as coordinates.
         """
         self.figure.figimage(np.round(255 * image).astype(np.uint8), zorder=-1)
         axes = self.figure.add_axes((0, 0, 1, 1))
@@ -105,7 +105,7 @@ class Page:
         )  # fmt: skip
 
     def _sensors(self, axes: Axes, shot: Shot) -> None:
-        """Mark the sensors, hollow where something hides them, each on a stem."""
+        """Mark the sensors, hollow if hidden, each on a stem."""
         for path in shot.paths:
             some = path[np.linspace(0, len(path) - 1, min(len(path), PATH_PIECES)).astype(int)]
             pixels, _ = shot.camera.project(some)
@@ -128,7 +128,7 @@ class Page:
             )  # fmt: skip
 
     def _actors(self, axes: Axes, shot: Shot) -> None:
-        """Name the actors, if they are few, each above its place; paler where it is hidden."""
+        """Name the actors, if they are few, each above its position; paler if hidden."""
         boxes, taken = shot.scene.object_bounds, np.empty((0, 2))
         some = np.arange(len(boxes) - shot.actors, len(boxes))
         some = some[np.isfinite(boxes[some]).all(axis=(1, 2))]
@@ -156,7 +156,7 @@ class Page:
             text.set_parse_math(False)  # names come from files
 
     def lines(self, axes: Axes, shot: Shot, segments: Floats, width: float, alpha: float) -> None:
-        """Draw the parts of segments (n, 2, 3) that nothing hides, in the sensors' colour."""
+        """Draw the visible parts of segments (n, 2, 3), in the sensors' colour."""
         runs = shot.runs(segments, shot.visible)
         axes.add_collection(
             LineCollection(
@@ -202,7 +202,7 @@ class Page:
             borderpad=0, handlelength=1.4, prop={"family": FONT, "size": size * self.unit},
         )  # fmt: skip
         # Names come from files: matplotlib leaves out those that begin with an underscore,
-        # and stumbles over what looks like a formula and is none ("$\\frac{x$").
+        # and fails on texts that only look like a formula ("$\\frac{x$").
         for text, handle in zip(legend.get_texts(), handles, strict=True):
             text.set_parse_math(False)
             text.set_text(str(handle.get_label()))
@@ -229,7 +229,7 @@ class Page:
         Raises
         ------
         LidarpoolError
-            If the folder is not there or cannot be written to.
+            If the folder does not exist or is not writable.
         """
         try:
             self.figure.savefig(path, dpi=DPI)
@@ -269,14 +269,14 @@ def _axis_edges(shot: Shot) -> list[tuple[Floats, Floats, Floats]]:
 
 
 def shortened(name: str, most: int = LEGEND_LETTERS) -> str:
-    """Cut a name in its middle where it has more letters than `most`; control characters show."""
+    """Shorten a name with more letters than `most` in its middle; show control characters."""
     name = "".join(letter if letter.isprintable() else "\ufffd" for letter in name)
     tail = (most - 1) // 2
     return name if len(name) <= most else f"{name[: most - 1 - tail]}…{name[-tail:]}"
 
 
 def without_common_prefix(names: Sequence[str]) -> list[str]:
-    """Leave out the words that all names begin with, where there are at least three names.
+    """Remove the common first words of at least three names.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""The pictures of a scene: its objects, how densely it was hit, and the points of a cloud."""
+"""The pictures of a scene: objects, density of hits, and points."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from .shot import Shot
 Floats = NDArray[np.float64]
 
 MOST_POINTS = 1_000_000  # of a cloud are drawn; a picture has a few more pixels
-MOST_RAYS, MOST_OF_MOVING = 600, 150  # more from one way would hide what they hit
-# An object that covers this much of the ground, and has the scene in it, is a floor or a hall.
+MOST_RAYS, MOST_OF_MOVING = 600, 150  # more from one trajectory would hide the surfaces
+# An object that covers this much of the ground is a floor or a hall.
 SURROUNDING = 0.6
 
 
 def draw_scene(path: Path, shot: Shot, triangles: int) -> None:
-    """Draw a scene, each object in its own colour, and the sensors; `triangles` are all there are.
+    """Draw a scene, each object in its own colour, and the sensors; `triangles` is their number.
 
     Raises
     ------
     LidarpoolError
-        If the file cannot be written, as all functions here.
+        If the file cannot be written; likewise for the other functions.
     """
     scene = shot.scene
     colours = _object_colours(scene)
@@ -42,7 +42,7 @@ def draw_scene(path: Path, shot: Shot, triangles: int) -> None:
     page.show(shot, shot.paint(colours[scene.face_object]))
     entries = list(zip(without_common_prefix(scene.names), colours, strict=True))
     there = np.bincount(scene.face_object, minlength=len(entries)) > 0
-    first = len(entries) - shot.actors  # actors are first in the legend: they are what happens
+    first = len(entries) - shot.actors  # actors are first in the legend
     order = [*range(first, len(entries)), *range(first)]
     page.legend([entries[k] for k in order if there[k]])
     page.title(
@@ -67,10 +67,10 @@ def draw_intensity(
     hit_counts
         (f,) hits of each triangle that is drawn.
     sample_rays
-        (n, 2, 3) start and end of rays, metres, local coordinates; of those that end in what is
-        drawn, some are.
+        (n, 2, 3) start and end of rays, metres, local coordinates; some of those that end in the
+        picture are drawn.
     count
-        Hits in all.
+        Number of all hits.
     """
     density = hit_density(shot.scene, hit_counts)
     low, high = density_range(density)
@@ -102,13 +102,13 @@ def draw_cloud(
     Parameters
     ----------
     cloud
-        The points; those that the scene hides are left out.
+        The points; hidden ones are left out.
     count
-        Points of the whole cloud, of which these are a choice.
+        Number of points of the whole cloud, of which these are a sample.
     column
-        What they are coloured by.
+        Column to colour them by.
     names
-        Names of the values 0, 1, 2, … of that, where it is a label.
+        Names of its values 0, 1, 2, …, if it is a label.
     """
     image = shot.paint(np.tile(theme.rgb(theme.CLAY), (len(shot.scene.faces), 1)), 0.55)
     page = Page(shot.camera.size)
@@ -134,7 +134,7 @@ def draw_cloud(
 def _object_colours(scene: Scene) -> Floats:
     """Colours of a scene's objects, (objects, 3) in 0 to 1.
 
-    Floors and halls are grey, so that what stands in them is what one sees.
+    Floors and halls are grey, so that objects in them stand out.
     """
     width = scene.object_bounds[:, 1] - scene.object_bounds[:, 0]
     whole = np.maximum(scene.bounds[1] - scene.bounds[0], 1e-9)
@@ -152,11 +152,11 @@ def with_points(
 ) -> NDArray[np.float32]:
     """Draw points (n, 3) as discs over an image, nearer ones over farther ones.
 
-    Only those are drawn that lie on what their pixel shows: points behind it are hidden, those
-    before it lie on a wall that was taken away. They have the light of what they lie on.
+    Only points on the surface of their pixel are drawn: others are hidden, or on a wall that was
+    removed. They have the light of that surface.
     """
     pixels, distance = shot.camera.project(points)
-    # Range noise up to one per cent of the scene's size is let pass.
+    # Allow range noise up to one per cent of the scene's size.
     slack = 0.01 * shot.stage.size + 2 * shot.camera.footprint(distance)
     shown = np.zeros(len(points), np.bool_)
     # A point at a silhouette may fall into the pixel beside the one that shows its surface.
@@ -185,7 +185,7 @@ def with_points(
         if dx * dx + dy * dy <= radius * radius
     ]
     column, row = (2 * pixels.T).astype(np.int64) + margin
-    # Of several colours for one place the last, which is nearest, stays.
+    # The last of several colours for one pixel, which is nearest, stays.
     fine.ravel()[(row * wide + column)[:, None] + disc] = shaded[:, None]
     out = np.ascontiguousarray(inner).view(np.uint8).reshape(height, 2, width, 2, 4)[..., :3]
     return out.mean(axis=(1, 3), dtype=np.float32) / 255

@@ -1,4 +1,4 @@
-"""A shot: what the camera sees in each pixel, before it is given colours."""
+"""A shot: the surface in each pixel of a camera, before colouring."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ Bools = NDArray[np.bool_]
 SIZE = (1600, 1000)  # pixels of a finished picture
 # Where the scene is: the title is above it, legend and colour bar are right of it.
 FRAME = (0.08, 0.115, 0.79, 0.91)
-SKY, GROUND = -1, -2  # in place of a triangle
-STEPS = 700  # places along a line where it is tested for being seen
+SKY, GROUND = -1, -2  # instead of a triangle
+STEPS = 700  # points along a line where its visibility is tested
 
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """What rays of the camera met; every array has one row a ray."""
+    """Hits of the camera's rays; every array has one row for each ray."""
 
     triangle: NDArray[np.int64]  # (n,) or SKY, GROUND
     distance: Reals  # (n,) metres, infinite for the sky
@@ -41,7 +41,7 @@ class Samples:
     light: Reals  # (n,) brightness: 1 on open ground
 
     def among(self, which: NDArray[np.int64], count: int) -> Samples:
-        """Put the samples in places `which` (n,) of so many, the others of which are sky."""
+        """Put the samples at `which` (n,) among `count`; the others are sky."""
         whole = Samples(
             np.full(count, SKY), np.full(count, np.inf, np.float32),
             np.full((count, 3), np.nan, np.float32), np.full((count, 3), np.nan, np.float32),
@@ -66,8 +66,8 @@ class Shot:
 
     scene: Scene
     sensors: Floats  # (p, 3) metres, local coordinates
-    paths: tuple[Floats, ...]  # of sensors that move, (k, 3) each
-    actors: int  # the last objects of the scene, which are named in the pictures
+    paths: tuple[Floats, ...]  # of moving sensors, (k, 3) each
+    actors: int  # number of actors, the last objects of the scene, which are labelled
     when: str  # what is drawn, for a caption: how many sensors there are, and at what time
     models: str  # what the sensors are, for a caption
     stage: Stage
@@ -78,11 +78,11 @@ class Shot:
 
     @property
     def depth(self) -> Reals:
-        """Metres (height, width) from the eye to what each pixel shows, infinite for nothing."""
+        """Metres (height, width) from the eye to the surface in each pixel, infinite for none."""
         return self.whole.distance.reshape(self.camera.size[::-1])
 
     def paint(self, face_colours: Floats, contrast: float = 1.0) -> Reals:
-        """Give the shot colours.
+        """Colour the shot.
 
         Parameters
         ----------
@@ -108,7 +108,7 @@ class Shot:
         return pixels, distance <= depth + 2 * self.camera.footprint(distance)
 
     def on_ground(self, points: ArrayLike) -> tuple[Floats, Bools]:
-        """Pixel coordinates of points of the ground, and whether nothing stands on or before it."""
+        """Pixel coordinates of points of the ground, and whether they are visible."""
         pixels, _ = self.camera.project(points)
         bare = (self.whole.triangle < 0).reshape(self.depth.shape)
         return pixels, self.camera.look_up(bare, pixels, False)
@@ -116,7 +116,7 @@ class Shot:
     def runs(
         self, segments: Floats, seen: Callable[[Floats], tuple[Floats, Bools]]
     ) -> list[Floats]:
-        """Split line segments (n, 2, 3) into the pieces that are seen.
+        """Split line segments (n, 2, 3) into their visible pieces.
 
         Parameters
         ----------
@@ -152,10 +152,10 @@ def take_shot(
     size: tuple[int, int] = SIZE,
     backend: str = "auto",
 ) -> Shot:
-    """Look at a scene from a place that shows it well.
+    """Look at a scene from a good viewpoint.
 
-    The camera looks down from the side on which the scene is wider. Where the sensors stand
-    inside a building, the walls and roofs in front of them are taken away.
+    The camera looks down from the side on which the scene is wider. If the sensors stand inside a
+    building, the walls and roofs in front of them are removed.
 
     Parameters
     ----------
@@ -164,11 +164,11 @@ def take_shot(
     poses
         (p, 3) sensor positions, world coordinates.
     paths
-        Ways of sensors that move, (k, 3) each, local coordinates.
+        Trajectories of moving sensors, (k, 3) each, local coordinates.
     actors
         How many of the last objects are actors.
     when
-        How many sensors there are, and at what time they are shown; by default how many.
+        Caption on the number of sensors and the time; by default the number.
     models
         What the sensors are.
     size
@@ -180,16 +180,16 @@ def take_shot(
     everywhere = np.concatenate([sensors, *paths])
     stage = _stage(scene, everywhere)
     surface = Surface.of(scene, backend)
-    # What moves is on the ground, between what stands there.
+    # Moving objects are on the ground, between other objects.
     camera, reach = _camera(stage, size, 48.0 if len(paths) or actors else 33.0), np.inf
     cutaway = plan_cutaway(surface, everywhere, camera.eye)
     if cutaway is not None:
-        # From higher up more of the floor is seen between what stands on it.
+        # From higher up more of the floor is visible between objects.
         camera, reach = _camera(stage, size, 42.0), 0.15 * stage.size
         cutaway = replace(cutaway, eye=camera.eye)
 
     def see(pixels: Floats) -> Samples:
-        """Look through places (n, 2) of the picture, in pixels; light is still to come."""
+        """Look through points (n, 2) of the picture, in pixels; light is added later."""
         directions = camera.rays(pixels)
         distance, triangle, u, v = cast_through(surface, cutaway, camera.eye, directions)
         normal = np.full((len(pixels), 3), np.nan, np.float32)
@@ -244,7 +244,7 @@ def _camera(stage: Stage, size: tuple[int, int], elevation_deg: float) -> Camera
     wide = np.ptp(stage.ground[:, 0]) >= np.ptp(stage.ground[:, 1])
     top = stage.corners.copy()
     top[:, 2] = stage.bounds[1, 2]
-    # The scene stays inside the ground's margin, so its top does so too.
+    # The scene is inside the ground's margin, and so is its top.
     top[:, :2] = np.clip(top[:, :2], stage.bounds[0, :2], stage.bounds[1, :2])
     corners = np.concatenate([stage.corners, top])
     return fit_camera(corners, size, FRAME, -62.0 if wide else -28.0, elevation_deg)

@@ -1,4 +1,4 @@
-"""A scene's triangles made ready to be looked at: closest hits and smooth normals."""
+"""A scene's triangles for rendering: closest hits and smooth normals."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ CREASE_COSINE = np.cos(np.radians(35))
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Triangles, what casts rays at them, and their normals."""
+    """Triangles, their ray caster, and their normals."""
 
     scene: Scene
     caster: RayCaster
     face_normals: Floats  # (f, 3) unit length; zero for degenerate triangles
-    vertex_normals: Floats  # (v, 3) unit length, weighted by area; zero where faces cancel out
+    vertex_normals: Floats  # (v, 3) unit length, weighted by area; zero if faces cancel out
 
     @classmethod
     def of(cls, scene: Scene, backend: str = "auto") -> Surface:
-        """Build what is needed to look at a scene."""
+        """Prepare a scene for rendering."""
         a, b, c = (scene.vertices[scene.faces[:, k]] for k in range(3))
         doubled = np.cross(b - a, c - a)
         at_vertices = np.zeros_like(scene.vertices)
@@ -40,10 +40,10 @@ class Surface:
         return cls(scene, caster, unit(doubled), unit(at_vertices))
 
     def normals(self, triangle: Ints, u: Floats, v: Floats, towards: Floats) -> Floats:
-        """Shading normals (n, 3) at hits, turned to the side that a ray came from.
+        """Shading normals (n, 3) at hits, on the side of the ray.
 
-        Interpolated from the corners (Phong 1975), except across creases, where a corner's
-        normal gives way to that of the face.
+        Interpolated from the corners (Phong 1975), except across creases, where the face's normal
+        replaces a corner's.
 
         Parameters
         ----------
