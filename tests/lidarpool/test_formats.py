@@ -541,7 +541,7 @@ def test_a_cloud_is_saved_in_the_format_of_its_ending(cloud, sweeps, tmp_path):
     ):
         with pytest.raises(LidarpoolError, match=told):
             known.save(tmp_path / path, **more)
-    with pytest.raises(LidarpoolError, match="mcap stores single sweeps, and this cloud knows of"):
+    with pytest.raises(LidarpoolError, match="mcap stores single sweeps, but this cloud has none"):
         bare.save(tmp_path / "x.mcap")
     with pytest.raises(LidarpoolError, match="kitti needs scan, object, intensity, class, which"):
         Cloud(cloud.positions, {}, sweeps=lambda: sweeps).save(tmp_path / "x", format="kitti")
