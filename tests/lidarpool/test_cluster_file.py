@@ -49,19 +49,22 @@ WRONG = {
         "argument is not a field. Did you mean 'arguments'?",
     ),
     "no partitions": ("cluster: distributed.SSHCluster", "partitions is missing"),
-    "a partition of others": (GOOD.replace("GPU", "GPUS"), "none of a survey's.*mean 'GPU'"),
+    "a partition of others": (
+        GOOD.replace("GPU", "GPUS"),
+        "not a partition of a survey.*mean 'GPU'",
+    ),
     "workers": (GOOD.replace("workers: 5", "workers: many"), "partitions.OTHER.workers is 'many'"),
     "no host": (GOOD.replace("[a, b], slots: 2", "[]"), "partitions.GPU.hosts is"),
     "no such package": (
         GOOD.replace("distributed.", "dask_jobqueues."),
         r"is not installed.*lidarpool\[clusters\]",
     ),
-    "no such class": (GOOD.replace("SSHCluster", "SHCluster"), "is no cluster that can be started"),
+    "no such class": (GOOD.replace("SSHCluster", "SHCluster"), "cannot be started by partition"),
     "another class": (
         GOOD.replace("distributed.SSHCluster", "subprocess.Popen"),
-        "is no cluster that can be started",
+        "cannot be started by partition",
     ),
-    "no module": (GOOD.replace("distributed.", ""), "is no cluster that can be started"),
+    "no module": (GOOD.replace("distributed.", ""), "cannot be started by partition"),
 }
 
 

@@ -355,7 +355,7 @@ FLY = legs('pulseFreq_hz="1000"')
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (("<survey", "<survey <"), "fly.xml is no XML that can be read"),
+        (("<survey", "<survey <"), "fly.xml is not readable XML"),
         (("document>", "kml>"), "fly.xml is XML, but not of HELIOS[+][+]"),
         (("survey", "route"), "it has no <survey>"),
         (("devices.xml#s", "devices.xml#t"), "no <scanner> 't' in .*devices.xml"),
@@ -396,5 +396,5 @@ def test_entities_are_not_expanded_without_end(survey, tmp_path):
     nested = "".join(f'<!ENTITY e{n + 1} "{f"&e{n};" * 10}">' for n in range(9))
     text = f'<!DOCTYPE document [<!ENTITY e0 "ha">{nested}]><document name="&e9;"/>'
     path.write_text(text)
-    with pytest.raises(LidarpoolError, match="is no XML that can be read"):
+    with pytest.raises(LidarpoolError, match="is not readable XML"):
         import_survey(path, tmp_path / "out")

@@ -1,4 +1,4 @@
-"""The way into the command, which Ctrl-C stops from the first moment on."""
+"""Entry point of the command, which Ctrl-C stops from the first moment on."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from .base.interrupts import end_on_signals
 def main() -> NoReturn:
     """Run the command, see `cli.main`."""
     end_on_signals()
-    # A second of imports, in which Python would answer an interrupt with a traceback of its own.
+    # A second of imports, during which an interrupt would print Python's traceback.
     from .cli.commands import main as command
 
     command()

@@ -1,1 +1,1 @@
-"""Runs and results in the browser, on this machine alone and without the internet."""
+"""Runs and results in the browser, only on this machine and without the internet."""

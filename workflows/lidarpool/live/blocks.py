@@ -1,4 +1,4 @@
-"""Points of a file that are looked for: all that a filter keeps, or those before a camera."""
+"""Searches a file for points: those that a filter keeps, or those before a camera."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Search = Generator[float, None, tuple[Cloud, int]]
 
 
 class Blocks:
-    """A file in blocks of rows, of which the boxes are known that were read once.
+    """A file in blocks of rows; remembers the bounding box of each block read.
 
     Parameters
     ----------
@@ -27,12 +27,12 @@ class Blocks:
     origin
         World position of the local origin, (3,), metres.
     most
-        Points that are shown of all, and as many of what is seen from near.
+        Points of the whole that are shown, and as many of a near view.
     """
 
     def __init__(self, file: CloudFile, origin: NDArray[np.float64], most: int) -> None:
         self.file, self._origin, self.most = file, origin, most
-        # NaN where a block was not read yet; 48 bytes each, 150 kB for a hundred million points.
+        # NaN for unread blocks; 48 bytes each, 150 kB for a hundred million points.
         self._boxes = np.full((-(-len(file) // BLOCK), 2, 3), np.nan)
 
     def search(
@@ -42,23 +42,23 @@ class Blocks:
         eye: Eye | None = None,
         shares: NDArray[np.float64] | None = None,
     ) -> Search:
-        """Look for points, block by block; gives the share of them that was looked at.
+        """Search for points, block by block; yields the share that was searched.
 
         Parameters
         ----------
         wanted
-            What they are like.
+            Filter for the points.
         most
-            How many are kept at most: an even choice of all that there are.
+            Most points to keep: an evenly spaced sample.
         eye, shares
-            Only what is in a picture, and of each of its parts (t,) this share.
+            Only points in a picture, and this share of each of its parts (t,).
 
         Returns
         -------
         cloud
             The points, in order.
         count
-            How many are like that.
+            Number of matching points.
         """
         random, kept, thin, found, held = np.random.default_rng(0), [], 1.0, 0, 0
         low, high = self.file.rows_of(wanted.of("scan") or self.file.scans)

@@ -1,4 +1,4 @@
-"""The cloud on a page: its colours, a filter, what is picked, and more of it from near."""
+"""The cloud on a page: colours, filter, picked points, and more points of a near view."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from .page import LivePage
 from .picked_point import PickedPoints
 
 HIDDEN = "not shown"
-REST_S = 0.4  # that a camera stands still before points are looked for
-SEARCH_S = 0.15  # of a core, that points are looked for before other things are drawn
-ENOUGH_SEEN = 0.5  # of the points are in the picture: it shows the whole
+REST_S = 0.4  # for which a camera stands still before a search
+SEARCH_S = 0.15  # of a core, for searching before drawing
+ENOUGH_SEEN = 0.5  # share of the points in a picture that shows the whole
 
 # As shares of the scene's diagonal. Points can be seen where there are few, and told apart where
 # there are many.
@@ -39,11 +39,11 @@ _NS = 1e9
 
 @dataclass(eq=False)
 class _Near:
-    """What one browser sees from near."""
+    """Near view of one browser."""
 
     eye: Eye
-    since: float  # when it came there
-    wanted: Hashable = None  # what was looked for
+    since: float  # when the camera arrived
+    wanted: Hashable = None  # the search
     search: Search | None = None
     cloud: Cloud | None = None  # with what is outside the picture; None: as for everybody
     size: float = 1.0  # of the points, as a share of that for everybody
@@ -58,15 +58,15 @@ class CloudView:
     Parameters
     ----------
     page
-        Where it is shown.
+        The page.
     columns
-        What it has beside the positions.
+        Columns except positions.
     names
         {label: names of its values 0, 1, 2, …}.
     origin
         World position of the local origin, (3,), metres.
     size_m
-        Diagonal of what there is to see.
+        Diagonal of the visible scene.
     """
 
     def __init__(
@@ -80,14 +80,14 @@ class CloudView:
         self._page, self._names, self._origin, self._size_m = page, names, origin, size_m
         rest = {column.name: column for column in columns if column not in AXES}
         self._columns = {"z": Z, **rest}
-        # {column: what one can filter by}
+        # {column: description for the filter}
         self.filtered = {**({"scan": SCAN} if "scan" in rest else {}), "x": X, "y": Y, "z": Z}
         self.filtered |= {name: column for name, column in rest.items() if name != "scan"}
-        self.blocks: Blocks | None = None  # where more can be read
+        self.blocks: Blocks | None = None  # file with more points
         self._even: Cloud | None = None  # of all points
         self._even_version: Hashable = None
         self._found: Cloud | None = None  # that the filter keeps
-        self._count: int | None = None  # how many there are of those
+        self._count: int | None = None  # number of those
         self._search: Search | None = None
         self._search_for = Filter()
         self._progress = 0.0
@@ -96,10 +96,10 @@ class CloudView:
         self.trail = Filter()  # of the time that is played
         self._counted = (-1, Filter(), 0)  # points of a version that a filter keeps
         self._colouring: Colouring | None = None
-        self._scaled: Hashable = None  # what the colours were made of
+        self._scaled: Hashable = None  # inputs of the colours
         self._drawn: Hashable = None
         self._node: Any = None  # viser shows no cloud without points
-        self._near: dict[int, _Near] = {}  # {client: what it sees}
+        self._near: dict[int, _Near] = {}  # {client: its near view}
         self._clicks: SimpleQueue[viser.SceneClickEvent] = SimpleQueue()
         self._input: Any = None  # of the filter
         self._input_for = ""
@@ -116,7 +116,7 @@ class CloudView:
         self._legend = gui.add_html("")
 
     def add_picked(self) -> None:
-        """Add what is told of points that are clicked at."""
+        """Add the panel for clicked points."""
         self.picked = PickedPoints(self._page, self._columns, self._names, self._origin)
 
     def add_filter(self) -> None:
@@ -134,11 +134,11 @@ class CloudView:
         self._point_size = self._page.gui.add_slider("point size", 0.1, 4.0, 0.1, 1.0)
 
     def set_filter(self, wanted: Filter) -> None:
-        """Show only these points."""
+        """Show only points that pass this filter."""
         self.filter, self._input_for = wanted, ""  # the controls follow
 
     def _follow_filter(self) -> None:
-        """Take the filter from its controls, made for the column that is chosen."""
+        """Update the filter from its controls for the chosen column."""
         name = self._filter_by.value
         if name != self._input_for:
             if self._input is not None:
@@ -162,7 +162,7 @@ class CloudView:
             return gui.add_dropdown("only", ("all", *labels), initial_value=chosen)
         unit = _NS if column.unit == "ns" else 1.0
         low, high = (values.min() / unit, values.max() / unit) if len(values) else (0.0, 1.0)
-        span = max(high - low, 1e-6 * abs(high), 1e-6)  # digits that a slider can tell
+        span = max(high - low, 1e-6 * abs(high), 1e-6)  # resolution of a slider
         step = 10.0 ** math.floor(math.log10(span / 500))
         step = max(step, 1.0) if values.dtype.kind in "iu" and unit == 1.0 else step
         first, last = (
@@ -207,7 +207,7 @@ class CloudView:
     # -- what is drawn -------------------------------------------------------------------
 
     def show(self, cloud: Cloud, version: Hashable) -> None:
-        """Show these points, an even choice of all; another version has others."""
+        """Show these points, an evenly spaced sample; a new version has others."""
         if version == self._even_version:
             return
         self._even, self._even_version = cloud, version
@@ -231,7 +231,7 @@ class CloudView:
             if handle is not None and near.drawn != (near.version, state):
                 near.drawn = (near.version, state)
                 if near.cloud is not None:
-                    # A node of one browser hides that of the same name for all.
+                    # A node for one browser hides the common node of the same name.
                     near.node = self._draw(handle.scene, near.node, near.cloud, cut, near.size)
                 elif near.node is not None:
                     near.node.remove()
@@ -239,7 +239,7 @@ class CloudView:
         self._pick(cut)
 
     def _base(self) -> Cloud:
-        """Points of which all browsers see those that are wanted."""
+        """Points for all browsers that pass the filter."""
         assert self._even is not None
         return self._even if self._found is None else self._found
 
@@ -252,11 +252,11 @@ class CloudView:
         return kept
 
     def _point_m(self) -> float:
-        """Width of a point that all browsers see."""
+        """Width of the points for all browsers."""
         return min(_POINT, _POINT_OF_MANY / len(self._base()) ** 0.5) * self._size_m
 
     def _scale(self) -> None:
-        """Spread the colours over what the filter keeps."""
+        """Fit the colour scale to the filtered points."""
         name = self.colour.value
         if name == HIDDEN or self._scaled == (self._version, self.filter, name):
             return
@@ -268,7 +268,7 @@ class CloudView:
     def _draw(
         self, scene: viser.SceneApi, node: Any, cloud: Cloud, cut: float | None, size: float
     ) -> Any:
-        """Draw the points that are wanted; returns the node."""
+        """Draw the filtered points; returns the node."""
         rows = np.flatnonzero(self._wanted(cloud, cut))
         self._legend.content = legend_of(self._colouring) if self._colouring and len(rows) else ""
         if not len(rows) or self._colouring is None:
@@ -289,14 +289,14 @@ class CloudView:
                 point_shading="flat",
                 precision="float32",
             )
-        with self._page.atomic():  # else there would be points without colours for a moment
+        with self._page.atomic():  # otherwise points would lack colours for a moment
             node.visible, node.points, node.colors, node.point_size = True, places, colours, size
         return node
 
     # -- points of the file --------------------------------------------------------------
 
     def _look_for_filtered(self) -> None:
-        """Read all of the file for what the filter keeps, where that was not all shown."""
+        """Search the whole file for filtered points, unless all are shown."""
         if self.blocks is None or self._even is None:
             return
         if self._search_for != self.filter:
@@ -311,7 +311,7 @@ class CloudView:
             self._version += 1
 
     def _go_on(self, search: Search) -> tuple[Cloud, int] | None:
-        """Go on with a search for a moment; returns what it found when it is over."""
+        """Continue a search for a moment; returns its result at the end."""
         until = time.thread_time() + SEARCH_S
         try:
             while time.thread_time() < until:
@@ -322,7 +322,7 @@ class CloudView:
         return None
 
     def _follow_eyes(self, playing: bool) -> None:
-        """Look for more points where a camera stands still and sees few of those there are."""
+        """Search for more points when a camera stands still and shows few of them."""
         if self.blocks is None:
             return
         clients, now = self._page.get_clients(), time.monotonic()
@@ -344,7 +344,7 @@ class CloudView:
                 self._keep_near(searching, found[0])
 
     def _look_from(self, near: _Near, most: int) -> None:
-        """Begin to look for what a browser sees, if that is not most of what there is."""
+        """Start a search for the view of a browser, unless it shows most points."""
         assert self.blocks is not None
         base, near.search = self._base(), None
         rows = self.filter.keeps(base)
@@ -359,7 +359,7 @@ class CloudView:
             near.cloud, near.version = None, near.version + 1
 
     def _keep_near(self, near: _Near, found: Cloud) -> None:
-        """Show a browser what was found, and outside its picture what all see."""
+        """Show a browser the points found, and the common points outside its picture."""
         base = self._base()
         seen = near.eye.tiles(base.positions - self._origin) >= 0
         if len(found):
@@ -371,7 +371,7 @@ class CloudView:
 
     @property
     def facts(self) -> list[str]:
-        """How many points there are and how many are shown, as lines of HTML."""
+        """Numbers of all and of shown points, as lines of HTML."""
         if self._even is None:
             return ["reading the points …"]
         whole = len(self._even) if self.blocks is None else len(self.blocks.file)
@@ -395,7 +395,7 @@ class CloudView:
     # -- what is picked ------------------------------------------------------------------
 
     def _pick(self, cut: float | None) -> None:
-        """Look which points were clicked at."""
+        """Find clicked points."""
         while True:
             try:
                 click = self._clicks.get_nowait()

@@ -1,4 +1,4 @@
-"""Hits per square metre on a grid: large triangles are divided where there are many hits."""
+"""Hits per square metre on a grid, which divides large triangles with many hits."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ _LEVELS = 24  # of a grid whose cells are half as wide each time
 def hit_grid(
     scene: Scene, corners: NDArray[np.float32], hits: Floats, points: NDArray[np.float32], most: int
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_], Floats]:
-    """Divide triangles where they were hit, and say how densely each piece was.
+    """Divide triangles that were hit, and return the density of hits on each piece.
 
-    A density is that of the finest grid in which there are enough points around a piece, and
-    `hit_density` of its whole triangle where there never are.
+    The density is from the finest grid with enough points around a piece, or `hit_density` of its
+    whole triangle if there is none.
 
     Parameters
     ----------
     scene
-        Whose triangles they are.
+        Scene of the triangles.
     corners
-        (f, 3, 3): the triangles as they are drawn, metres.
+        (f, 3, 3): the drawn triangles, metres.
     hits
         (f,): hits of each.
     points
-        (n, 3): some of the places that were hit, evenly chosen.
+        (n, 3): an evenly spaced sample of hit points.
     most
-        Pieces that there may be.
+        Most pieces.
 
     Returns
     -------
@@ -131,7 +131,7 @@ def _keys(cells: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _longest(pieces: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
-    """Return which edge of each piece is the longest, (k,), and how long it is."""
+    """Return the longest edge of each piece, (k,), and its length."""
     lengths = np.linalg.norm(pieces - np.roll(pieces, -1, axis=1), axis=2)
     return lengths.argmax(axis=1), lengths.max(axis=1)
 

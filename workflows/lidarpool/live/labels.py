@@ -1,4 +1,4 @@
-"""Names of things on a page, of which each browser shows those that do not cover one another."""
+"""Labels on a page; each browser hides overlapping ones."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class _Shown:
 
 
 class Labels:
-    """Labels on a page; where two would overlap, the one that was put there first is shown."""
+    """Labels on a page; of two that overlap, the first one is shown."""
 
     def __init__(self, page: LivePage) -> None:
         self._page = page
@@ -33,13 +33,13 @@ class Labels:
         self._shown: dict[int, _Shown] = {}  # {client: what it shows}
 
     def put(self, text: str, place: NDArray[np.floating]) -> None:
-        """Put a label somewhere, (3,) local; one of the same text moves there."""
+        """Place a label, (3,) local, or move the one with the same text."""
         if text in self._places or len(self._places) < MOST_LABELS:
             x, y, z = place.tolist()
             self._places[text] = x, y, z
 
     def draw(self) -> None:
-        """Show what each browser has room for, if anything has moved."""
+        """Update the visible labels of each browser, if anything has moved."""
         clients = self._page.get_clients()
         self._shown = {client: shown for client, shown in self._shown.items() if client in clients}
         texts = list(self._places)
@@ -65,7 +65,7 @@ class Labels:
 def without_overlap(
     texts: list[str], places: NDArray[np.float64], eye: Eye, height: int
 ) -> NDArray[np.bool_]:
-    """Which labels (n,) are shown so that none covers one before it.
+    """Whether to show labels (n,), so that none covers an earlier one.
 
     Parameters
     ----------

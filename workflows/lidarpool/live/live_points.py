@@ -1,4 +1,4 @@
-"""The growing cloud as it is displayed, read from the parts that a run commits."""
+"""The growing cloud on the live page, read from the parts that a run commits."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from ..run.store import RunStore
 from ..scan import Receipt
 
 LIVE_POINTS = 150_000  # in the browser at a time
-PARTS_NOTED = 64  # parts that wait to be read; of more, every second is left out
-PARTS_AT_ONCE = 8  # read for one drawing
+PARTS_NOTED = 64  # parts that wait to be read; of more, every second is skipped
+PARTS_AT_ONCE = 8  # parts read for one drawing
 
 
 class LivePoints:
-    """Points and hits of a run, of as many of its parts as there is time to read.
+    """Points and hits of a run, from as many of its parts as there is time to read.
 
-    The run's thread notes parts, the page's reads them. At the end an even choice of the whole
-    result takes their place, so that what was left out meanwhile does not matter.
+    The run's thread records parts, the page's thread reads them. At the end an evenly spaced
+    sample of the whole result replaces them, so skipped parts do not matter.
 
     Parameters
     ----------
     store
-        What the run commits to.
+        Store of the run.
     most
-        Points that are kept.
+        Most points to keep.
     """
 
     def __init__(self, store: RunStore, most: int = LIVE_POINTS) -> None:
@@ -43,21 +43,21 @@ class LivePoints:
         self._share = 1.0  # of the points of a part that are taken
         self._counts = np.zeros(store.job.scene.triangles, np.int64)
         self.hits = 0  # of the parts that were read
-        self.version = 0  # counts up when there is something else to show
+        self.version = 0  # incremented when there is something new to show
         self.cloud: Cloud | None = None
         self.error = ""  # why a part could not be read, a sentence
 
     def add(self, receipts: Sequence[Receipt]) -> None:
-        """Note parts that are in storage; cheap, and reads nothing."""
+        """Record parts that are in storage; quick, reads nothing."""
         with self._lock:
             self._waiting += [part.name for part in receipts]
             while len(self._waiting) > PARTS_NOTED:
                 del self._waiting[1::2]
 
     def gather(self) -> None:
-        """Read some of the parts that wait.
+        """Read some of the waiting parts.
 
-        A part that cannot be read is left out, and `error` says why: it is for the run to fail.
+        A part that cannot be read is skipped, and `error` says why; the run itself reports it.
         """
         with self._lock:
             names, self._waiting = self._waiting[:PARTS_AT_ONCE], self._waiting[PARTS_AT_ONCE:]
@@ -77,7 +77,7 @@ class LivePoints:
         return self._points.cloud_of(part, rows)
 
     def _keep(self, clouds: list[Cloud]) -> None:
-        """Keep these points, or half of them as often as they are too many."""
+        """Keep these points, halved until they are few enough."""
         cloud = Cloud.joined(clouds)
         while len(cloud) > self._most:
             self._share /= 2
@@ -86,7 +86,7 @@ class LivePoints:
         self.version += 1
 
     def finish(self, result: RunResult) -> None:
-        """Take an even choice of all points, and all hits; the parts may be removed after that."""
+        """Take a sample of all points, and all hits; the parts may then be removed."""
         with self._lock:
             self._waiting = []
             self.cloud = result.points.sample(self._most, PARTS_NOTED)
@@ -100,7 +100,7 @@ class LivePoints:
             self.version += 1
 
     def hit_counts(self) -> NDArray[np.float64]:
-        """Hits of each triangle, (f,), scaled up to all hits where not all parts were read."""
+        """Hits of each triangle, (f,), scaled up to all hits if some parts were not read."""
         with self._lock:
             counts = self._counts[: len(self._store.job.scene.faces)]
             return np.asarray(counts * (self._store.db.hits / max(self.hits, 1)))

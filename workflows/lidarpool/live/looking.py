@@ -1,4 +1,4 @@
-"""What one looks at: a camera, the points that a filter keeps, and the one under the mouse."""
+"""Views: a camera, a filter of points, and the point under the mouse."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ Floats = NDArray[np.floating]
 COORDINATES = ("x", "y", "z")
 _ACROSS, _DOWN = 48, 27
 TILES = _ACROSS * _DOWN  # parts of a picture
-_NEAR = 1e-6  # metres ahead of a camera: what is behind is not seen
+_NEAR = 1e-6  # metres ahead of a camera; nearer points are not visible
 _UNDER = 6.0  # pixels around the mouse in which a point is picked
-_BEHIND = 1.03  # times as far away as the nearest of those: on another surface
+_BEHIND = 1.03  # times the distance of the nearest: on another surface
 
 
 def values_of(cloud: Cloud, name: str) -> NDArray[Any]:
@@ -32,27 +32,27 @@ def values_of(cloud: Cloud, name: str) -> NDArray[Any]:
 
 @dataclass(frozen=True)
 class Filter:
-    """The points whose columns are within limits.
+    """Filter: points whose columns are within limits.
 
     Parameters
     ----------
     limits
-        (column, lowest, highest): both ends belong to it; a label has its value at both.
+        (column, lowest, highest), both included; a label has its value twice.
     """
 
     limits: tuple[tuple[str, float, float], ...] = ()
 
     def of(self, column: str) -> tuple[float, float] | None:
-        """Limits of a column, if it has some."""
+        """Limits of a column, if any."""
         return next(((low, high) for name, low, high in self.limits if name == column), None)
 
     def with_limits(self, column: str, limits: tuple[float, float] | None) -> Filter:
-        """Return one with these limits of a column, or without."""
+        """Return a filter with these limits of a column, or without."""
         rest = tuple(entry for entry in self.limits if entry[0] != column)
         return Filter(rest if limits is None else (*rest, (column, *limits)))
 
     def keeps(self, cloud: Cloud) -> NDArray[np.bool_]:
-        """Which points (n,) are within all limits; what is NaN is not."""
+        """Whether points (n,) are within all limits; NaN is not."""
         kept = np.ones(len(cloud), np.bool_)
         for name, low, high in self.limits:
             values = values_of(cloud, name)
@@ -62,7 +62,7 @@ class Filter:
 
 @dataclass(frozen=True)
 class Eye:
-    """Where a browser's camera is, and what it sees.
+    """Pose and field of view of a browser's camera.
 
     Parameters
     ----------
@@ -83,13 +83,13 @@ class Eye:
 
     @classmethod
     def of(cls, camera: viser.CameraHandle) -> Eye:
-        """Return that of a browser."""
+        """Return the camera of a browser."""
         position, turn = camera.position.tolist(), camera.wxyz.tolist()
         aspect = camera.image_width / max(camera.image_height, 1)  # a window may have no height
         return cls(tuple(position), tuple(turn), camera.fov, aspect or 1.0)
 
     def seen(self, places: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-        """Where places (n, 3) are in the picture, (n, 2) in -1 to 1, and which (n,) are in it."""
+        """Project points (n, 3) to the picture, (n, 2) in -1 to 1, and whether they are in it."""
         axes = SO3(np.array(self.wxyz)).as_matrix()
         x, y, z = ((places - np.array(self.position)) @ axes).astype(np.float32).T
         depth = np.maximum(z, _NEAR)
@@ -98,7 +98,7 @@ class Eye:
         return at, (np.abs(at) < 1).all(axis=1) & (z > _NEAR)
 
     def tiles(self, places: Floats) -> NDArray[np.int64]:
-        """In which part of the picture each place (n, 3) is, (n,); -1 outside."""
+        """Part of the picture of each point (n, 3): (n,); -1 outside."""
         at, inside = self.seen(places)
         column, row = ((np.clip(at, -1, 0.9999).T + 1) / 2 * np.array([[_ACROSS], [_DOWN]])).astype(
             np.int64
@@ -106,7 +106,7 @@ class Eye:
         return np.where(inside, row * _ACROSS + column, -1)
 
     def may_see(self, box: Floats) -> bool:
-        """Whether some of a box (2, 3) may be in the picture."""
+        """Whether a box (2, 3) may be partly in the picture."""
         low, high = box
         corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
         axes = SO3(np.array(self.wxyz)).as_matrix()
@@ -120,7 +120,7 @@ class Eye:
 def even_shares(counts: NDArray[Any], most: int) -> NDArray[np.float64]:
     """Shares (t,) of the points of each part of a picture, so that as many of each are shown.
 
-    A part with fewer points than that has all of them shown.
+    A part with fewer points shows all of them.
 
     Parameters
     ----------
@@ -143,9 +143,9 @@ def even_shares(counts: NDArray[Any], most: int) -> NDArray[np.float64]:
 def picked(
     places: Floats, origin: Sequence[float], direction: Sequence[float], pixel: float
 ) -> int | None:
-    """Which of the places (n, 3) a ray means, if any.
+    """Pick one of the points (n, 3) by a ray, or none.
 
-    That is the nearest to the ray of those on the first surface that it meets.
+    It is the nearest to the ray among those on the first surface.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The page: a viser server for this machine alone, its camera, ground and light."""
+"""The page: a viser server for this machine only, its camera, ground and light."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ from ..base.notebook import cell_display
 HOST = "127.0.0.1"
 PORT = 8080  # or the next that is free
 PICTURE = "lidarpool.png"
-LAST_S = 30.0  # that the last drawing is waited for
+LAST_S = 30.0  # to wait for the last drawing
 
-# By these names a browser reaches this machine, also through a port forwarded by SSH, which
-# may have any number. A name that somebody else's DNS server lets point here is none of them.
+# A browser reaches this machine by these names, also through a port forwarded by SSH, with any
+# number. A foreign DNS name that points here is not among them.
 OWN_NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
 
 _POLICY_VIOLATION = 1008  # RFC 6455, 7.4.1
@@ -55,7 +55,7 @@ _LOGGER = logging.getLogger(__name__)
 
 
 class LivePage(viser.ViserServer):
-    """A page for anybody on this machine, and for nobody else.
+    """A page for users of this machine only.
 
     Parameters
     ----------
@@ -85,21 +85,21 @@ class LivePage(viser.ViserServer):
         self.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=dark)
 
     def request_share_url(self, verbose: bool = True) -> None:
-        """Do nothing: viser would open a way to this page from the whole internet."""
+        """Do nothing: viser would open a tunnel to this page from the internet."""
 
     @property
     def url(self) -> str:
-        """Where it is."""
+        """Its address."""
         return f"http://{HOST}:{self.get_port()}"
 
     def look_from(self, client: viser.ClientHandle, side: str) -> None:
-        """Move the camera of a browser to a side from which it sees all."""
+        """Move the camera of a browser to a side from which it sees the whole."""
         low, high = self._bounds
         look_at, position = place_camera(low, high, side)
         place_eye(client, position, look_at)
 
     def save_picture(self, client: viser.ClientHandle) -> None:
-        """Have a browser save what it shows, without the panel, as a PNG file."""
+        """Let a browser save its view, without the panel, as a PNG file."""
         height, width = client.camera.image_height, client.camera.image_width
         drawn = client.get_render(height, width, transport_format="png", timeout=LAST_S)
         image = Image.new("RGB", (width, height), _DARK if self._dark.value else _LIGHT)
@@ -110,7 +110,7 @@ class LivePage(viser.ViserServer):
         client.send_file_download(PICTURE, data.getvalue(), save_immediately=True)
 
     def link(self, client: viser.ClientHandle, choices: Sequence[tuple[str, str]]) -> str:
-        """Address under which a browser shows what this one does, with these choices.
+        """Address of the view of a browser, with these choices.
 
         viser's page takes the camera from its address, and where to connect; choices are told
         as the path of that.
@@ -128,7 +128,7 @@ class LivePage(viser.ViserServer):
         return f"http://{own}/?{'&'.join(places)}&websocket={quote(f'ws://{own}/{path}', safe='')}"
 
     def opened_link(self) -> list[tuple[str, str]] | None:
-        """Choices of the link that a browser has opened, the next one; None if there is none."""
+        """Choices of the next link that a browser has opened, or None."""
         try:
             path = self._links.get_nowait()
         except Empty:
@@ -137,7 +137,7 @@ class LivePage(viser.ViserServer):
         return [(name, unquote(value)) for name, _, value in entries]
 
     def frame_scene(self, bounds: ArrayLike) -> None:
-        """Put the camera where it sees all of a box, (2, 3) in metres, with Z up, and a grid below.
+        """Place the camera to see all of a box, (2, 3) in metres, with Z up, and a grid below.
 
         The lines of the grid are whole metres apart, or tenths or tens of them.
         """
@@ -195,8 +195,8 @@ def place_eye(
 def may_connect(origins: Iterable[str]) -> bool:
     """Whether a connection with these ``Origin`` headers is from this machine.
 
-    A browser lets any page connect to any server, and tells the server which page it was
-    (RFC 6454). A connection without the header is none of a browser's.
+    A browser lets any page connect to any server, and sends the server the page's origin
+    (RFC 6454). A connection without the header is not from a browser.
 
     Examples
     --------
@@ -219,12 +219,12 @@ def _is_own(origin: str) -> bool:
 def refuse_strangers(
     server: viser.ViserServer, admitted: Callable[[str], None] = lambda path: None
 ) -> None:
-    """Let no page from elsewhere see what a server shows, nor press its buttons.
+    """Keep pages from elsewhere from reading a server's content or pressing its buttons.
 
     `admitted` is called with the path to which a page of this machine connects, if it has one.
 
-    viser itself lets everybody in. That its port is on the loopback interface does not help:
-    the browser that opens the stranger's page is on this machine.
+    viser itself accepts every connection. Listening on the loopback interface does not help: the
+    browser with the foreign page is on this machine.
     """
     sockets = server._websock_server
 
@@ -238,7 +238,7 @@ def refuse_strangers(
             return
         _LOGGER.warning("a page of %r wanted to connect to the live page: refused", origins)
         await connection.close(_POLICY_VIOLATION, "only pages of this machine may connect")
-        # What it sent meanwhile would still be taken, so that closing is not enough. The next
+        # Its messages so far would still be handled, so closing is not enough. The next
         # that the handler of this connection does is to wait for what sends and takes messages:
         # cancelled by then, it starts neither, and takes the client off its tables.
         task = asyncio.current_task()
@@ -246,7 +246,7 @@ def refuse_strangers(
         task.cancel()
 
     sockets.on_client_connect(admit)
-    # Whoever was quicker comes again: viser listens before anybody can be kept out.
+    # Earlier connections reconnect: viser listens before this check is in place.
     sockets.disconnect_all_clients()
 
 
@@ -264,7 +264,7 @@ def live_page(title: str, port: int = PORT) -> Iterator[LivePage]:
 
 @contextmanager
 def _without_words() -> Iterator[None]:
-    """Keep from the terminal what viser tells as it begins and as it ends."""
+    """Suppress viser's output at start and end."""
     console = rich.get_console()
     before, console.quiet = console.quiet, True
     try:
@@ -275,14 +275,14 @@ def _without_words() -> Iterator[None]:
 
 @contextmanager
 def announced(page: LivePage, words: str, browser: bool) -> Iterator[None]:
-    """Say where a page is while the body runs: on stderr, or by the page itself in a notebook.
+    """Show a page's address on stderr while the body runs, or in a notebook the page itself.
 
     Parameters
     ----------
     page
         The page.
     words
-        What is said, with its address.
+        The message with its address.
     browser
         Whether to open a browser where there is a desktop, and no notebook.
     """
@@ -304,10 +304,9 @@ def announced(page: LivePage, words: str, browser: bool) -> Iterator[None]:
 
 @contextmanager
 def redrawn(draw: Callable[[], float], every_s: float) -> Iterator[None]:
-    """Call a function again and again in a thread while the body runs, and once at its end.
+    """Call a function repeatedly in a thread while the body runs, and once at its end.
 
-    The function looks for what is new and draws that. An error is logged, and ends the drawing
-    but not the body.
+    The function draws changes. An error is logged, and ends the drawing but not the body.
 
     Parameters
     ----------
@@ -325,7 +324,7 @@ def redrawn(draw: Callable[[], float], every_s: float) -> Iterator[None]:
                 share = draw()
                 if last:
                     return
-                took = time.thread_time() - started  # of the processor: waiting slows nobody down
+                took = time.thread_time() - started  # processor time: waiting does not count
                 ended.wait(max(every_s, took / share - took))
         except Exception:
             _LOGGER.exception("the page cannot be drawn any more")

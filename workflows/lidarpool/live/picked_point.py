@@ -1,4 +1,4 @@
-"""What was clicked at: all columns of a point, and the way from it to another."""
+"""Clicked points: all columns of a point, and its distance to another."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ _BOX = (
 
 
 class PickedPoints:
-    """The point that was clicked at last, and the one to which it is measured.
+    """The last clicked point, and a second one for measuring.
 
     Parameters
     ----------
     page
         Where they are shown.
     columns
-        {name: what is told of a point beside its position}.
+        {name: column shown for a point}.
     names
         {label: names of its values 0, 1, 2, …}.
     origin
@@ -50,7 +50,7 @@ class PickedPoints:
         self._tell()
 
     def take(self, point: Cloud | None, measure: bool, eye: Sequence[float]) -> None:
-        """Take a point that was clicked at from `eye`, (3,) local; None where there was none."""
+        """Take a point clicked from `eye`, (3,) local, or None."""
         if point is None:
             self._points = []
         elif measure and self._points:
@@ -96,7 +96,7 @@ class PickedPoints:
         )
 
     def entries(self, point: Cloud) -> list[tuple[str, str]]:
-        """(name, value with its unit) of all that is known of a point."""
+        """(name, value with unit) for all columns of a point."""
         found = [
             (axis, f"{at:,.3f} m")
             for axis, at in zip("xyz", point.positions[0].tolist(), strict=True)
@@ -117,7 +117,7 @@ class PickedPoints:
 
 
 def measured(start: NDArray[Any], end: NDArray[Any]) -> list[tuple[str, str]]:
-    """(name, metres) of the way from one point (3,) to another."""
+    """(name, metres) of the distances from one point (3,) to another."""
     way = end.astype(np.float64) - start
     return [
         ("distance", f"{np.linalg.norm(way):,.3f} m"),

@@ -24,7 +24,7 @@ from .page import PORT, LivePage, announced, live_page, redrawn
 from .view import View, bounds_of, described, places_of
 
 CLOUD = "cloud.ply"
-DRAW_EVERY_S, BUSY_SHARE = 0.1, 0.7  # of a core: nothing else is to be done
+DRAW_EVERY_S, BUSY_SHARE = 0.1, 0.7  # of a core: there is no other work
 
 
 class ResultView:
@@ -37,9 +37,9 @@ class ResultView:
     file
         The points.
     pictured
-        The scene and what else is known of the run; None where there is nothing of that.
+        The scene and other data of the run, or None.
     note
-        What one should know of the result, a sentence, or empty.
+        A remark on the result, or empty.
     most
         Points that are shown at a time.
     """
@@ -99,11 +99,11 @@ class ResultView:
 
 
 def _around(file: CloudFile) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Whole metres near the points of a file, (3,), and the box (2, 3) around them from there."""
+    """Origin in whole metres near the points of a file, (3,), and their box (2, 3) from it."""
     positions = file.choose(100_000)[0].positions
     if not len(positions):
         return np.zeros(3), np.array([[-1.0, -1.0, 0.0], [1.0, 1.0, 1.0]])
-    # Nearly all of them: few strays do not count.
+    # Without a few outliers.
     box = np.percentile(positions, [0.5, 99.5], axis=0)
     origin = np.where(np.abs(box[0]) > 10_000, np.round(box[0]), 0.0)
     return origin, box - origin
@@ -119,12 +119,12 @@ def result_page(
     port: int = PORT,
     browser: bool = True,
 ) -> Iterator[None]:
-    """Serve the page of a result while the body runs, and say where.
+    """Serve the page of a result while the body runs, and print its address.
 
     Parameters
     ----------
     file, pictured, note
-        What it shows, see `ResultView`.
+        See `ResultView`.
     title
         Title of its panel.
     port
@@ -143,7 +143,7 @@ def result_page(
 
 
 def wait_for_interrupt() -> None:
-    """Let a page be looked at until Ctrl-C."""
+    """Keep a page open until Ctrl-C."""
     with suppress(KeyboardInterrupt):
         while True:
             time.sleep(1.0)
@@ -175,7 +175,7 @@ def open_result(path: Path) -> tuple[CloudFile, Pictured | None, str]:
     if (path / RUN_FOLDER / FILE).exists():
         raise LidarpoolError(
             f"{path} holds an unfinished run: continue it with lidarpool run --resume, where "
-            "--live shows what there is."
+            "--live shows its points."
         )
     raise LidarpoolError(
         f"{path} holds no {CLOUD}: give the folder of a result (its --out), or a cloud."
@@ -185,7 +185,7 @@ def open_result(path: Path) -> tuple[CloudFile, Pictured | None, str]:
 def _pictured_in(folder: Path) -> tuple[Pictured | None, str]:
     """Read what pictures of a result show; if that fails, return a sentence that says so.
 
-    It is no error: the cloud is what one wants to see, and is all there.
+    This is not an error, because the cloud is complete.
     """
     if not (folder / PICTURE_FILE).exists():
         return None, ""

@@ -1,7 +1,7 @@
-"""The live page of a run: while it runs, and until somebody has seen enough of it.
+"""The live page of a run: during the run, and until it is closed.
 
-The run calls in its own thread, and is never kept waiting by a browser: what it brings is
-noted, and drawn in another thread now and then, as much as a small share of the time allows.
+The run calls it in its own thread, and never waits for a browser: news are recorded, and drawn in
+another thread from time to time, within a small share of a core.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _BOX = '<div style="padding:0 0.8em 0.6em;font-size:0.85em;font-variant-numeric:
 
 
 class LiveRun:
-    """What a run tells a page, and what it is told from there.
+    """Connects a run and its page, in both directions.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ class LiveRun:
 
     def __init__(self, page: LivePage, job: Job) -> None:
         self.page, self._job = page, job
-        self.stopped = Event()  # by somebody at the page; --resume goes on
+        self.stopped = Event()  # by a user of the page; --resume continues
         self._text = page.gui.add_html("")
         self._stop = page.gui.add_button("Stop", color="red")
         self._stop.on_click(lambda _: self.stopped.set())
@@ -70,9 +70,9 @@ class LiveRun:
             page, job.scene, sensors, columns, origin, bounds, lasts, table.reflectance
         )
         self._described = described(sensors)
-        self._starting = "starting"  # what is going on before there is any progress
+        self._starting = "starting"  # the state before there is any progress
         self._newest = ""  # sensor and time of the newest frame
-        self._shown = -1  # the last scan of which the page was told when it was
+        self._shown = -1  # the last scan whose time was sent to the page
         self._store: RunStore | None = None
         self._points: LivePoints | None = None
         self._progress: Progress | None = None
@@ -87,7 +87,7 @@ class LiveRun:
     # -- the run's side, in its thread ---------------------------------------------------
 
     def follow(self, store: RunStore) -> None:
-        """Show what is committed from now on, and what an earlier run has left."""
+        """Show what is committed from now on, and the scans of an earlier run."""
         points = LivePoints(store)
         points.add(store.db.ordered)
         if store.kept:
@@ -97,9 +97,9 @@ class LiveRun:
         self._starting = "starting: workers, each with its own Python"
 
     def with_progress(self, show: Show, partitions: Mapping[str, Partition]) -> Show:
-        """Return a function to call with the progress: it calls `show` and tells the page.
+        """Return a function to call with the progress: it calls `show` and updates the page.
 
-        It raises KeyboardInterrupt if somebody has stopped the run.
+        It raises KeyboardInterrupt if a user of the page has stopped the run.
 
         Parameters
         ----------
@@ -116,11 +116,11 @@ class LiveRun:
         return tell
 
     def on_frame(self, frame: Frame) -> None:
-        """Note a frame; it is displayed unless many others come at once."""
+        """Record a frame; it is displayed unless many others come at once."""
         self._frames.append(frame)
 
     def with_frames(self, take: Callable[[Frame], None] | None) -> Callable[[Frame], None]:
-        """Return a function to call with each frame: it tells the page, and calls `take`."""
+        """Return a function to call with each frame: it updates the page, and calls `take`."""
 
         def tell(frame: Frame) -> None:
             self.on_frame(frame)
@@ -130,20 +130,20 @@ class LiveRun:
         return tell
 
     def on_progress(self, progress: Progress) -> None:
-        """Note how far the run is; raises KeyboardInterrupt if it was stopped."""
+        """Record the progress; raises KeyboardInterrupt if the run was stopped."""
         self._first = self._first or progress
         self._progress = progress
         now = time.monotonic()
         if now >= self._ask_at:
             self._ask_at = now + ASK_EVERY_S
-            with suppress(OSError, RuntimeError):  # a lost cluster is for the run to tell of
+            with suppress(OSError, RuntimeError):  # the run itself reports a lost cluster
                 stats = {name: part.stats() for name, part in self._partitions.items()}
                 self._busy = {name: (of.busy, of.slots) for name, of in stats.items()}
         if self.stopped.is_set():
             raise KeyboardInterrupt
 
     def finish(self, result: RunResult) -> None:
-        """Say that the run is over, and show all of it; its parts may be removed after that."""
+        """Show the whole result at the end of the run; its parts may then be removed."""
         if self._points is not None:
             self._points.finish(result)
         self._rays = result.sample_rays
@@ -156,7 +156,7 @@ class LiveRun:
         Parameters
         ----------
         cloud
-            What the run has written: the parts are gone, and more points are read from there.
+            The written cloud, from which more points are read, because the parts are gone.
         """
         own = [column for column in self._job.survey.stored_columns if column.name not in TABLE]
         file = CloudFile(cloud, own)
@@ -173,7 +173,7 @@ class LiveRun:
     def draw(self) -> float:
         """Draw what is new; returns the share of a core that this may take."""
         share = IDLE_SHARE if self._over else BUSY_SHARE
-        if not self.page.get_clients():  # whoever comes later has it drawn then
+        if not self.page.get_clients():  # draw it for browsers that connect later
             return share
         points, view = self._points, self._view
         self._text.content = self._panel()
@@ -185,7 +185,7 @@ class LiveRun:
         points.gather()
         if points.cloud is not None:
             view.draw_cloud(points.cloud, points.version)
-        # It is large, and looks another only when there are a tenth more hits.
+        # It is large, and changes visibly only with a tenth more hits.
         grown = round(math.log1p(points.hits) / math.log(1.1))
         view.draw_scene(lambda: (points.hit_counts(), points.cloud), (grown, self._over))
         self._draw_frames()
@@ -217,7 +217,7 @@ class LiveRun:
             self._view.draw_path(best(store.db.trials, planning).path, planning)
 
     def _panel(self) -> str:
-        """Write how far the run is."""
+        """Write the progress of the run."""
         progress, points = self._progress, self._points
         if progress is None:
             return f"{_BOX}<b>{self._starting}</b></div>"
@@ -248,7 +248,7 @@ class LiveRun:
         return "running" if self._first is not None and progress.cast else self._starting
 
     def _pace(self, progress: Progress) -> str:
-        """Tell scans a second, and how long the rest will take."""
+        """Return scans a second, and the time left."""
         first, left = self._first, progress.scans - progress.collected
         if first is None or progress.collected <= first.collected or not left:
             return ""
@@ -272,7 +272,7 @@ def _bar(label: str, done: int, whole: int) -> str:
 
 @contextmanager
 def live_run(job: Job, *, port: int = PORT, browser: bool = True) -> Iterator[LiveRun]:
-    """Serve the live page of a run while the body runs, and say where.
+    """Serve the live page of a run while the body runs, and print its address.
 
     Parameters
     ----------

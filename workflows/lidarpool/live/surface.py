@@ -42,11 +42,11 @@ _MATERIAL = {
 
 
 class Surface:
-    """A scene's triangles, or fewer of nearly its shape, in the colours that one asks for.
+    """A scene's triangles, or a simplified mesh, in the chosen colours.
 
-    Vertices in the same cell of a grid become one (Rossignac and Borrel, 1993), and hits go to
-    the nearest triangle that is left. Each triangle is moved inwards by a little, so that those
-    of two objects that touch, as the top of a wall and a ceiling, do not show through each other.
+    Vertices in the same cell of a grid are merged (Rossignac and Borrel, 1993), and hits go to the
+    nearest remaining triangle. Each triangle is moved inwards a little, so that touching objects,
+    such as the top of a wall and a ceiling, do not show through each other.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ class Surface:
     reflectance
         (objects,): share of the light that each object reflects, 0 to 1; None if not known.
     most
-        Triangles that there may be.
+        Most triangles.
     """
 
     def __init__(
@@ -88,8 +88,7 @@ class Surface:
         by
             One of `colours_for` the scene.
         hit_counts, points
-            Hits (f,) of each triangle of the scene and some of the places (n, 3) that were hit,
-            which are looked at only for "hits".
+            Hits (f,) of each triangle of the scene, and some of the hit points (n, 3), for "hits".
         """
         legend = ""
         if by == "hits":
@@ -122,13 +121,13 @@ class Surface:
     def around(self, sensors: NDArray[np.float64]) -> tuple[float | None, float | None]:
         """Heights of the floor under sensors at (p, 3) and of the roof over them, metres.
 
-        None where there is none: where they see the sky, or stand over an abyss.
+        None if there is none: under the sky, or over an abyss.
         """
         return floor_and_roof(self.coarse, sensors) if len(self.corners) else (None, None)
 
 
 def colours_for(scene: Scene, reflectance: NDArray[np.float64] | None) -> tuple[str, ...]:
-    """Name what a scene can be coloured by, the reflectance of its objects being known or not."""
+    """List the ways to colour a scene, with or without known reflectance."""
     more = ("reflectance",) if reflectance is not None and len(np.unique(reflectance)) > 1 else ()
     return ("grey", "hits", "object", *more)
 
@@ -138,7 +137,7 @@ def below(
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Corners (k, 3, 3) of those triangles that lie below a height, and which (f,) these are.
 
-    What rises above it is pressed down to it: an upright wall looks as if it were cut.
+    Parts above it are pressed down to it, so that an upright wall looks cut.
     """
     if height is None:
         return corners, np.ones(len(corners), np.bool_)
@@ -174,17 +173,17 @@ def _nearest(scene: Scene, others: Scene) -> NDArray[np.int64]:
 
 
 class MeshNode:
-    """Shows the latest of several meshes, without a moment in which there is none.
+    """Shows the latest of several meshes, without flicker.
 
-    viser's page drops a mesh when it is told of a new one, and has nothing to show until that
-    one is loaded; it does not say when that is. So two nodes take turns.
+    viser's page drops a mesh when it receives a new one, shows nothing until that is loaded, and
+    does not say when it is. So two nodes take turns.
     """
 
     def __init__(self, page: LivePage, name: str) -> None:
         self._page = page
         self._names = [f"{name}/one", f"{name}/other"]  # the latest is the first
         self._nodes: dict[str, Any] = {}
-        self._alone_at = 0.0  # when the last but one may go
+        self._alone_at = 0.0  # when to remove the last but one
 
     def show(self, corners: NDArray[np.float32], colours: NDArray[np.uint8]) -> None:
         """Show triangles (f, 3, 3), each of one colour, (f, 3); nothing if there are none."""

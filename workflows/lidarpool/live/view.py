@@ -1,4 +1,4 @@
-"""What a page shows in space: scene, cloud, sensors, rays and path, and their controls."""
+"""The 3D view of a page: scene, cloud, sensors, rays and path, and their controls."""
 
 from __future__ import annotations
 
@@ -29,29 +29,29 @@ from .page import LivePage, place_eye
 from .surface import MeshNode, Surface, below, colours_for
 
 MOST_POSES = 1000  # that have a ball
-MOST_RAYS = 150  # more of them hide what they hit
+MOST_RAYS = 150  # more rays would hide the surfaces
 
 _RED, _PALE = (224, 24, 45), (232, 140, 150)
 _PATH, _DISC = (20, 150, 90), (120, 130, 150)
 # As shares of the scene's diagonal.
 _BALL, _POSE, _END = 0.009, 0.0054, 0.008
-_MOVES = 0.4  # of that: what moves through a large scene is looked at from near
+_MOVES = 0.4  # of that: motion in a large scene is shown from near
 Hits = tuple[NDArray[Any], Cloud | None]  # of each triangle (f,), and points evenly chosen
-_PLAY_S = (6.0, 60.0)  # that a survey takes which is played, however short or long it is
+_PLAY_S = (6.0, 60.0)  # limits of the playing time of a survey
 
 
 class View:
-    """Scene, cloud, sensors, rays and path on a page, with what one can choose about them.
+    """Scene, cloud, sensors, rays and path on a page, with their controls.
 
-    Everything is drawn in the scene's local coordinates, and by one thread. What is drawn again
-    looks at first whether it has changed.
+    One thread draws everything, in the scene's local coordinates. Unchanged things are not drawn
+    again.
 
     Parameters
     ----------
     page
         Where they are shown.
     scene
-        The scene; None where there is only a cloud.
+        The scene; None for a cloud alone.
     sensors
         Where they are in the course of time.
     table
@@ -59,11 +59,11 @@ class View:
     origin
         World position of the local origin, (3,), metres.
     bounds
-        Box (2, 3) of what there is to see, metres.
+        Box (2, 3) of the visible scene, metres.
     duration_ns
-        How long the survey lasts.
+        Duration of the survey.
     reflectance
-        (objects,): of each object of the scene, 0 to 1; None if it is not known.
+        (objects,): of each object of the scene, 0 to 1; None if unknown.
     """
 
     def __init__(
@@ -91,17 +91,17 @@ class View:
         names = {} if scene is None else {"object": scene.all_names}
         names["sensor"] = tuple(way.name for way in sensors)
         self.cloud = CloudView(page, table, names, origin, self._size_m)
-        self._drawn: dict[str, Hashable] = {}  # {name: what it depended on when it was drawn}
+        self._drawn: dict[str, Hashable] = {}  # {name: its inputs when it was drawn}
         self._surface: Surface | None = None
         self._mesh = MeshNode(page, "/scene")
         self._lines: dict[str, Any] = {}  # {name: node}; nor no lines
         self._labels = Labels(page)
-        self._markers: list[Any] = []  # of the sensors, once it is told when it is
+        self._markers: list[Any] = []  # of the sensors, once the time is known
         self._bodies: list[Any] = []  # of the actors
         self._time: Any = None  # slider, where anything moves
         self._follow: Any = None  # checkbox, where a sensor moves
         self._trail: Any = None  # slider, where points have a time
-        self._followed: NDArray[np.float64] | None = None  # where the carrier was
+        self._followed: NDArray[np.float64] | None = None  # last position of the carrier
         self._playing = False
         self._moved_at = 0.0  # when the time was last moved on by playing
         self._ends_ns = duration_ns
@@ -159,18 +159,18 @@ class View:
 
     @property
     def cut(self) -> float | None:
-        """Height above which nothing is shown, metres; None where all is."""
+        """Height above which nothing is shown, metres; None to show all."""
         value = self._cut.value
         return None if value >= self._top else float(value) - float(self._origin[2])
 
     def _changed(self, name: str, *state: Hashable) -> bool:
-        """Whether something is to be drawn that depends on this."""
+        """Whether to draw something with these inputs."""
         changed = self._drawn.get(name) != state
         self._drawn[name] = state
         return changed
 
     def draw_cloud(self, cloud: Cloud, version: Hashable) -> None:
-        """Show these points, an even choice of all, world coordinates; see `CloudView.show`."""
+        """Show a sample of the points, world coordinates; see `CloudView.show`."""
         self.cloud.show(cloud, version)
         if self._trail is not None:
             length, at = self._trail.value, self._time.value
@@ -179,7 +179,7 @@ class View:
         self.cloud.draw(self.cut, self._playing)
 
     def draw_labels(self) -> None:
-        """Show names where there is room for them, after all else is drawn."""
+        """Show labels where there is room, after all else is drawn."""
         self._labels.draw()
 
     def draw_scene(self, hits: Callable[[], Hits], version: Hashable) -> None:
@@ -215,14 +215,14 @@ class View:
             body.color = tuple(colour)
 
     def _on_scene(self, cloud: Cloud) -> NDArray[np.float32]:
-        """Places (n, 3) of the points that are on what does not move, local."""
+        """Positions (n, 3) of points on static objects, local."""
         places = (cloud.positions - self._origin).astype(np.float32)
         if self._actors and "object" in cloud.columns and self._scene is not None:
             places = places[cloud["object"] < len(self._scene.names)]
         return places
 
     def _look_around(self, surface: Surface) -> None:
-        """Let one look into a building, where the sensors stand in one, and find the floor."""
+        """Cut a building open if the sensors stand in one, and find the floor."""
         floor, roof = surface.around(self._poses)
         self._ground = self._ground if floor is None else floor
         if roof is not None and (self.cut is None or roof < self.cut):
@@ -254,14 +254,14 @@ class View:
         self._play.label = "Pause" if self._playing else "Play"
 
     def set_time(self, time_ns: float) -> None:
-        """Show sensors and actors as they are at a time, unless somebody plays another."""
+        """Show sensors and actors at a time, unless a user plays another."""
         if self._time is None:
             self._place(time_ns)
         elif not self._playing:
             self._time.value = time_ns / 1e9
 
     def draw_time(self) -> None:
-        """Show sensors and actors where they are at the time that is chosen or played."""
+        """Show sensors and actors at the chosen or played time."""
         while (choices := self._page.opened_link()) is not None:
             self.choose(choices)
         if self._time is None:
@@ -314,7 +314,7 @@ class View:
                 client.camera.position = client.camera.position + at - before  # looks along
 
     def _carrier(self, time_ns: float) -> NDArray[np.float64]:
-        """Where the first sensor that moves is, or the first of all, (3,)."""
+        """Position of the first moving sensor, or of the first of all, (3,)."""
         way = next((way for way in self._sensors if way.moves), self._sensors[0])
         return way.at(time_ns)
 
@@ -337,7 +337,7 @@ class View:
         place_eye(event.client, eye, at + 0.1 * self._size_m * ahead)
 
     def _link(self, event: Any) -> None:
-        """Tell a browser where all can be seen as it sees it now."""
+        """Show a browser the link to its current view."""
         if event.client is not None:
             url = escape(self._page.link(event.client, self.choices))
             self._link_text.content = (
@@ -347,7 +347,7 @@ class View:
 
     @property
     def choices(self) -> list[tuple[str, str]]:
-        """(name, value) of what one has chosen to see, as `choose` takes it."""
+        """(name, value) of the current choices, for `choose`."""
         chosen = [("cut", f"{self._cut.value:g}"), ("colour", self.cloud.colour.value)]
         if self._scene is not None:
             chosen.append(("scene", self._scene_colour.value))
@@ -359,7 +359,7 @@ class View:
         return chosen + [("only", f"{name},{low!r},{high!r}") for name, low, high in limits]
 
     def choose(self, choices: Sequence[tuple[str, str]]) -> None:
-        """Choose what a link tells; what it tells wrongly is left as it is."""
+        """Apply the choices of a link; invalid ones are ignored."""
         menus: dict[str, Any] = {"colour": self.cloud.colour}
         sliders: dict[str, Any] = {"cut": self._cut, "time": self._time, "last": self._trail}
         if self._scene is not None:
@@ -397,7 +397,7 @@ class View:
             )
 
     def _add_poses(self) -> None:
-        """Show the ways of sensors that move as lines, and where the others stand as balls."""
+        """Show trajectories of moving sensors as lines, and positions of others as balls."""
         for number, way in enumerate(self._sensors):
             if way.moves and len(way.positions) > 1:
                 line = np.stack([way.positions[:-1], way.positions[1:]], axis=1)
@@ -423,7 +423,7 @@ class View:
         )
 
     def draw_path(self, path: NDArray[np.float64], planning: Planning | None) -> None:
-        """Show a path, (n, 2) in metres, over the ground, and what it goes around, once."""
+        """Show a path, (n, 2) in metres, and its obstacles over the ground, once."""
         if not self._changed("path"):
             return
         scene, size = self._page.scene, self._size_m
@@ -458,12 +458,12 @@ class View:
 
 
 def places_of(sensors: Sequence[SensorWay]) -> NDArray[np.float64]:
-    """All places of sensors, (p, 3) metres, local."""
+    """All positions of sensors, (p, 3) metres, local."""
     return np.concatenate([np.empty((0, 3)), *(way.positions for way in sensors)])
 
 
 def described(sensors: Sequence[SensorWay]) -> str:
-    """Tell what the sensors are, by their names where they have one, as HTML."""
+    """Models of the sensors, with their names if any, as HTML."""
     words = (f"{way.name}: {way.model}" if way.name else way.model for way in sensors)
     return "<br>".join(map(escape, words))
 
@@ -471,7 +471,7 @@ def described(sensors: Sequence[SensorWay]) -> str:
 def bounds_of(
     scene: Scene, poses: NDArray[np.float64], planning: Planning | None
 ) -> NDArray[np.float64]:
-    """Box (2, 3) that holds the scene, the sensors at (p, 3) and both ends of the path, local."""
+    """Box (2, 3) around the scene, the sensors at (p, 3) and both ends of the path, local."""
     places = [*scene.bounds, *poses]
     low, high = np.min(places, axis=0), np.max(places, axis=0)
     if planning is not None:

@@ -1,4 +1,4 @@
-"""A YAML file that says which cluster to start for a run, and with which workers."""
+"""Cluster files: YAML with the cluster to start for a run, and its workers."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Workers(BaseModel):
 
 
 class ClusterFile(BaseModel):
-    """What to start; see docs/how-to/queues.md.
+    """The cluster to start; see docs/how-to/queues.md.
 
     Parameters
     ----------
@@ -62,8 +62,8 @@ class ClusterFile(BaseModel):
         Raises
         ------
         LidarpoolError
-            If it cannot be read, a field is wrong, a package is missing, or the class is none
-            of clusters.
+            If it cannot be read, a field is wrong, a package is missing, or the class is not a
+            cluster.
         """
         content = read_yaml(path, "a cluster file has cluster:, arguments: and partitions:")
         try:
@@ -76,7 +76,7 @@ class ClusterFile(BaseModel):
         for name in file.partitions:
             if name not in (GPU, LIDAR, OTHER):
                 raise LidarpoolError(
-                    f"{path}: partitions.{name} is none of a survey's, which are GPU, LIDAR and "
+                    f"{path}: partitions.{name} is not a partition of a survey: GPU, LIDAR or "
                     f"OTHER.{did_you_mean(name, (GPU, LIDAR, OTHER))}"
                 )
         file._factory()
@@ -167,7 +167,7 @@ class ClusterFile(BaseModel):
             isinstance(found, type) and issubclass(found, SpecCluster)
         ):
             raise LidarpoolError(
-                f"{self._source}: {self.cluster} is no cluster that can be started by partition: "
+                f"{self._source}: {self.cluster} cannot be started by partition: "
                 "give dask_jobqueue.SLURMCluster, another of dask_jobqueue, or "
                 "distributed.SSHCluster. Start others yourself, and use --scheduler."
             )

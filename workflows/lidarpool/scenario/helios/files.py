@@ -1,4 +1,4 @@
-"""The XML files of HELIOS++: where they are, and the values in them."""
+"""Finds the XML files of HELIOS++, and reads their values."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def _root(path: Path) -> Element:
     except OSError as error:
         raise LidarpoolError(f"{path} cannot be read: {error.strerror}.") from error
     except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise LidarpoolError(f"{path} is no XML that can be read: {error}.") from error
+        raise LidarpoolError(f"{path} is not readable XML: {error}.") from error
     if root.tag != "document":
         raise LidarpoolError(
             f"{path} is XML, but not of HELIOS++: it begins with <{root.tag[:40]}>, not <document>."

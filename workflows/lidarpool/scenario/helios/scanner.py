@@ -1,7 +1,7 @@
-"""Scanners of HELIOS++ as sensors: data files, and how each is turned on its platform.
+"""Scanners of HELIOS++ as sensors: data files, and rotations on their platforms.
 
-HELIOS++ looks along y with z up and x to the right. Every pulse is one step of it: mirrors and
-heads move by what they do between two pulses, which is copied here, rounded lines and all.
+HELIOS++ looks along y with z up and x to the right. Every pulse is one step: mirrors and heads move
+by their step between two pulses, which is reproduced here, including rounded lines.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def channels(element: Element) -> dict[str, Scanner]:
 
 
 def unread(scanner: Scanner) -> Iterator[str]:
-    """Say what of a scanner a scenario has no words for."""
+    """List the features of a scanner that a scenario does not support."""
     for tag in ("rangeError", "deflectionError", "headError"):
         if scanner.child(tag) is not None:
             yield f"<{tag}> of {scanner.name}: errors by a formula"
@@ -180,7 +180,7 @@ def _tilt(emitter: Float) -> float | None:
 
 
 def _us(pulses: int, pulse_hz: float) -> int | str:
-    """How long so many pulses take, microseconds, exactly."""
+    """Exact duration of so many pulses, microseconds."""
     exact = Fraction(pulses * 1_000_000) / Fraction(pulse_hz)
     return exact.numerator if exact.denominator == 1 else str(exact)
 

@@ -27,7 +27,7 @@ _UNREAD = ("geotiffloader", "xyzloader", "detailedvoxels")
 
 @dataclass
 class Part:
-    """One mesh file of a scene and where it stands: turned, scaled, moved."""
+    """One mesh file of a scene and its placement: rotated, scaled, moved."""
 
     file: Path
     up_axis: str | None
@@ -38,7 +38,7 @@ class Part:
 
     @cached_property
     def materials(self) -> list[dict[str, str]]:
-        """Values that HELIOS++ reads of the materials of its faces."""
+        """Material values that HELIOS++ reads for its faces."""
         text = self.file.read_text("utf-8", "replace")
         used = set(re.findall(r"^\s*usemtl\s+(\S+)", text, re.MULTILINE))
         found: dict[str, dict[str, str]] = {}
@@ -202,7 +202,7 @@ class Surroundings:
         return None
 
     def left_out(self) -> list[str]:
-        """Say what is not taken over, once all has been asked for."""
+        """List the unsupported features, after everything was read."""
         missing = "; ".join(sorted(self._missing))
         return self.unread + [f"onGround at {missing}: no ground there, so z is 0"] * bool(missing)
 

@@ -32,7 +32,7 @@ _AHEAD = about(np.array([0.0, 0, 1]), -90)
 
 @dataclass
 class Imported:
-    """A scenario that was written, and what of its survey is not in it."""
+    """A written scenario, and the unsupported features of its survey."""
 
     path: Path
     scenario: Scenario
@@ -42,7 +42,7 @@ class Imported:
 def import_survey(
     survey: str | Path, out: str | Path, assets: Sequence[str | Path] = ()
 ) -> Imported:
-    """Write a HELIOS++ survey as a scenario, into a folder that is not there yet.
+    """Write a HELIOS++ survey as a scenario, into a new folder.
 
     Beside `scenario.yaml` go data files of its sensors, and the trajectory if it is a file.
 
@@ -53,13 +53,13 @@ def import_survey(
     out
         The folder.
     assets
-        Folders that names in it start from, before the survey's own and those above it.
+        Folders where its references start, before the survey's own and those above it.
 
     Raises
     ------
     LidarpoolError
-        If a file is missing or broken, or something without which the survey has no meaning
-        is not supported; nothing is written then.
+        If a file is missing or broken, or an essential feature is not supported; nothing is
+        written then.
     """
     survey, out = Path(survey), Path(out)
     if out.exists():

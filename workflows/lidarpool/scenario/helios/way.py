@@ -1,4 +1,4 @@
-"""Legs of HELIOS++ as the way of a carrier: flown from leg to leg, stood at, or from a file."""
+"""Legs of HELIOS++ as a trajectory: from leg to leg, standing at each, or from a file."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Leg:
 
 @dataclass
 class Stretch:
-    """What a leg takes of the way."""
+    """Part of the trajectory of a leg."""
 
     leg: int
     active: bool
@@ -213,7 +213,7 @@ def _table(text: str, settings: dict[str, str]) -> tuple[Float, list[str]]:
     except ValueError as error:
         raise LidarpoolError(f"its trajectory has rows that are not alike: {error}.") from error
     if rows.ndim != 2 or not np.isfinite(rows).all():
-        raise LidarpoolError("its trajectory is no table of numbers.")
+        raise LidarpoolError("its trajectory is not a table of numbers.")
     names = [""] * rows.shape[1]
     header = re.search(r"^#\s*HEADER:(.*)$", text, re.MULTILINE)
     if any(f"{name}Index" in settings for name in usual):
