@@ -117,7 +117,7 @@ def _seat(steward: Steward, name: str, address: str) -> Seat:
     if others := sorted(_declared_by(steward, seat) - {name}):
         raise PoolError(
             f"Worker {seat.info.name} already declares {', '.join(others)}; a worker belongs to "
-            f"one partition. If somebody has just put it there, make a new pool "
+            f"one partition. If another client has just put it there, make a new pool "
             "(Pool.from_client) and divide what is left."
         )
     return seat
@@ -215,7 +215,7 @@ async def _move(
     # Other moves wait until the workers have arrived; dissolving does not.
     if target is not None and target not in steward.rules:
         raise PoolError(
-            f"{names_of(seats)} did not arrive in partition {target!r}: somebody has dissolved it."
+            f"{names_of(seats)} did not arrive in partition {target!r}, which was dissolved."
         )
     return [seat.info.name for seat in seats if not seat.gone]
 
