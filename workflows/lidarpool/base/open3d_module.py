@@ -1,17 +1,25 @@
-"""Open3D without its viewers, or what it lacks."""
+"""Open3D without its viewers."""
 
 from __future__ import annotations
 
+import sys
+from importlib import import_module
+from importlib.util import find_spec, module_from_spec
+from threading import Lock
 from typing import Any
-
-from raybeam import open3d_module
 
 from .errors import LidarpoolError
 from .interrupts import deferred_interrupts
 
+_LOCK = Lock()  # a second thread would find the package that is to be taken away
+
 
 def load_open3d() -> Any:
     """Return the extension module of Open3D, which has `core`, `t`, `io` and `utility`.
+
+    Importing the package takes more than twice the time: it brings Dash and Plotly for viewers in
+    a browser. So the extension is loaded below a package that has not been run, and that is taken
+    away again: whoever says `import open3d`, before or after, gets the whole package.
 
     Raises
     ------
@@ -19,12 +27,23 @@ def load_open3d() -> Any:
         If Open3D is not installed, or lacks a library of the system.
     """
     # Interrupted while it loads, an extension module cannot be loaded again.
-    with deferred_interrupts():
+    with deferred_interrupts(), _LOCK:
         try:
-            return open3d_module.load_open3d()
+            return _extension("open3d.pybind")
         except (ImportError, OSError) as error:
             raise LidarpoolError(
                 f"Clouds are written through Open3D, which does not load ({error}): install "
                 "open3d-cpu (Linux x86_64) or open3d; on Debian and Ubuntu it needs the packages "
                 "libegl1 libgl1 libgomp1 libusb-1.0-0, too."
             ) from error
+
+
+def _extension(name: str) -> Any:
+    spec = None if {"open3d", name} & sys.modules.keys() else find_spec("open3d")
+    if spec is None:
+        return import_module(name)
+    sys.modules["open3d"] = module_from_spec(spec)
+    try:
+        return import_module(name)
+    finally:
+        del sys.modules["open3d"]
