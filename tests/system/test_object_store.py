@@ -200,6 +200,14 @@ def test_a_result_that_cannot_go_there(url, words, lidarpool, environment):
     assert len(refused.err.splitlines()) == 1
 
 
+def test_a_place_is_looked_at_before_a_run(lidarpool, environment, tmp_path):
+    (tmp_path / "s.yaml").write_text(SCENARIO)
+    checked = lidarpool("check", tmp_path / "s.yaml", "--out", f"{BUCKET}/nothing")
+    assert checked.code == 0 and Storage.at(f"{BUCKET}/nothing").sizes() == {}
+    refused = lidarpool("check", tmp_path / "s.yaml", "--out", "s3://nobody/x")
+    assert refused.code == 2 and "make the bucket first" in refused.err
+
+
 def test_without_the_package_that_opens_it(lidarpool, monkeypatch):
     monkeypatch.setitem(sys.modules, "s3fs", None)
     monkeypatch.delitem(_registry, "s3", raising=False)

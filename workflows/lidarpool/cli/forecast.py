@@ -253,9 +253,10 @@ def _look_at_folder(out: Path | Storage) -> tuple[list[str], list[str]]:
     reasons = []
     if isinstance(out, Storage):
         try:
-            unfinished = FILE in Storage.at(f"{out}/{RUN_FOLDER}").sizes()
-        except (OSError, LidarpoolError) as error:
-            return [f"{out} cannot be looked at: {error}."], []
+            out.claim()  # leaves nothing
+        except LidarpoolError as error:
+            return [str(error)], []
+        unfinished = FILE in Storage.at(f"{out}/{RUN_FOLDER}").sizes()
     else:
         there = _existing(out)
         if not there.is_dir():
