@@ -42,7 +42,7 @@ _SECTIONS = {
 _FIRST = {
     "lidarpool": (
         *("simulate", "remove_run", "Scene", "Sensor", "Beams", "Spin", "Pose", "Survey"),
-        *("Planning", "Result", "Frame", "Cloud", "Column", "save_cloud", "read_cloud"),
+        *("Planning", "Result", "Frame", "Cloud", "Column", "read_cloud"),
     ),
     "poolpart": (
         *("Pool", "Partition", "Rule", "per_gpu", "per_host", "n_workers", "named", "rest"),

@@ -31,7 +31,6 @@ from lidarpool import (
     load_trajectory,
     read_cloud,
     remove_run,
-    save_cloud,
     simulate,
 )
 
@@ -122,11 +121,7 @@ WRONG = {
     load_trajectory: [(3, "path is 3"), (None, "a path"), ([AT], "text or a path")],
     read_cloud: [(3, "path is 3"), (None, "a path"), (["a.ply"], "text or a path")],
     remove_run: [(3, "folder is 3"), (None, "a path"), ([], "text or a path")],
-    save_cloud: [
-        (3, None, "path is 3"),
-        ("a.ply", POINTS, "an array; it must be a CloudLike"),
-        ("a", 3, "is 3"),
-    ],
+    Cloud(POINTS, {}).save: [(3, "path is 3"), (None, "a path"), (["a.ply"], "text or a path")],
     simulate: [
         ("hall.glb", Survey(poses=AT), "Scene.load('hall.glb')"),
         (Scene.seed(), GRID, "survey is a Sensor; it must be a Survey, such as"),

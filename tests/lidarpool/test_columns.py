@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidarpool import Cloud, Column, LidarpoolError, save_cloud
+from lidarpool import Cloud, Column, LidarpoolError
 from lidarpool.columns.table import ALWAYS, OPTIONAL, TABLE, chosen, stored
 from lidarpool.scan.returns import BatchReturns
 
@@ -62,7 +62,7 @@ def test_a_column_that_files_cannot_hold_is_neither_chosen_nor_written(name, tmp
     with pytest.raises(LidarpoolError, match=r"name .* in files.*: (use|rename)"):
         chosen([column])
     with pytest.raises(LidarpoolError, match=r"name .* in files.*: (use|rename)"):
-        save_cloud(tmp_path / "c.ply", Cloud(np.zeros((1, 3)), {"a": [1]}, (column,)))
+        Cloud(np.zeros((1, 3)), {"a": [1]}, (column,)).save(tmp_path / "c.ply")
     assert list(tmp_path.iterdir()) == []
 
 

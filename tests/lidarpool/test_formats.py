@@ -28,7 +28,6 @@ from lidarpool import (
     Track,
     load_trajectory,
     read_cloud,
-    save_cloud,
 )
 from lidarpool.base.open3d_module import load_open3d
 from lidarpool.base.vocabulary import FORMATS
@@ -97,7 +96,7 @@ def cloud(survey) -> Cloud:
 @pytest.fixture
 def written(cloud, sweeps, tmp_path):
     """Write the cloud in a format, from its file as `lidarpool export` does."""
-    save_cloud(tmp_path / "cloud.ply", cloud)
+    cloud.save(tmp_path / "cloud.ply")
 
     def write(name, layout="velodyne"):
         one = Format(name, layout)

@@ -31,7 +31,7 @@ import yaml
 from distributed.cli import dask_scheduler, dask_worker
 
 import lidarpool.api.simulation
-from lidarpool import Cloud, save_cloud
+from lidarpool import Cloud
 from lidarpool.cli.commands import cli
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.sensor.models import SensorModel
@@ -115,7 +115,7 @@ def test_python_runs(tmp_path, block, in_threads, monkeypatch, capsys):
     folder.mkdir()
     one = np.ones(1, np.int32)
     columns = {"scan": one, "channel": one, "object": one}
-    save_cloud(folder / "cloud.ply", Cloud(np.ones((1, 3), np.float32), columns))
+    Cloud(np.ones((1, 3), np.float32), columns).save(folder / "cloud.ply")
     script = tmp_path / "example.py"
     fewer = block.code.replace("trials=100", "trials=4")  # all are in `make sample`
     script.write_text(fewer, encoding="utf-8")

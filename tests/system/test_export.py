@@ -5,7 +5,7 @@ import json
 import laspy
 import numpy as np
 
-from lidarpool import Cloud, Scene, Survey, read_cloud, save_cloud
+from lidarpool import Cloud, Scene, Survey, read_cloud
 from lidarpool.export.folder import result_folder
 from lidarpool.export.formats import Format
 from lidarpool.export.sweeps import Sweeps
@@ -89,7 +89,7 @@ def test_an_interrupt_says_which_formats_are_written(lidarpool, tmp_path, monkey
     scene, survey = Scene.seed(), Survey(poses=[(0, 0, 1)], columns=["intensity"])
     Sweeps.of(survey, scene).save(tmp_path / "sweeps.npz")
     columns = {name: np.zeros(3) for name in ("scan", "channel", "object", "intensity")}
-    save_cloud(tmp_path / "cloud.ply", Cloud(np.zeros((3, 3)), columns))
+    Cloud(np.zeros((3, 3)), columns).save(tmp_path / "cloud.ply")
     (tmp_path / "report.json").write_text("{}")
     write = Format.write
 

@@ -17,7 +17,7 @@ import yaml
 from distributed import Client
 
 import lidarpool.report.output as lidarpool_output
-from lidarpool import LidarpoolError, save_cloud, simulate
+from lidarpool import LidarpoolError, simulate
 from lidarpool.columns.storage import Storage
 from lidarpool.report.output import FILES
 from lidarpool.scenario.scenario import Scenario
@@ -49,7 +49,7 @@ def run(cluster: str) -> Callable[..., Any]:
 def expected(run: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """The cloud of an undisturbed run."""
     path = tmp_path_factory.mktemp("undisturbed") / "cloud.ply"
-    save_cloud(path, run().points)
+    run().points.save(path)
     assert path.stat().st_size > 50_000
     return path.read_bytes()
 
@@ -91,7 +91,7 @@ def test_the_disk_of_the_run_is_full(disk, run, expected):
         disk(kilobytes)
     result = run(folder=folder, resume=True)
     assert result.resumed > 0
-    save_cloud(folder.parent / "cloud.ply", result.points)
+    result.points.save(folder.parent / "cloud.ply")
     assert (folder.parent / "cloud.ply").read_bytes() == expected
 
 

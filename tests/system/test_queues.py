@@ -21,7 +21,7 @@ from tests.clusters import import_jobqueue
 from tests.daemons import LOOPBACK, Slurm, needs_slurm, needs_sshd, slurm, ssh_server, wait_until
 from tests.system.default_survey import DEFAULT_CLOUD_SHA256
 
-from lidarpool import Result, Scene, save_cloud, simulate
+from lidarpool import Result, Scene, simulate
 from lidarpool.scenario.scenario import Scenario
 from poolpart import placement_violations, start_partitions
 
@@ -206,7 +206,7 @@ def run_disturbed(cluster: SpecCluster, disturb: Callable[[Client], None]) -> Re
 
 
 def assert_default_cloud(result: Result, folder: Path) -> None:
-    save_cloud(folder / "cloud.ply", result.cloud)
+    result.cloud.save(folder / "cloud.ply")
     assert sha256((folder / "cloud.ply").read_bytes()).hexdigest() == DEFAULT_CLOUD_SHA256
     assert placement_violations(result.records) == []
 

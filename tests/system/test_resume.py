@@ -18,7 +18,7 @@ import pytest
 import yaml
 from distributed import Client
 
-from lidarpool import Frame, LidarpoolError, Scene, Sensor, Survey, remove_run, save_cloud, simulate
+from lidarpool import Frame, LidarpoolError, Scene, Sensor, Survey, remove_run, simulate
 from lidarpool.scenario.scenario import Scenario
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="forks")
@@ -96,7 +96,7 @@ def undisturbed(cluster: str, tmp_path_factory: pytest.TempPathFactory) -> bytes
     with Client(cluster, set_as_default=False) as client:
         result = simulate(scene, scenario.survey(scene), client=client, backend="numpy")
     path = tmp_path_factory.mktemp("undisturbed") / "cloud.ply"
-    save_cloud(path, result.points)
+    result.points.save(path)
     return path.read_bytes()
 
 

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from .base.errors import LidarpoolError
     from .columns.cloud import Cloud
     from .columns.table import Column
-    from .export.ply import read_cloud, save_cloud
+    from .export.ply import read_cloud
     from .plan import Plan, Planning
     from .run.store import remove_run
     from .scan import Frame
@@ -61,7 +61,6 @@ __all__ = [
     "load_trajectory",
     "read_cloud",
     "remove_run",
-    "save_cloud",
     "simulate",
 ]
 
@@ -73,7 +72,7 @@ _MODULES = {
     "base.errors": ("LidarpoolError",),
     "columns.cloud": ("Cloud",),
     "columns.table": ("Column",),
-    "export.ply": ("read_cloud", "save_cloud"),
+    "export.ply": ("read_cloud",),
     "plan": ("Plan", "Planning"),
     "run.store": ("remove_run",),
     "scan": ("Frame",),

@@ -28,7 +28,7 @@ class RunResult:
     scene, survey, planning
         The scene, the survey, and the planning or None.
     points
-        The points, in parts: read in order a piece at a time, or written with `save_cloud`.
+        The points, in parts: read in order a piece at a time, or written with their `save`.
     plan, trials
         The best path and all trials; None and empty without planning.
     backend
