@@ -95,21 +95,25 @@ def find_workers(
     """
     if client.asynchronous:
         raise LidarpoolError("The client is asynchronous: give one made without asynchronous=True.")
-    began = told = time.monotonic()
+    began = told = looked = time.monotonic()
     while True:
         try:
             pool = _survey_pool(client, slots_needed(collectors, planning))
             casting = [worker for worker in pool if worker.resources.get(GPU)]
             return pool, casting, common_backend(client, wanted, casting, advice)
         except TooFewWorkersError as error:
-            now = time.monotonic()
-            if now > began + wait_s:
+            # One that has just died takes half a minute not to answer, which is no waiting: what
+            # counts is when the last look began.
+            if looked >= began + wait_s:
                 raise
+            now = time.monotonic()
             if now - told >= max(TELL_EVERY_S, (now - began) / 10):
                 told = now
                 lacking = str(error).partition(": start ")[0]  # who waits has started them
-                tell(f"waiting for workers, for another {began + wait_s - now:.0f} s: {lacking}")
+                left = max(0, began + wait_s - now)
+                tell(f"waiting for workers, for another {left:.0f} s: {lacking}")
         time.sleep(LOOK_EVERY_S)
+        looked = time.monotonic()
 
 
 def _survey_pool(client: Client, needed: Mapping[str, int]) -> Pool:
