@@ -159,6 +159,7 @@ def result_at(url: str) -> dict[str, Any]:
     return json.loads(out.read("report.json"))
 
 
+@pytest.mark.slow
 def test_a_result_goes_to_the_bucket(cluster, lidarpool, tmp_path, environment):
     (tmp_path / "s.yaml").write_text(SCENARIO)
     url = f"{BUCKET}/results/whole"

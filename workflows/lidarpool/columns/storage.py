@@ -69,9 +69,15 @@ class Storage:
         """Whether it is a folder in a local file system."""
         return not is_url(self.url)
 
-    @cached_property
+    @property
     def _remote(self) -> tuple[Any, str]:
         """File system and folder of a URL."""
+        system, folder = self._opened
+        system.invalidate_cache()  # other processes write there, too
+        return system, folder
+
+    @cached_property
+    def _opened(self) -> tuple[Any, str]:
         import fsspec
 
         try:
@@ -226,7 +232,7 @@ class Storage:
         try:
             with _as_os_error():
                 system, folder = self._remote
-                entries = system.ls(folder, detail=True, refresh=True)
+                entries = system.ls(folder, detail=True)
         except FileNotFoundError:
             return {}
         return {
@@ -253,7 +259,6 @@ class Storage:
         """Whether there is a file or folder of this name; OSError if that cannot be told."""
         with _as_os_error():
             system, folder = self._remote
-            system.invalidate_cache()
             return bool(system.exists(f"{folder}/{name}"))
 
     def discard(self, name: str) -> None:
@@ -266,7 +271,6 @@ class Storage:
         """
         with suppress(FileNotFoundError), _as_os_error():
             system, folder = self._remote
-            system.invalidate_cache()
             system.rm(f"{folder}/{name}", recursive=True)
 
     def remove_folder(self) -> None:
