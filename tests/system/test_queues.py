@@ -23,7 +23,7 @@ from tests.system.default_survey import DEFAULT_CLOUD_SHA256
 
 from lidarpool import Result, Scene, simulate
 from lidarpool.scenario.scenario import Scenario
-from poolpart import placement_violations, start_partitions
+from poolpart import placement_violations, start_partitions, worker_identities
 
 pytestmark = pytest.mark.slow
 
@@ -260,7 +260,7 @@ def test_a_worker_that_is_killed_half_way(ssh, tmp_path, small_batches, victim):
         start_partitions(cluster, {name: own | options for name, own in HOSTS.items()})
 
         def kill(client: Client) -> None:
-            workers = client.scheduler_info(n_workers=-1)["workers"]
+            workers = worker_identities(client)
             (address,) = (a for a, w in workers.items() if w["name"] == victim)
             os.kill(client.run(os.getpid, workers=[address])[address], signal.SIGKILL)
 

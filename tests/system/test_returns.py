@@ -9,6 +9,7 @@ import numpy as np
 
 from lidarpool import Frame, Material, Noise, Returns, Scene, Sensor, Survey, load_sensor, simulate
 from lidarpool.columns.table import TABLE
+from poolpart import worker_identities
 
 OPTIONAL = [name for name in TABLE if name not in ("scan", "x", "y", "z", "channel", "object")]
 SURVEY = Survey(
@@ -36,7 +37,7 @@ def test_another_cluster_other_batches_and_a_killed_worker_give_the_same_bytes(
 
     def kill(frame: Frame) -> None:
         if frame.scan == 50:
-            workers = client.scheduler_info(n_workers=-1)["workers"].items()
+            workers = worker_identities(client).items()
             gpu = [address for address, worker in workers if "GPU" in worker["resources"]]
             killed.append(client.run(os.getpid, workers=gpu[:1])[gpu[0]])
             os.kill(killed[0], signal.SIGKILL)

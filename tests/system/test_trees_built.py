@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from lidarpool import Scene, Sensor, Survey, simulate
+from poolpart import worker_identities
 
 
 def _count_builds(dask_worker=None) -> None:
@@ -21,7 +22,7 @@ def _builds(dask_worker=None) -> int:
 
 def test_a_tree_for_each_casting_worker(client):
     assert client.amm.running()
-    casting = [a for a, w in client.scheduler_info(n_workers=-1)["workers"].items()
+    casting = [a for a, w in worker_identities(client).items()
                if w["resources"].get("GPU")]  # fmt: skip
 
     def look(frame) -> None:
