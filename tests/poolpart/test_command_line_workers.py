@@ -54,6 +54,7 @@ def await_workers(client, count):
     client.wait_for_workers(count, timeout=LONG_S)
 
 
+@pytest.mark.slow
 def test_live_late_killed_and_undone(command_line, wait_until):
     """A user's cluster: it is divided, workers die, join and come back, and it is as before."""
     command_line.worker("--name", "named")

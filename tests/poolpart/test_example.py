@@ -27,6 +27,7 @@ def thumbnails(count):
     return blocks.mean(axis=(2, 4)).astype(np.uint8).tobytes()
 
 
+@pytest.mark.slow
 def test_whichever_worker_is_killed_the_file_is_the_same(tmp_path, wait_until):
     path, total = tmp_path / "out.bin", 100
     run, all_killed = runpy.run_path(str(EXAMPLE))["run"], threading.Event()
