@@ -266,8 +266,8 @@ ENDS = [Pipe.close, Pipe.delete, lambda pipe: pipe.fail("why not")]
 @pytest.mark.parametrize("change", [*ENDS, lambda pipe: pipe.put("item")])
 def test_an_item_or_the_end_of_a_pipe_ends_the_wait(client, make_pipe, change):
     pipe = make_pipe(client)
-    threading.Timer(0.1, change, [pipe]).start()
     start = time.monotonic()
+    threading.Timer(0.1, change, [pipe]).start()
     assert take_news(client, LONG_S, [pipe.name]) in ({}, {pipe.name: ["item"]})
     assert 0.1 <= time.monotonic() - start < LONG_S / 2
 
