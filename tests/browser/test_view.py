@@ -114,6 +114,23 @@ def test_points_are_clicked_at_measured_seen_from_near_and_linked_to(served, new
     assert tab.errors == other.errors == []
 
 
+def test_each_browser_is_dark_where_its_system_is_until_its_user_wants_otherwise(served, new_tab):
+    page, _ = served
+    scheme = "document.documentElement.dataset.mantineColorScheme"
+    light, dark = new_tab("about:blank"), new_tab("about:blank")
+    for tab, name in ((light, "light"), (dark, "dark")):
+        media = [{"name": "prefers-color-scheme", "value": name}]
+        tab.call("Emulation.setEmulatedMedia", features=media)
+        tab.open(page.url)
+        tab.wait_for(lambda text: "20,000 shown" in text)
+    dark.wait_for(lambda _: dark.value(scheme) == "dark")
+    assert light.value(scheme) == "light"
+    for client in page.get_clients():
+        page._dark[client].value = not page._dark[client].value
+    dark.wait_for(lambda _: dark.value(scheme) == "light")
+    light.wait_for(lambda _: light.value(scheme) == "dark")
+
+
 def colourful(picture):
     """Count the pixels left of the panel that are of a colour."""
     part = picture[200:, :900].astype(int)

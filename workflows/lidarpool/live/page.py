@@ -51,6 +51,12 @@ _FROM = (0.15, -0.75, 1.2)  # left of the camera's first place, so that no two s
 _LIGHT, _DARK = (255, 255, 255), (20, 20, 20)  # behind all
 _GRID = (128, 134, 142)
 
+# Runs when the page loads it, as a script would not (HTML, 4.12.1.1).
+_TICK_IF_DARK = (
+    '<img src="data:," style="display:none" onerror="const box = document.getElementById(\'{}\');'
+    "if (box && !box.checked && matchMedia('(prefers-color-scheme: dark)').matches) box.click()\">"
+)
+
 _LOGGER = logging.getLogger(__name__)
 
 
@@ -69,10 +75,10 @@ class LivePage(viser.ViserServer):
         super().__init__(host=HOST, port=port, label=title, verbose=False)
         self._links: SimpleQueue[str] = SimpleQueue()  # paths
         refuse_strangers(self, self._links.put)
-        self._set_theme(dark=False)
-        # It is the last of the panel.
-        self._dark = self.gui.add_checkbox("dark", initial_value=False, order=1e6)
-        self._dark.on_update(lambda _: self._set_theme(self._dark.value))
+        _set_theme(self, dark=False)
+        self._dark: dict[int, viser.GuiCheckboxHandle] = {}  # {client: its choice}
+        self.on_client_connect(self._add_dark)
+        self.on_client_disconnect(lambda client: self._dark.pop(client.client_id, None))
         self.scene.configure_environment_map(None)
         self.scene.configure_default_lights(enabled=False, cast_shadow=False)
         self.scene.add_light_ambient("/light/around", intensity=_AROUND)
@@ -81,8 +87,19 @@ class LivePage(viser.ViserServer):
     SIDES = tuple(_SIDES)
     _bounds = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
 
-    def _set_theme(self, dark: bool) -> None:
-        self.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=dark)
+    def _add_dark(self, client: viser.ClientHandle) -> None:
+        """Give a browser its own choice of colours, at first as its system has it.
+
+        viser does not know the system's choice, so the page itself ticks the box, once.
+        """
+        box = client.gui.add_checkbox("dark", initial_value=False, order=1e6)  # the last one
+        ticks = client.gui.add_html(_TICK_IF_DARK.format(box._impl.uuid))
+        self._dark[client.client_id] = box
+
+        @box.on_update
+        def choose(_: viser.GuiEvent[viser.GuiCheckboxHandle]) -> None:
+            _set_theme(client, box.value)
+            ticks.content = ""
 
     def request_share_url(self, verbose: bool = True) -> None:
         """Do nothing: viser would open a tunnel to this page from the internet."""
@@ -102,7 +119,8 @@ class LivePage(viser.ViserServer):
         """Let a browser save its view, without the panel, as a PNG file."""
         height, width = client.camera.image_height, client.camera.image_width
         drawn = client.get_render(height, width, transport_format="png", timeout=LAST_S)
-        image = Image.new("RGB", (width, height), _DARK if self._dark.value else _LIGHT)
+        dark = self._dark[client.client_id].value
+        image = Image.new("RGB", (width, height), _DARK if dark else _LIGHT)
         layer = Image.fromarray(drawn)
         image.paste(layer, mask=layer.getchannel("A"))
         data = io.BytesIO()
@@ -248,6 +266,10 @@ def refuse_strangers(
     sockets.on_client_connect(admit)
     # Earlier connections reconnect: viser listens before this check is in place.
     sockets.disconnect_all_clients()
+
+
+def _set_theme(whose: viser.ViserServer | viser.ClientHandle, dark: bool) -> None:
+    whose.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=dark)
 
 
 @contextmanager
