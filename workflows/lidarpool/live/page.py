@@ -78,7 +78,6 @@ class LivePage(viser.ViserServer):
         _set_theme(self, dark=False)
         self._dark: dict[int, viser.GuiCheckboxHandle] = {}  # {client: its choice}
         self.on_client_connect(self._add_dark)
-        self.on_client_disconnect(lambda client: self._dark.pop(client.client_id, None))
         self.scene.configure_environment_map(None)
         self.scene.configure_default_lights(enabled=False, cast_shadow=False)
         self.scene.add_light_ambient("/light/around", intensity=_AROUND)
