@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import logging
+import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import dask
@@ -19,10 +22,15 @@ from .rules import check_name
 logger = logging.getLogger(__name__)
 
 _LOOK_EVERY_S = 5.0  # for workers that are gone
+INFORMATION = " - INFO - "  # in lines of Dask's logs that are no complaints
 _DEATH_S = 60  # a worker that finds no scheduler for so long ends, as those of dask-jobqueue do
 
 
-def start_partitions(cluster: SpecCluster, partitions: Mapping[str, Mapping[str, Any]]) -> None:
+def start_partitions(
+    cluster: SpecCluster,
+    partitions: Mapping[str, Mapping[str, Any]],
+    tell: Callable[[str], object] = logger.warning,
+) -> None:
     """Start the workers of partitions on a cluster of dask-jobqueue, or on an `SSHCluster`.
 
     They declare their partition from the start, and are named after it: ``GPU-0``, ``GPU-1``.
@@ -41,6 +49,9 @@ def start_partitions(cluster: SpecCluster, partitions: Mapping[str, Mapping[str,
         SSHCluster takes ``connect_options``, ``remote_python``, ``worker_class``,
         ``worker_options``, and ``hosts``, which workers are dealt out to in turn; by default there
         is one for each.
+    tell
+        Called with what went wrong later: the last line of a job's log while workers are missing,
+        or why a lost worker cannot be started again.
 
     Raises
     ------
@@ -92,7 +103,16 @@ def start_partitions(cluster: SpecCluster, partitions: Mapping[str, Mapping[str,
             raise PoolError(f"Partition {name!r} cannot be started: {error}") from error
 
     cluster.worker_spec.update(workers)
+    logs = _JobLogs(cluster)
     cluster.sync(_start, cluster)
+    told: set[str] = set()
+
+    def say(words: str) -> None:
+        line = " ".join(words.split())[:400]
+        alike = re.sub(r"\d+", "", line)  # but for the numbers of jobs
+        if alike not in told:
+            told.add(alike)
+            tell(line)
 
     async def start_again() -> None:
         # A SpecCluster lets go of a worker that is lost, and starts another when it is asked to.
@@ -100,7 +120,10 @@ def start_partitions(cluster: SpecCluster, partitions: Mapping[str, Mapping[str,
             try:
                 await _start(cluster)
             except Exception as error:
-                logger.warning("A worker was lost, and cannot be started again: %s", error)
+                say(f"A worker was lost, and cannot be started again: {error}")
+            with suppress(OSError):
+                for line in logs.endings() if cluster.plan - cluster.observed else ():
+                    say(line)
 
     def watch() -> None:
         again = PeriodicCallback(start_again, 1000 * _LOOK_EVERY_S)
@@ -123,12 +146,44 @@ async def _start(cluster: SpecCluster) -> None:
         raise
 
 
+class _JobLogs:
+    """Logs of jobs: why workers are missing. Dask does not notice jobs that end before."""
+
+    def __init__(self, cluster: SpecCluster) -> None:
+        jobs = [spec["options"] for spec in cluster.worker_spec.values()]
+        self._folders = {Path(job["log_directory"]) for job in jobs if job.get("log_directory")}
+        self._done = self._files()  # logs that are older, or have been read
+        self._last: set[tuple[Path, int]] = set()
+
+    def _files(self) -> set[tuple[Path, int]]:
+        """All files, and when they were written to."""
+        files = (path for folder in self._folders for path in folder.glob("*") if path.is_file())
+        return {(path, path.stat().st_mtime_ns) for path in files}
+
+    def endings(self) -> Iterator[str]:
+        """Last lines of logs that have not changed since the last look."""
+        now = self._files()
+        still = (now & self._last) - self._done
+        self._done |= still
+        self._last = now
+        for path, _ in sorted(still):
+            with path.open("rb") as log:
+                log.seek(max(0, path.stat().st_size - 4000))
+                last = log.read().decode(errors="replace").rstrip().rpartition("\n")[2]
+            if last and INFORMATION not in last:
+                yield f"The log {path} ends: {last}"
+
+
 def _jobs(
     cluster: Any, name: str, number: int, resources: Mapping[str, int], own: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Describe a job as a cluster of dask-jobqueue does."""
     options = {**cluster.new_spec["options"], **own}
-    for option, default in (("processes", 1), ("worker_extra_args", [])):
+    for option, default in (
+        ("processes", 1),
+        ("worker_extra_args", []),
+        ("log_directory", None),
+    ):
         if options.get(option) is None:
             key = f"jobqueue.{options['config_name']}.{option}"
             options[option] = dask.config.get(key, None) or default

@@ -79,7 +79,7 @@ def test_a_cluster_that_does_not_start(tmp_path):
     file = load(tmp_path, GOOD.replace("hosts: [head]}", "host: head}", 1))
     with (
         pytest.raises(LidarpoolError, match=r"c.yaml: distributed.SSHCluster was not started \(.*"),
-        file.started(),
+        file.started(print),
     ):
         pass
 

@@ -100,6 +100,24 @@ def test_a_job_that_was_lost_is_submitted_again(cluster, queue, monkeypatch):
     assert cluster.status == Status.closed
 
 
+def test_logs_tell_why_workers_are_missing(queue, tmp_path, monkeypatch):
+    monkeypatch.setattr(poolpart.clusters, "_LOOK_EVERY_S", 0.01)
+    said: list[str] = []
+    (tmp_path / "old.err").write_text("an older job failed\n")
+    logs = {"log_directory": str(tmp_path), "scheduler_options": SCHEDULER}
+    with import_jobqueue().SLURMCluster(cores=2, memory="2GB", **logs) as cluster:
+        start_partitions(cluster, {"GPU": {"workers": 2}}, said.append)
+        (tmp_path / "up.err").write_text("2026-01-01 - distributed.nanny - INFO - Start Nanny\n")
+        (tmp_path / "gpu-1.err").write_text("Traceback:\nno such file: job 1\n\n")
+        wait_until(lambda: len(said) == 1)
+        (tmp_path / "gpu-2.err").write_text("no such file: job 2\n")  # the same again
+        (tmp_path / "gpu-3.err").write_text("out of memory\n")
+        wait_until(lambda: len(said) == 2)
+    first, second = said
+    assert first == f"The log {tmp_path}/gpu-1.err ends: no such file: job 1"
+    assert second.endswith("gpu-3.err ends: out of memory")
+
+
 def test_a_job_that_is_refused(cluster, queue):
     queue.refuses = "IO-0"
     with pytest.raises(RuntimeError, match="no such partition"):

@@ -20,6 +20,7 @@ from distributed import Client, SpecCluster, SSHCluster
 from tests.clusters import import_jobqueue
 from tests.daemons import LOOPBACK, Slurm, needs_slurm, needs_sshd, slurm, ssh_server, wait_until
 from tests.system.default_survey import DEFAULT_CLOUD_SHA256
+from tests.system.test_tls import new_files
 
 from lidarpool import Result, Scene, simulate
 from lidarpool.scenario.scenario import Scenario
@@ -189,6 +190,40 @@ def test_a_job_that_the_queue_refuses_takes_the_others_with_it(empty_queue, tmp_
     assert empty_queue.jobs() == {}
 
 
+@needs_slurm
+def test_the_log_of_a_job_that_did_not_start_its_worker(empty_queue, tmp_path):
+    run = Command(tmp_path, slurm_file(tmp_path, python="/nowhere/python"))
+    run.wait_for(rf"note: The log {tmp_path}/gpu-\d+.err ends: .*/nowhere/python: No such file")
+    run.process.send_signal(signal.SIGINT)
+    assert run.process.wait(300) == 130
+    assert empty_queue.jobs() == {}
+
+
+@needs_slurm
+@pytest.mark.parametrize("certificates", ["of its own", "configured"])
+def test_an_encrypted_cluster_of_jobs(empty_queue, tmp_path, monkeypatch, certificates):
+    file = slurm_file(tmp_path)
+    if certificates == "configured":
+        configure_certificates(tmp_path, monkeypatch)
+        file["arguments"]["protocol"] = "tls://"
+    else:
+        file["arguments"] |= {"security": True, "shared_temp_directory": str(tmp_path)}
+    run = Command(tmp_path, file)
+    run.assert_default_result()
+    assert "The cluster at tls://" in run.said
+    assert empty_queue.jobs() == {}
+
+
+def configure_certificates(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Put certificates into Dask's configuration, for this process and those that it starts."""
+    _, files = new_files(folder)
+    pair = {"cert": str(files.cert), "key": str(files.key)}
+    tls = {"ca-file": str(files.ca), "scheduler": pair, "worker": pair, "client": pair}
+    comm = {"require-encryption": True, "tls": tls}
+    (folder / "dask.yaml").write_text(yaml.safe_dump({"distributed": {"comm": comm}}))
+    monkeypatch.setenv("DASK_CONFIG", str(folder / "dask.yaml"))
+
+
 def run_disturbed(cluster: SpecCluster, disturb: Callable[[Client], None]) -> Result:
     """Run the default survey, disturbed once half way."""
     scenario = Scenario()
@@ -235,20 +270,40 @@ def test_a_job_that_is_cancelled_half_way(empty_queue, tmp_path, small_batches, 
     wait_until(lambda: not empty_queue.jobs())
 
 
-@needs_sshd
-def test_a_run_on_hosts_that_ssh_reaches(ssh, tmp_path):
-    file = {
+def ssh_file(folder: Path, ssh: dict[str, object], **scheduler: Any) -> dict[str, Any]:
+    return {
         "cluster": "distributed.SSHCluster",
         "arguments": {
             "hosts": [LOOPBACK],
             "connect_options": ssh,
-            "scheduler_options": SCHEDULER,
-            "worker_options": {"host": LOOPBACK, "local_directory": str(tmp_path)},
+            "scheduler_options": SCHEDULER | scheduler,
+            "worker_options": {"host": LOOPBACK, "local_directory": str(folder)},
         },
         "partitions": HOSTS,
     }
-    run = Command(tmp_path, file)
+
+
+@needs_sshd
+@pytest.mark.parametrize("protocol", ["tcp://", "tls://"])
+def test_a_run_on_hosts_that_ssh_reaches(ssh, tmp_path, monkeypatch, protocol):
+    if protocol == "tls://":
+        configure_certificates(tmp_path, monkeypatch)
+    run = Command(tmp_path, ssh_file(tmp_path, ssh, protocol=protocol))
     run.assert_default_result()
+    wait_until(lambda: not processes_in(tmp_path))
+
+
+@needs_sshd
+@pytest.mark.parametrize("where", ["arguments", "GPU"])
+def test_what_a_host_says_that_cannot_start_its_process(ssh, tmp_path, where):
+    file = ssh_file(tmp_path, ssh)
+    if where == "GPU":
+        file["partitions"] = HOSTS | {"GPU": HOSTS["GPU"] | {"remote_python": "/nowhere/python"}}
+    else:
+        file["arguments"]["remote_python"] = "/nowhere/python"
+    run = Command(tmp_path, file)
+    assert run.process.wait(300) == 2
+    assert re.search(r"was not started \(.*/nowhere/python.*No such file", run.said), run.said
     wait_until(lambda: not processes_in(tmp_path))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -217,8 +217,7 @@ def _drive(
         check_backend_here(store.backend or store.job.backend, store.advice)
         cluster = _local_client(scenario, options, store.job.planning is not None)
     with cluster as client, shown_progress(options.quiet) as show:
-        tell = (lambda words: None) if options.quiet else _note
-        run = Run(client, store, tell)
+        run = Run(client, store, _teller(options))
         # The cluster of one run has no dashboard.
         with nullcontext() if options.here else run.partitions_page():
             if live is None:
@@ -231,7 +230,7 @@ def _started_client(file: ClusterFile, options: RunOptions) -> Iterator[Client]:
     """Client of the cluster of a file."""
     with ExitStack() as stack:
         with shown_status(f"starting {file}", options.quiet):
-            client = stack.enter_context(started_client(file))
+            client = stack.enter_context(started_client(file, _teller(options)))
         if not options.quiet:
             _note(f"started {file}")
         try:
@@ -239,6 +238,10 @@ def _started_client(file: ClusterFile, options: RunOptions) -> Iterator[Client]:
         except TooFewWorkersError as error:
             error.add_note("Jobs that began and failed say why in their logs.")
             raise
+
+
+def _teller(options: RunOptions) -> Callable[[str], None]:
+    return (lambda words: None) if options.quiet else _note
 
 
 def _note(words: str) -> None:

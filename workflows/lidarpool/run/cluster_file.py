@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from distributed import SpecCluster, SSHCluster
+from distributed.deploy import ssh
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError
 
 from poolpart import start_partitions
+from poolpart.clusters import INFORMATION
 
 from ..base.errors import LidarpoolError
 from ..base.interrupts import deferred_interrupts
@@ -102,8 +104,13 @@ class ClusterFile(BaseModel):
         return f"{self.cluster.rpartition('.')[2]}: {total}, {parts}"
 
     @contextmanager
-    def started(self) -> Iterator[SpecCluster]:
+    def started(self, tell: Callable[[str], object]) -> Iterator[SpecCluster]:
         """Cluster with these workers, which are there or in a queue, as long as the body runs.
+
+        Parameters
+        ----------
+        tell
+            Called with what goes wrong with workers meanwhile.
 
         Raises
         ------
@@ -116,6 +123,7 @@ class ClusterFile(BaseModel):
             for name, one in self.partitions.items()
         }
         factory = self._factory()
+        heard: list[str] = []
         try:
             if factory is SSHCluster:
                 common = {
@@ -129,14 +137,16 @@ class ClusterFile(BaseModel):
                     ("connect_options", "connect_timeout", _CONNECT),
                 ):
                     arguments[option] = {key: value} | arguments.get(option, {})
-            cluster = factory(**arguments)
-            try:
-                start_partitions(cluster, partitions)
-            except BaseException:
-                cluster.close()
-                raise
+            with _listening(heard):
+                cluster = factory(**arguments)
+                try:
+                    start_partitions(cluster, partitions, tell)
+                except BaseException:
+                    cluster.close()
+                    raise
         except Exception as error:  # of sbatch, of SSH, of a constructor: any
             told = str(error).partition(" Very likely")[0]  # jobqueue goes on with all arguments
+            told = ": ".join([told, *[line for line in heard if INFORMATION not in line][-1:]])
             reason = " ".join(f"{type(error).__name__}: {told}".split())[:400]
             raise LidarpoolError(
                 f"{self._source}: {self.cluster} was not started ({reason})."
@@ -172,3 +182,19 @@ class ClusterFile(BaseModel):
                 "distributed.SSHCluster. Start others yourself, and use --scheduler."
             )
         return found
+
+
+@contextmanager
+def _listening(heard: list[str]) -> Iterator[None]:
+    """Collect what processes that SSH starts say until they are up; Dask only logs it."""
+
+    def info(line: str, *arguments: object) -> None:
+        heard.append(line)
+        log(line, *arguments)
+
+    log = ssh.logger.info
+    ssh.logger.info = info
+    try:
+        yield
+    finally:
+        del ssh.logger.info

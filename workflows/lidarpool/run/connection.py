@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -91,10 +91,11 @@ def local_client(
 
 
 @contextmanager
-def started_client(file: ClusterFile) -> Iterator[Client]:
+def started_client(file: ClusterFile, tell: Callable[[str], object]) -> Iterator[Client]:
     """Client of a cluster that is started for it and lasts as long as the body.
 
-    An interrupt waits until all jobs are in the queue, and until they have been cancelled.
+    An interrupt waits until all jobs are in the queue, and until they have been cancelled. `tell`
+    is called with what goes wrong with workers.
 
     Raises
     ------
@@ -104,7 +105,7 @@ def started_client(file: ClusterFile) -> Iterator[Client]:
     stack = ExitStack()
     try:
         with deferred_interrupts(), children_spared():
-            cluster = stack.enter_context(file.started())
+            cluster = stack.enter_context(file.started(tell))
             client = stack.enter_context(Client(cluster, set_as_default=False))
         yield client
     finally:
