@@ -133,10 +133,9 @@ def points(page):
     return node.points if node is not None and node.visible else np.empty((0, 3))
 
 
-def scenes(page):
+def scenes(view):
     """Meshes that are shown."""
-    handles = [page.scene.get_handle_by_name(f"/scene/{name}") for name in ("one", "other")]
-    return [handle.glb_data for handle in handles if handle is not None]
+    return [node for node in view._view._mesh._nodes if node.visible]
 
 
 def test_the_page_shows_scene_sensors_rays_and_planning(cloud, pictured, page):
@@ -144,7 +143,7 @@ def test_the_page_shows_scene_sensors_rays_and_planning(cloud, pictured, page):
     view.draw()
     for name in ("/poses", "/rays", "/path", "/discs/0"):
         assert page.scene.get_handle_by_name(name) is not None, name
-    assert len(scenes(page)) == 1
+    assert len(scenes(view)) == 1
     assert not view._view._scene_legend.content  # grey
     view._view._scene_colour.value = "hits"
     view.draw()
@@ -171,10 +170,10 @@ def test_under_a_roof_the_page_is_cut_and_can_be_made_whole(cloud, pictured, pag
     assert view._view.cut is None
     assert len(points(page)) == 10_000
     assert len(page.scene.get_handle_by_name("/rays").points) == 18
-    assert len(scenes(page)) == 2
+    assert len(scenes(view)) == 2
     view._view._cut.value = -1.0  # not even the floor is left
     view.draw()
-    assert len(points(page)) == len(scenes(page)) == 0
+    assert len(points(page)) == len(scenes(view)) == 0
 
 
 def test_a_colour_that_is_chosen_is_drawn_and_what_is_hidden_is_not(cloud, pictured, page):
@@ -187,7 +186,7 @@ def test_a_colour_that_is_chosen_is_drawn_and_what_is_hidden_is_not(cloud, pictu
     view.draw()
     assert len(points(page)) == 0
     assert not page.scene.get_handle_by_name("/rays").visible
-    assert not page.scene.get_handle_by_name("/scene/other").visible
+    assert len(scenes(view)) == 0
 
 
 def test_what_moves_is_where_it_is_at_the_time_that_is_chosen_or_played(cloud, pictured, page):
@@ -226,6 +225,32 @@ def test_a_drive_through_a_large_scene_is_looked_at_from_near(cloud, page):
     view.draw()
     assert 20 < view._view.cut < 40
     assert np.linalg.norm(page.initial_camera.position) < 200
+
+
+def test_of_an_object_that_is_looked_at_alone_all_else_is_hidden(cloud, page):
+    scene = Scene.from_meshes([box("Hall", (8, 8, 8)), box("Table", (2, 2, 2))])
+    track = Track([0, 2], [[1, 1, 0], [5, 1, 0]])
+    scene = replace(scene, actors=(Actor(box("Cart", (1, 1, 1)), track),))
+    hits = np.arange(scene.triangles)
+    rays = np.ones((4, 2, 3), np.float32)
+    way = SensorWay(np.zeros(1), np.array([[20.0, 0, 1]]))  # beside the hall
+    seen = Pictured(scene, [way], hits, rays, None, None, (), 2e9)
+    view = ResultView(page, CloudFile(cloud), seen)
+    shown, cart = view._view, page.scene.get_handle_by_name("/actors/0")
+    for colour in ("grey", "hits"):
+        shown._scene_colour.value = colour
+        for name, sides, moving in ((None, 24, True), ("Table", 12, False), ("Cart", 0, True)):
+            only = None if name is None else (scene.all_names.index(name),) * 2
+            shown.cloud.set_filter(Filter().with_limits("object", only))
+            view.draw()
+            if sides:
+                mesh = trimesh.load(io.BytesIO(scenes(view)[-1].glb_data), file_type="glb")
+                assert mesh.to_mesh().extents == pytest.approx([2 if name else 8] * 3, abs=0.01)
+            else:
+                assert not scenes(view)
+            assert cart.visible == moving
+            assert ("Cart" in shown._labels._places) == moving
+            assert page.scene.get_handle_by_name("/rays").visible == (name is None)
 
 
 def test_a_drive_under_a_wide_roof_is_cut_below_the_roof(cloud, page):

@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 from queue import Empty, SimpleQueue
 from typing import Any
 
@@ -18,7 +17,8 @@ from ..columns.cloud import Cloud
 from ..columns.table import AXES, SCAN, Column, X, Y, Z
 from ..render.colouring import MOST_ENTRIES, Colouring, colours_of
 from .blocks import Blocks, Search
-from .colouring import as_bytes, legend_of
+from .colouring import as_bytes, boxed, legend_of
+from .labels import Labels
 from .looking import TILES, Eye, Filter, even_shares, picked, values_of
 from .page import LivePage
 from .picked_point import PickedPoints
@@ -72,12 +72,14 @@ class CloudView:
     def __init__(
         self,
         page: LivePage,
+        labels: Labels,
         columns: Sequence[Column],
         names: Mapping[str, Sequence[str]],
         origin: NDArray[np.float64],
         size_m: float,
     ) -> None:
-        self._page, self._names, self._origin, self._size_m = page, names, origin, size_m
+        self._page, self._labels, self._names = page, labels, names
+        self._origin, self._size_m = origin, size_m
         rest = {column.name: column for column in columns if column not in AXES}
         self._columns = {"z": Z, **rest}
         # {column: description for the filter}
@@ -109,29 +111,24 @@ class CloudView:
 
     # -- controls ------------------------------------------------------------------------
 
-    def add_controls(self) -> None:
+    def add_colour(self) -> None:
         """Add the menu of colours and their legend."""
         gui = self._page.gui
         self.colour = gui.add_dropdown("cloud colour", (*self._columns, HIDDEN))
         self._legend = gui.add_html("")
 
-    def add_picked(self) -> None:
-        """Add the panel for clicked points."""
-        self.picked = PickedPoints(self._page, self._columns, self._names, self._origin)
-
     def add_filter(self) -> None:
-        """Add the controls of the filter."""
+        """Add the panel of clicked points and the controls of the filter."""
         gui = self._page.gui
+        self.picked = PickedPoints(
+            self._page, self._labels, self._columns, self._names, self._origin
+        )
         self._folder = gui.add_folder("filter", expand_by_default=False)
         with self._folder:
             self._filter_by = gui.add_dropdown("column", tuple(self.filtered))
             self._filter_text = gui.add_html("", order=1e4)
             self._all = gui.add_button("Show all", order=1e5, visible=False)
         self._all.on_click(lambda _: self.set_filter(Filter()))
-
-    def add_point_size(self) -> None:
-        """Add a slider."""
-        self._point_size = self._page.gui.add_slider("point size", 0.1, 4.0, 0.1, 1.0)
 
     def set_filter(self, wanted: Filter) -> None:
         """Show only points that pass this filter."""
@@ -149,14 +146,14 @@ class CloudView:
         else:
             self.filter = self.filter.with_limits(name, self._chosen_limits(name))
         words = [self._in_words(*entry) for entry in self.filter.limits]
-        self._filter_text.content = _boxed(words)
+        self._filter_text.content = boxed(words)
         self._all.visible = bool(words)
 
     def _filter_input(self, name: str) -> Any:
         gui, column, limits = self._page.gui, self.filtered[name], self.filter.of(name)
         values = np.zeros(0) if self._even is None else values_of(self._even, name)
         values = values[np.isfinite(values)]
-        if column.kind == "label" and (labels := self._labels(name, values)):
+        if column.kind == "label" and (labels := self._values_by_name(name, values)):
             self._label_values = labels
             chosen = next((word for word, at in labels.items() if limits == (at, at)), "all")
             return gui.add_dropdown("only", ("all", *labels), initial_value=chosen)
@@ -174,7 +171,7 @@ class CloudView:
         title = f"{name}, {'s' if unit == _NS else column.unit}".rstrip(", ")
         return gui.add_multi_slider(title, first, last, step, ends)
 
-    def _labels(self, name: str, values: NDArray[Any]) -> dict[str, int]:
+    def _values_by_name(self, name: str, values: NDArray[Any]) -> dict[str, int]:
         """Return {name: value} of a label with few values, or with names."""
         names, found = self._names.get(name, ()), np.unique(values).astype(np.int64)
         if len(found) > (_MOST_NAMES if names else MOST_ENTRIES) or name == "scan":
@@ -213,26 +210,26 @@ class CloudView:
         self._even, self._even_version = cloud, version
         self._version += 1
 
-    def draw(self, cut: float | None, playing: bool = False) -> None:
-        """Draw what has changed; nothing above `cut`, metres, local, is shown."""
+    def draw(self, cut: float | None, size: float = 1.0, playing: bool = False) -> None:
+        """Draw what has changed: points of this size, and nothing above `cut`, metres, local."""
         if self._even is None:
             return
         self._follow_filter()
         self._look_for_filtered()
-        chosen = self.colour.value, self._point_size.value
-        state = self._version, self.filter, self.trail, cut, chosen
+        state = self._version, self.filter, self.trail, cut, self.colour.value, size
         self._scale()
         self._follow_eyes(playing)
         if state != self._drawn:
             self._drawn = state
-            self._node = self._draw(self._page.scene, self._node, self._base(), cut, 1.0)
+            self._node = self._draw(self._page.scene, self._node, self._base(), cut, size)
         for client, near in self._near.items():
             handle = self._page.get_clients().get(client)
             if handle is not None and near.drawn != (near.version, state):
                 near.drawn = (near.version, state)
                 if near.cloud is not None:
                     # A node for one browser hides the common node of the same name.
-                    near.node = self._draw(handle.scene, near.node, near.cloud, cut, near.size)
+                    sizes = near.size * size
+                    near.node = self._draw(handle.scene, near.node, near.cloud, cut, sizes)
                 elif near.node is not None:
                     near.node.remove()
                     near.node = None
@@ -278,7 +275,7 @@ class CloudView:
         values = values_of(cloud, self.colour.value)[rows]
         colours = as_bytes(self._colouring.paint(values))
         places = (cloud.positions[rows] - self._origin).astype(np.float32)
-        size *= self._point_m() * self._point_size.value
+        size *= self._point_m()
         if node is None:
             return scene.add_point_cloud(
                 "/cloud",
@@ -410,7 +407,3 @@ class CloudView:
             at = picked(places, click.ray_origin, click.ray_direction, pixel)
             one = None if at is None else cloud.part(rows[at : at + 1])
             self.picked.take(one, click.modifier == "shift", click.ray_origin)
-
-
-def _boxed(lines: Sequence[str]) -> str:
-    return f'<div style="padding:0 0.8em;font-size:0.85em">{"<br>".join(map(escape, lines))}</div>'

@@ -60,6 +60,12 @@ def _key(colouring: Colouring) -> str:
     )
 
 
+def boxed(lines: Sequence[str]) -> str:
+    """Lines of text for the panel."""
+    text = "<br>".join(map(escape, lines))
+    return f'<div style="padding:0 0.8em 0.6em;font-size:0.85em">{text}</div>'
+
+
 def as_bytes(colours: NDArray[np.float64]) -> NDArray[np.uint8]:
     """Colours of 0 to 1 as bytes."""
     return np.round(255 * colours).astype(np.uint8)

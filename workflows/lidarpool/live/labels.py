@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Hashable
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -16,50 +15,45 @@ MOST_LABELS = 100
 _LETTER, _ROUND, _HEIGHT = 7.5, 12.0, 22.0  # pixels: of a letter, around all, of a line
 
 
-@dataclass(eq=False)
-class _Shown:
-    """What one browser shows."""
-
-    state: Hashable = None
-    nodes: dict[str, Any] = field(default_factory=dict)  # {text: node}
-
-
 class Labels:
     """Labels on a page; of two that overlap, the first one is shown."""
 
     def __init__(self, page: LivePage) -> None:
         self._page = page
-        self._places: dict[str, tuple[float, float, float]] = {}  # {text: where it is}
-        self._shown: dict[int, _Shown] = {}  # {client: what it shows}
+        self._places: dict[str, tuple[float, ...]] = {}  # {text: where it is}
+        # {client: (what was drawn, {text: node})}
+        self._shown: dict[int, tuple[Hashable, dict[str, Any]]] = {}
 
-    def put(self, text: str, place: NDArray[np.floating]) -> None:
-        """Place a label, (3,) local, or move the one with the same text."""
-        if text in self._places or len(self._places) < MOST_LABELS:
-            x, y, z = place.tolist()
-            self._places[text] = x, y, z
+    def put(self, text: str, place: NDArray[np.floating] | None, *, first: bool = False) -> None:
+        """Place a label, (3,) local, `first` of all; or move or remove the one with this text."""
+        if place is None:
+            self._places.pop(text, None)
+        elif first:
+            self._places = {text: tuple(place.tolist()), **self._places}
+        elif text in self._places or len(self._places) < MOST_LABELS:
+            self._places[text] = tuple(place.tolist())
 
     def draw(self) -> None:
         """Update the visible labels of each browser, if anything has moved."""
         clients = self._page.get_clients()
-        self._shown = {client: shown for client, shown in self._shown.items() if client in clients}
-        texts = list(self._places)
-        places = np.array(list(self._places.values())).reshape(-1, 3)
-        for client, handle in clients.items():
-            shown = self._shown.setdefault(client, _Shown())
-            eye = Eye.of(handle.camera)
-            state = (eye, handle.camera.image_height, tuple(self._places.items()))
-            if shown.state == state:
+        self._shown = {client: self._shown.get(client, (None, {})) for client in clients}
+        for client, (before, nodes) in self._shown.items():
+            handle = clients[client]
+            eye, height = Eye.of(handle.camera), handle.camera.image_height
+            state = (eye, height, tuple(self._places.items()))
+            if state == before:
                 continue
-            shown.state = state
-            free = without_overlap(texts, places, eye, handle.camera.image_height)
-            for text, place, visible in zip(texts, places, free, strict=True):
-                node = shown.nodes.get(text)
-                if visible and node is None:
-                    name = f"/labels/{len(shown.nodes)}"
-                    node = handle.scene.add_label(name, text, anchor="bottom-left")
-                    shown.nodes[text] = node
-                if node is not None:
-                    node.visible, node.position = bool(visible), place
+            self._shown[client] = state, nodes
+            texts = list(self._places)
+            places = np.array(list(self._places.values())).reshape(-1, 3)
+            free = without_overlap(texts, places, eye, height)
+            visible = {text: places[at] for at, text in enumerate(texts) if free[at]}
+            for text in visible.keys() - nodes.keys():
+                name = f"/labels/{len(nodes)}"
+                nodes[text] = handle.scene.add_label(name, text, anchor="bottom-left")
+            for text, node in nodes.items():
+                node.visible = text in visible
+                node.position = visible.get(text, node.position)
 
 
 def without_overlap(

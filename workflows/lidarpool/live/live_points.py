@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
+from contextlib import suppress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,13 +26,6 @@ class LivePoints:
 
     The run's thread records parts, the page's thread reads them. At the end an evenly spaced
     sample of the whole result replaces them, so skipped parts do not matter.
-
-    Parameters
-    ----------
-    store
-        Store of the run.
-    most
-        Most points to keep.
     """
 
     def __init__(self, store: RunStore, most: int = LIVE_POINTS) -> None:
@@ -45,7 +39,6 @@ class LivePoints:
         self.hits = 0  # of the parts that were read
         self.version = 0  # incremented when there is something new to show
         self.cloud: Cloud | None = None
-        self.error = ""  # why a part could not be read, a sentence
 
     def add(self, receipts: Sequence[Receipt]) -> None:
         """Record parts that are in storage; quick, reads nothing."""
@@ -55,33 +48,27 @@ class LivePoints:
                 del self._waiting[1::2]
 
     def gather(self) -> None:
-        """Read some of the waiting parts.
-
-        A part that cannot be read is skipped, and `error` says why; the run itself reports it.
-        """
+        """Read some of the waiting parts, without those that cannot be read: the run says so."""
         with self._lock:
             names, self._waiting = self._waiting[:PARTS_AT_ONCE], self._waiting[PARTS_AT_ONCE:]
-            clouds = [cloud for name in names if (cloud := self._read(name)) is not None]
-            if clouds:
-                self._keep([self.cloud, *clouds] if self.cloud is not None else clouds)
+            clouds = [] if self.cloud is None else [self.cloud]
+            for name in names:
+                with suppress(LidarpoolError):
+                    part = read_part(self._store.storage, name)
+                    self._counts[part.triangles] += part.hits
+                    self.hits += int(part.hits.sum())
+                    rows = np.flatnonzero(self._random.random(len(part)) < self._share)
+                    clouds.append(self._points.cloud_of(part, rows))
+            if not names or not clouds:
+                return
+            cloud = Cloud.joined(clouds)
+            while len(cloud) > self._most:
+                self._share /= 2
+                cloud = cloud.part(np.flatnonzero(self._random.random(len(cloud)) < 0.5))
+            self.show(cloud)
 
-    def _read(self, name: str) -> Cloud | None:
-        try:
-            part = read_part(self._store.storage, name)
-        except LidarpoolError as error:
-            self.error = str(error)
-            return None
-        self._counts[part.triangles] += part.hits
-        self.hits += int(part.hits.sum())
-        rows = np.flatnonzero(self._random.random(len(part)) < self._share)
-        return self._points.cloud_of(part, rows)
-
-    def _keep(self, clouds: list[Cloud]) -> None:
-        """Keep these points, halved until they are few enough."""
-        cloud = Cloud.joined(clouds)
-        while len(cloud) > self._most:
-            self._share /= 2
-            cloud = cloud.part(np.flatnonzero(self._random.random(len(cloud)) < 0.5))
+    def show(self, cloud: Cloud) -> None:
+        """Show these points instead."""
         self.cloud = cloud
         self.version += 1
 
@@ -89,15 +76,8 @@ class LivePoints:
         """Take a sample of all points, and all hits; the parts may then be removed."""
         with self._lock:
             self._waiting = []
-            self.cloud = result.points.sample(self._most, PARTS_NOTED)
             self._counts, self.hits = result.hit_counts, result.hits
-            self.version += 1
-
-    def replace(self, cloud: Cloud) -> None:
-        """Show other points, such as more of them."""
-        with self._lock:
-            self.cloud = cloud
-            self.version += 1
+            self.show(result.points.sample(self._most, PARTS_NOTED))
 
     def hit_counts(self) -> NDArray[np.float64]:
         """Hits of each triangle, (f,), scaled up to all hits if some parts were not read."""

@@ -14,6 +14,7 @@ from viser.transforms import SO3
 from ..columns.cloud import Cloud
 
 Floats = NDArray[np.floating]
+Limits = tuple[float, float] | None  # lowest and highest, both included; None for all
 
 COORDINATES = ("x", "y", "z")
 _ACROSS, _DOWN = 48, 27
@@ -30,6 +31,13 @@ def values_of(cloud: Cloud, name: str) -> NDArray[Any]:
     return cloud[name]
 
 
+def within(values: Any, limits: Limits) -> Any:
+    """Whether values (n,) are within limits; NaN is not."""
+    if limits is None:
+        return np.ones(np.shape(values), np.bool_)
+    return (values >= limits[0]) & (values <= limits[1])
+
+
 @dataclass(frozen=True)
 class Filter:
     """Filter: points whose columns are within limits.
@@ -42,21 +50,20 @@ class Filter:
 
     limits: tuple[tuple[str, float, float], ...] = ()
 
-    def of(self, column: str) -> tuple[float, float] | None:
+    def of(self, column: str) -> Limits:
         """Limits of a column, if any."""
         return next(((low, high) for name, low, high in self.limits if name == column), None)
 
-    def with_limits(self, column: str, limits: tuple[float, float] | None) -> Filter:
+    def with_limits(self, column: str, limits: Limits) -> Filter:
         """Return a filter with these limits of a column, or without."""
         rest = tuple(entry for entry in self.limits if entry[0] != column)
         return Filter(rest if limits is None else (*rest, (column, *limits)))
 
     def keeps(self, cloud: Cloud) -> NDArray[np.bool_]:
-        """Whether points (n,) are within all limits; NaN is not."""
+        """Whether points (n,) are within all limits."""
         kept = np.ones(len(cloud), np.bool_)
         for name, low, high in self.limits:
-            values = values_of(cloud, name)
-            kept &= (values >= low) & (values <= high)
+            kept &= within(values_of(cloud, name), (low, high))
         return kept
 
 

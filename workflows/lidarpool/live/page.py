@@ -273,7 +273,7 @@ def _set_theme(whose: viser.ViserServer | viser.ClientHandle, dark: bool) -> Non
 
 @contextmanager
 def live_page(title: str, port: int = PORT) -> Iterator[LivePage]:
-    """Serve a page while the body runs; see `LivePage`."""
+    """Serve a page while the body runs, on a port or the next that is free; 0 for any."""
     with _without_words():
         page = LivePage(title, port)
     try:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..columns.cloud import Cloud
 from ..columns.table import Column
+from .labels import Labels
 from .page import LivePage
 
 HINT = "Click a point; Shift and click another to measure."
@@ -26,8 +27,6 @@ class PickedPoints:
 
     Parameters
     ----------
-    page
-        Where they are shown.
     columns
         {name: column shown for a point}.
     names
@@ -39,28 +38,28 @@ class PickedPoints:
     def __init__(
         self,
         page: LivePage,
+        labels: Labels,
         columns: Mapping[str, Column],
         names: Mapping[str, Sequence[str]],
         origin: NDArray[np.float64],
     ) -> None:
-        self._page, self._columns, self._names, self._origin = page, columns, names, origin
+        self._page, self._labels = page, labels
+        self._columns, self._names, self._origin = columns, names, origin
         self._points: list[Cloud] = []  # one each; two at most
         self._nodes: list[Any] = []
+        self._length = ""  # label
         self._text = page.gui.add_html("")
         self._tell()
 
     def take(self, point: Cloud | None, measure: bool, eye: Sequence[float]) -> None:
         """Take a point clicked from `eye`, (3,) local, or None."""
-        if point is None:
-            self._points = []
-        elif measure and self._points:
-            self._points = [self._points[0], point]
-        else:
-            self._points = [point]
+        before = self._points[:1] if measure else []
+        self._points = [] if point is None else [*before, point]
         self._tell()
         for node in self._nodes:
             node.remove()
         self._nodes = []
+        self._labels.put(self._length, None)
         if not self._points:
             return
         places = np.concatenate([p.positions for p in self._points]) - self._origin
@@ -72,39 +71,27 @@ class PickedPoints:
         ]
         if len(places) == 2:
             line = places[None].astype(np.float32)
-            words = f"{np.linalg.norm(places[1] - places[0]):,.3f} m"
-            self._nodes += [
-                scene.add_line_segments(
-                    "/picked/way", line, _MARK, thickness=3.0, thickness_units="screen"
-                ),
-                scene.add_label("/picked/length", words, position=places.mean(axis=0)),
-            ]
+            way = scene.add_line_segments(
+                "/picked/way", line, _MARK, thickness=3.0, thickness_units="screen"
+            )
+            self._nodes.append(way)
+            self._length = f"{np.linalg.norm(places[1] - places[0]):,.3f} m"
+            self._labels.put(self._length, places.mean(axis=0), first=True)
 
     def _tell(self) -> None:
         if not self._points:
             self._text.content = f'<div style="padding:0 0.8em 0.4em;font-size:0.75em">{HINT}</div>'
             return
-        entries = self.entries(self._points[-1])
+        point = self._points[-1]
+        entries = []
         if len(self._points) == 2:
-            entries = measured(*(point.positions[0] for point in self._points)) + entries
-        self._text.content = (
-            _BOX
-            + "".join(
-                f"<div>{escape(name)} <b>{escape(value)}</b></div>" for name, value in entries
-            )
-            + "</div>"
-        )
-
-    def entries(self, point: Cloud) -> list[tuple[str, str]]:
-        """(name, value with unit) for all columns of a point."""
-        found = [
-            (axis, f"{at:,.3f} m")
-            for axis, at in zip("xyz", point.positions[0].tolist(), strict=True)
-        ]
-        for column in self._columns.values():
-            values = point.columns.get(column.name, ())
-            found += [(column.name, self._value(column, value)) for value in values]
-        return found
+            entries = measured(*(point.positions[0] for point in self._points))
+        at = zip("xyz", point.positions[0].tolist(), strict=True)
+        entries += [(axis, f"{metres:,.3f} m") for axis, metres in at]
+        for name, column in self._columns.items():
+            entries += [(name, self._value(column, value)) for value in point.columns.get(name, ())]
+        cells = (f"<div>{escape(name)} <b>{escape(value)}</b></div>" for name, value in entries)
+        self._text.content = f"{_BOX}{''.join(cells)}</div>"
 
     def _value(self, column: Column, value: Any) -> str:
         names = self._names.get(column.name, ())

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from html import escape
 from pathlib import Path
 
 import click
@@ -16,32 +15,22 @@ from ..base.errors import LidarpoolError
 from ..base.notebook import cell_display
 from ..columns.cloud import Cloud
 from ..export.cloud_file import CloudFile
-from ..run.picture_file import PICTURE_FILE, Pictured, SensorWay
+from ..run.picture_file import PICTURE_FILE, Pictured
 from ..run.store import RUN_FOLDER
 from ..scan.database import FILE
 from .blocks import VIEW_POINTS, Blocks
+from .colouring import boxed
 from .page import PORT, LivePage, announced, live_page, redrawn
-from .view import View, bounds_of, described, places_of
+from .view import View
 
 CLOUD = "cloud.ply"
 DRAW_EVERY_S, BUSY_SHARE = 0.1, 0.7  # of a core: there is no other work
 
 
 class ResultView:
-    """A result on a page.
+    """A result on a page: its points, what else is pictured of it if that is known, and a note.
 
-    Parameters
-    ----------
-    page
-        Where it is shown.
-    file
-        The points.
-    pictured
-        The scene and other data of the run, or None.
-    note
-        A remark on the result, or empty.
-    most
-        Points that are shown at a time.
+    `most` points are shown at a time.
     """
 
     def __init__(
@@ -54,20 +43,10 @@ class ResultView:
     ) -> None:
         self._file, self._pictured, self._note, self._most = file, pictured, note, most
         self._facts = page.gui.add_html("")
-        sensors: Sequence[SensorWay] = ()
-        if pictured is None:
-            origin, bounds = _around(file)
-            scene = None
-        else:
-            scene, origin = pictured.scene, pictured.scene.origin
-            sensors = pictured.sensors
-            bounds = bounds_of(scene, places_of(sensors), pictured.planning)
-        self._origin, self._sensors = origin, sensors
-        lasts = 0.0 if pictured is None else pictured.duration_ns
-        reflectance = None if pictured is None else pictured.reflectance
-        self._view = View(page, scene, sensors, file.table, origin, bounds, lasts, reflectance)
-
-        self._view.cloud.blocks = Blocks(file, origin, most)
+        around = _around(file) if pictured is None else (pictured.scene.origin, np.zeros((2, 3)))
+        self._origin = around[0]
+        self._view = View(page, file.table, pictured, around)
+        self._view.cloud.blocks = Blocks(file, self._origin, most)
         self._even: Cloud | None = None
 
     def draw(self) -> float:
@@ -75,16 +54,12 @@ class ResultView:
         if self._even is None:
             self._facts.content = self._told()
             self._even = self._file.choose(self._most)[0]
-        pictured = self._pictured
-        if pictured is not None:
-            faces = len(pictured.scene.faces)
-            self._view.draw_scene(lambda: (pictured.hit_counts[:faces], self._even), 0)
-            self._view.draw_rays(pictured.sample_rays, 0)
-            if pictured.plan is not None:
-                self._view.draw_path(pictured.plan.path, pictured.planning)
-        self._view.draw_time()
-        self._view.draw_cloud(self._even, 0)
-        self._view.draw_labels()
+        if (pictured := self._pictured) is None:
+            self._view.draw(self._even, 0)
+        else:
+            counts = pictured.hit_counts[: len(pictured.scene.faces)]
+            path = None if pictured.plan is None else pictured.plan.path
+            self._view.draw(self._even, 0, lambda: counts, 0, pictured.sample_rays, 0, path)
         self._facts.content = self._told()
         return BUSY_SHARE
 
@@ -93,9 +68,9 @@ class ResultView:
         if self._origin.any():
             away = ", ".join(f"{metres:.0f}" for metres in self._origin)
             lines.append(f"relative to {away} m")
-        lines += [described(self._sensors)] if self._sensors else []
-        lines += [escape(self._note)] if self._note else []
-        return f'<div style="padding:0 0.8em 0.6em;font-size:0.85em">{"<br>".join(lines)}</div>'
+        lines += [self._pictured.models] if self._pictured is not None else []
+        lines += [self._note] if self._note else []
+        return boxed(lines)
 
 
 def _around(file: CloudFile) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -121,16 +96,8 @@ def result_page(
 ) -> Iterator[None]:
     """Serve the page of a result while the body runs, and print its address.
 
-    Parameters
-    ----------
-    file, pictured, note
-        See `ResultView`.
-    title
-        Title of its panel.
-    port
-        Port to listen on, or the next that is free; 0 for any.
-    browser
-        Whether to open a browser where there is a desktop.
+    `port` is where to listen, or the next that is free; 0 for any. `browser` tells whether to open
+    one where there is a desktop.
     """
     with live_page(title, port) as page:
         view = ResultView(page, file, pictured, note)

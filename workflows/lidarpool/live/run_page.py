@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from html import escape
 from pathlib import Path
@@ -25,7 +25,7 @@ from ..columns.table import SCAN, TABLE
 from ..export.cloud_file import CloudFile
 from ..plan import best
 from ..run.job import Job
-from ..run.picture_file import sensor_ways
+from ..run.picture_file import Pictured, sensor_ways
 from ..run.progress import STAGES, Progress, Show, in_words, is_sure, time_in_words
 from ..run.result import RunResult
 from ..run.store import RunStore
@@ -34,7 +34,7 @@ from ..sensor.materials import MaterialTable
 from .blocks import VIEW_POINTS, Blocks
 from .live_points import LivePoints
 from .page import PORT, LivePage, announced, live_page, redrawn
-from .view import View, bounds_of, described, places_of
+from .view import NO_RAYS, View
 
 DRAW_EVERY_S = 0.2
 BUSY_SHARE, IDLE_SHARE = 0.06, 0.7  # of a core, while the run goes on and when it is over
@@ -45,15 +45,7 @@ _BOX = '<div style="padding:0 0.8em 0.6em;font-size:0.85em;font-variant-numeric:
 
 
 class LiveRun:
-    """Connects a run and its page, in both directions.
-
-    Parameters
-    ----------
-    page
-        The page.
-    job
-        What the run does.
-    """
+    """Connects a run and its page, in both directions."""
 
     def __init__(self, page: LivePage, job: Job) -> None:
         self.page, self._job = page, job
@@ -61,15 +53,14 @@ class LiveRun:
         self._text = page.gui.add_html("")
         self._stop = page.gui.add_button("Stop", color="red")
         self._stop.on_click(lambda _: self.stopped.set())
-        sensors = sensor_ways(job.survey)
-        bounds = bounds_of(job.scene, places_of(sensors), job.planning)
-        columns = (SCAN, *job.survey.stored_columns)
-        origin, lasts = job.scene.origin, job.survey.duration_ns
-        table = MaterialTable.of(job.survey.materials, job.scene.all_names)
-        self._view = View(
-            page, job.scene, sensors, columns, origin, bounds, lasts, table.reflectance
-        )
-        self._described = described(sensors)
+        survey, scene, ways = job.survey, job.scene, sensor_ways(job.survey)
+        table, nothing = MaterialTable.of(survey.materials, scene.all_names), np.zeros(0, np.int64)
+        pictured = Pictured(
+            scene, ways, nothing, NO_RAYS, job.planning, None, (), survey.duration_ns, (),
+            table.reflectance,
+        )  # fmt: skip
+        self._models = pictured.models
+        self._view = View(page, (SCAN, *survey.stored_columns), pictured)
         self._starting = "starting"  # the state before there is any progress
         self._newest = ""  # sensor and time of the newest frame
         self._shown = -1  # the last scan whose time was sent to the page
@@ -161,7 +152,7 @@ class LiveRun:
         own = [column for column in self._job.survey.stored_columns if column.name not in TABLE]
         file = CloudFile(cloud, own)
         if self._points is not None:
-            self._points.replace(file.choose(VIEW_POINTS)[0])
+            self._points.show(file.choose(VIEW_POINTS)[0])
         self._view.cloud.blocks = Blocks(file, self._job.scene.origin, VIEW_POINTS)
         click.echo(f"the live page stays at {self.page.url}; Ctrl-C ends it", err=True)
         with suppress(KeyboardInterrupt):
@@ -172,27 +163,23 @@ class LiveRun:
 
     def draw(self) -> float:
         """Draw what is new; returns the share of a core that this may take."""
-        share = IDLE_SHARE if self._over else BUSY_SHARE
-        if not self.page.get_clients():  # draw it for browsers that connect later
-            return share
-        points, view = self._points, self._view
-        self._text.content = self._panel()
-        view.draw_time()
-        view.draw_labels()
-        if points is None:
-            view.draw_scene(lambda: (np.zeros(len(self._job.scene.faces)), None), 0)
-            return share
-        points.gather()
-        if points.cloud is not None:
-            view.draw_cloud(points.cloud, points.version)
-        # It is large, and changes visibly only with a tenth more hits.
-        grown = round(math.log1p(points.hits) / math.log(1.1))
-        view.draw_scene(lambda: (points.hit_counts(), points.cloud), (grown, self._over))
-        self._draw_frames()
-        self._draw_path()
-        return share
+        if self.page.get_clients():  # those that connect later are drawn for then
+            self._text.content = self._panel()
+            cloud, version, hits, path = None, 0, 0, None
+            if (points := self._points) is not None:
+                points.gather()
+                cloud, version, hits, path = points.cloud, points.version, points.hits, self._path()
+            # It is large, and changes visibly only with a tenth more hits.
+            grown = round(math.log1p(hits) / math.log(1.1)), self._over
+            self._view.draw(cloud, version, self._hits, grown, *self._newest_rays(), path)
+        return IDLE_SHARE if self._over else BUSY_SHARE
 
-    def _draw_frames(self) -> None:
+    def _hits(self) -> NDArray[np.float64]:
+        faces = len(self._job.scene.faces)
+        return np.zeros(faces) if self._points is None else self._points.hit_counts()
+
+    def _newest_rays(self) -> tuple[NDArray[np.float32], Hashable]:
+        """Rays of the newest frames, or some of all in the end, and a version of them."""
         frames = list(self._frames)
         if frames and frames[-1].scan != self._shown:
             self._shown = frames[-1].scan
@@ -201,20 +188,19 @@ class LiveRun:
             of = f"{frames[-1].sensor}, " if frames[-1].sensor else ""
             self._newest = f"newest scan: {of}at {time_ns / 1e9:,.4g} s"
         if self._rays is not None:
-            self._view.draw_rays(self._rays, "all")
-        elif frames:
-            starts = np.repeat(
-                np.array([frame.pose.position for frame in frames], np.float32),
-                [len(frame.samples) for frame in frames],
-                axis=0,
-            )
-            ends = np.concatenate([frame.samples for frame in frames])
-            self._view.draw_rays(np.stack([starts, ends], axis=1), frames[-1].scan)
+            return self._rays, "all"
+        starts = [np.full_like(frame.samples, frame.pose.position) for frame in frames]
+        if not frames:
+            return NO_RAYS, 0
+        ends = np.concatenate([frame.samples for frame in frames])
+        return np.stack([np.concatenate(starts), ends], axis=1), self._shown
 
-    def _draw_path(self) -> None:
+    def _path(self) -> NDArray[np.float64] | None:
+        """Return the planned path, once all trials have ended."""
         planning, store = self._job.planning, self._store
-        if planning is not None and store is not None and len(store.db.trials) == self._job.trials:
-            self._view.draw_path(best(store.db.trials, planning).path, planning)
+        if planning is None or store is None or len(store.db.trials) < self._job.trials:
+            return None
+        return best(store.db.trials, planning).path
 
     def _panel(self) -> str:
         """Write the progress of the run."""
@@ -227,14 +213,12 @@ class LiveRun:
             for label, count, total in STAGES
             if getattr(progress, total)
         ]
-        lines.append(self._described)
+        lines.append(escape(self._models))
         lines += [escape(self._newest)] if self._newest else []
         shown = len(points.cloud) if points is not None and points.cloud is not None else 0
         some = "" if shown == progress.points else f", {shown:,} of them displayed"
         of_file = self._view.cloud.facts if self._view.cloud.blocks is not None else []
         lines += of_file or [f"<b>{progress.points:,} points</b>{some}"]
-        if points is not None and points.error:
-            lines.append(escape(points.error))
         lines += [_bar(f"{escape(name)}, slots busy", *slots) for name, slots in self._busy.items()]
         return _BOX + "".join(f"<div>{line}</div>" for line in lines) + "</div>"
 
@@ -274,14 +258,8 @@ def _bar(label: str, done: int, whole: int) -> str:
 def live_run(job: Job, *, port: int = PORT, browser: bool = True) -> Iterator[LiveRun]:
     """Serve the live page of a run while the body runs, and print its address.
 
-    Parameters
-    ----------
-    job
-        What the run does.
-    port
-        Port to listen on, or the next that is free; 0 for any.
-    browser
-        Whether to open a browser where there is a desktop.
+    `port` is where to listen, or the next that is free; 0 for any. `browser` tells whether to open
+    one where there is a desktop.
     """
     with live_page("lidarpool", port) as page:
         live = LiveRun(page, job)

@@ -176,39 +176,39 @@ class MeshNode:
     """Shows the latest of several meshes, without flicker.
 
     viser's page drops a mesh when it receives a new one, shows nothing until that is loaded, and
-    does not say when it is. So two nodes take turns.
+    does not say when it is. So the last one stays for a moment.
     """
 
     def __init__(self, page: LivePage, name: str) -> None:
-        self._page = page
-        self._names = [f"{name}/one", f"{name}/other"]  # the latest is the first
-        self._nodes: dict[str, Any] = {}
+        self._page, self._name, self._count = page, name, 0
+        self._nodes: list[Any] = []  # the latest is the last
         self._alone_at = 0.0  # when to remove the last but one
 
     def show(self, corners: NDArray[np.float32], colours: NDArray[np.uint8]) -> None:
         """Show triangles (f, 3, 3), each of one colour, (f, 3); nothing if there are none."""
+        self._keep(1 if len(corners) else 0)
         if not len(corners):
-            for name in tuple(self._nodes):
-                self._nodes.pop(name).remove()
             return
-        self._names.reverse()
-        latest = self._names[0]
-        self._nodes[latest] = self._page.scene.add_glb(
-            latest,
-            coloured_mesh(corners, colours),
-            cast_shadow=False,
-            receive_shadow=False,
+        mesh = coloured_mesh(corners, colours)
+        node = self._page.scene.add_glb(
+            f"{self._name}/{self._count}", mesh, cast_shadow=False, receive_shadow=False
         )
+        self._nodes.append(node)
+        self._count += 1
         self._alone_at = time.monotonic() + SWAP_S
 
     def settle(self) -> None:
         """Remove the last but one if it is time."""
-        if len(self._nodes) > 1 and time.monotonic() >= self._alone_at:
-            self._nodes.pop(self._names[1]).remove()
+        if time.monotonic() >= self._alone_at:
+            self._keep(1)
+
+    def _keep(self, count: int) -> None:
+        while len(self._nodes) > count:
+            self._nodes.pop(0).remove()
 
     def set_visible(self, visible: bool) -> None:
         """Show it, or not."""
-        for node in self._nodes.values():
+        for node in self._nodes:
             node.visible = visible
 
 

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Hashable, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from html import escape
 from typing import Any
 
@@ -15,19 +16,21 @@ from numpy.typing import NDArray
 
 from ..columns.cloud import Cloud
 from ..columns.table import Column
-from ..plan import Planning
 from ..render.closeup import CUT, around_ways
 from ..render.theme import CLAY, object_colours, rgb
-from ..run.picture_file import SensorWay, ways_of
-from ..scene.scene import Scene
+from ..run.picture_file import Pictured, ways_of
 from ..sensor.trajectory import quaternions_of
 from .cloud_view import HIDDEN, CloudView
 from .colouring import as_bytes
 from .labels import Labels
-from .looking import Filter
+from .looking import Filter, Limits, within
 from .page import LivePage, place_eye
 from .surface import MeshNode, Surface, below, colours_for
 
+Floats = NDArray[np.float64]
+Rays = NDArray[np.float32]  # (n, 2, 3), metres, local
+NO_RAYS: Rays = np.zeros((0, 2, 3), np.float32)
+NO_TRIANGLES = np.zeros((0, 3, 3), np.float32)
 MOST_POSES = 1000  # that have a ball
 MOST_RAYS = 150  # more rays would hide the surfaces
 
@@ -36,7 +39,6 @@ _PATH, _DISC = (20, 150, 90), (120, 130, 150)
 # As shares of the scene's diagonal.
 _BALL, _POSE, _END = 0.009, 0.0054, 0.008
 _MOVES = 0.4  # of that: motion in a large scene is shown from near
-Hits = tuple[NDArray[Any], Cloud | None]  # of each triangle (f,), and points evenly chosen
 _PLAY_S = (6.0, 60.0)  # limits of the playing time of a survey
 
 
@@ -50,69 +52,62 @@ class View:
     ----------
     page
         Where they are shown.
-    scene
-        The scene; None for a cloud alone.
-    sensors
-        Where they are in the course of time.
     table
         The columns of the cloud.
-    origin
-        World position of the local origin, (3,), metres.
-    bounds
-        Box (2, 3) of the visible scene, metres.
-    duration_ns
-        Duration of the survey.
-    reflectance
-        (objects,): of each object of the scene, 0 to 1; None if unknown.
+    pictured
+        Scene and sensors; None for a cloud alone.
+    around
+        Of a cloud alone: world position of the local origin, (3,), and its box (2, 3) from there.
     """
 
     def __init__(
         self,
         page: LivePage,
-        scene: Scene | None,
-        sensors: Sequence[SensorWay],
         table: Sequence[Column],
-        origin: NDArray[np.float64],
-        bounds: NDArray[np.float64],
-        duration_ns: float = 0.0,
-        reflectance: NDArray[np.float64] | None = None,
+        pictured: Pictured | None,
+        around: tuple[Floats, Floats] = (np.zeros(3), np.zeros((2, 3))),
     ) -> None:
-        self._page, self._scene, self._sensors = page, scene, sensors
-        self._reflectance = reflectance
-        self._poses = places_of(sensors)
-        self._actors = () if scene is None else scene.actors
-        self._actor_names = () if scene is None else scene.all_names[len(scene.names) :]
-        self._origin, self._ground = origin, float(bounds[0, 2])
-        near = around_ways(bounds, ways_of(sensors, self._actors, duration_ns))
+        self._page = page
+        self._scene = None if pictured is None else pictured.scene
+        self._reflectance = None if pictured is None else pictured.reflectance
+        self._planning = None if pictured is None else pictured.planning
+        self._sensors = () if pictured is None else pictured.sensors
+        self._actors = () if self._scene is None else self._scene.actors
+        self._first_actor = 0 if self._scene is None else len(self._scene.names)
+        self._ends_ns = 0.0 if pictured is None else pictured.duration_ns
+        self._poses = np.concatenate([np.empty((0, 3)), *(way.positions for way in self._sensors)])
+        self._origin, bounds = around
+        if pictured is not None:
+            self._origin, bounds = pictured.scene.origin, _whole(pictured, self._poses)
+        self._ground = float(bounds[0, 2])
+        near = around_ways(bounds, ways_of(self._sensors, self._actors, self._ends_ns))
         from_near = near is not None
         near = bounds if near is None else near
         self._size_m = float(np.linalg.norm(near[1] - near[0])) or 1.0
-        self._columns = {column.name for column in table}
-        names = {} if scene is None else {"object": scene.all_names}
-        names["sensor"] = tuple(way.name for way in sensors)
-        self.cloud = CloudView(page, table, names, origin, self._size_m)
-        self._drawn: dict[str, Hashable] = {}  # {name: its inputs when it was drawn}
-        self._surface: Surface | None = None
-        self._mesh = MeshNode(page, "/scene")
-        self._lines: dict[str, Any] = {}  # {name: node}; nor no lines
         self._labels = Labels(page)
+        names = {} if pictured is None else {c.name: pictured.names_of(c) for c in table}
+        self.cloud = CloudView(page, self._labels, table, names, self._origin, self._size_m)
+        self._drawn: dict[str, Hashable] = {}  # {name: its inputs when it was drawn}
+        # {limits of the objects: surface}; of all, and of those that were shown last
+        self._surfaces: dict[Limits, Surface] = {}
+        self._mesh = MeshNode(page, "/scene")
+        self._rays: Any = None  # viser shows no lines without points
         self._markers: list[Any] = []  # of the sensors, once the time is known
         self._bodies: list[Any] = []  # of the actors
         self._time: Any = None  # slider, where anything moves
         self._follow: Any = None  # checkbox, where a sensor moves
         self._trail: Any = None  # slider, where points have a time
-        self._followed: NDArray[np.float64] | None = None  # last position of the carrier
+        self._followed: Floats | None = None  # last position of the carrier
         self._playing = False
         self._moved_at = 0.0  # when the time was last moved on by playing
-        self._ends_ns = duration_ns
         page.frame_scene(near)
-        self._add_controls(bounds, duration_ns / 1e9)
+        self._add_controls(bounds, any(column.name == "time" for column in table))
         if from_near:  # towers would hide the street
-            self._cut.value = min(float(near[1, 2] + origin[2]), self._top)
+            self._cut.value = min(float(near[1, 2] + self._origin[2]), self._top)
         self._add_poses()
         self._add_actors()
 
-    def _add_controls(self, bounds: NDArray[np.float64], duration_s: float) -> None:
+    def _add_controls(self, bounds: Floats, timed: bool) -> None:
         gui = self._page.gui
         low, high = (bounds[:, 2] + self._origin[2]).tolist()
         step = 10.0 ** math.floor(math.log10(max(high - low, 1e-3) / 50))
@@ -120,39 +115,37 @@ class View:
             round(step * math.floor(low / step), 6),
             round(step * (math.floor(high / step) + 1), 6),
         )
-        if duration_s > 0 and (self._actors or any(way.moves for way in self._sensors)):
-            self._add_time(duration_s)
-        self.cloud.add_controls()
+        carried = any(way.moves for way in self._sensors)
+        if self._ends_ns > 0 and (self._actors or carried):
+            self._add_time(self._ends_ns / 1e9, carried, timed)
+        self.cloud.add_colour()
         if self._scene is not None:
             colours = colours_for(self._scene, self._reflectance)
             self._scene_colour = gui.add_dropdown("scene colour", (*colours, HIDDEN))
             self._scene_legend = gui.add_html("")
-        self.cloud.add_picked()
         self.cloud.add_filter()
         with gui.add_folder("view", expand_by_default=False):
             sides = (*self._page.SIDES, *(("sensor",) if self._sensors else ()))
             gui.add_button_group("look", sides).on_click(self._look)
             self._cut: Any = gui.add_slider("cut above, m", first, self._top, step, self._top)
-            self.cloud.add_point_size()
+            self._point_size = gui.add_slider("point size", 0.1, 4.0, 0.1, 1.0)
             if self._scene is not None:
                 self._show_rays = gui.add_checkbox("rays", initial_value=True)
-            save = gui.add_button("Save picture")
-            save.on_click(self._save)
-            link = gui.add_button("Link to this view")
-            link.on_click(self._link)
+            gui.add_button("Save picture").on_click(self._save)
+            gui.add_button("Link to this view").on_click(self._link)
             self._link_text = gui.add_html("")
 
-    def _add_time(self, duration_s: float) -> None:
+    def _add_time(self, duration_s: float, carried: bool, timed: bool) -> None:
         gui, step = self._page.gui, 10.0 ** math.floor(math.log10(duration_s / 200))
         end = round(step * math.ceil(duration_s / step), 9)  # as many digits are shown as it has
         self._time = gui.add_slider("time, s", 0.0, end, step, 0.0)
         self._play = gui.add_button("Play")
         self._play.on_click(lambda _: self._start_or_stop())
-        if any(way.moves for way in self._sensors):
+        if carried:
             self._follow = gui.add_checkbox(
                 "follow", initial_value=False, hint="the carrier, with the camera"
             )
-        if "time" in self._columns:
+        if timed:
             self._trail = gui.add_slider(
                 "last, s", 0.0, end, step, 0.0, hint="of the points, up to the time; 0: all"
             )
@@ -169,34 +162,68 @@ class View:
         self._drawn[name] = state
         return changed
 
-    def draw_cloud(self, cloud: Cloud, version: Hashable) -> None:
-        """Show a sample of the points, world coordinates; see `CloudView.show`."""
-        self.cloud.show(cloud, version)
-        if self._trail is not None:
-            length, at = self._trail.value, self._time.value
-            limits = ((at - length) * 1e9, at * 1e9) if length > 0 else None
-            self.cloud.trail = Filter().with_limits("time", limits)
-        self.cloud.draw(self.cut, self._playing)
+    def draw(
+        self,
+        cloud: Cloud | None,
+        version: Hashable,
+        hits: Callable[[], NDArray[Any]] = lambda: np.zeros(0),
+        hits_version: Hashable = 0,
+        rays: Rays = NO_RAYS,
+        rays_version: Hashable = 0,
+        path: Floats | None = None,
+    ) -> None:
+        """Draw what has changed.
 
-    def draw_labels(self) -> None:
-        """Show labels where there is room, after all else is drawn."""
+        Parameters
+        ----------
+        cloud
+            An evenly spaced sample of the points, world coordinates.
+        hits
+            Returns the hits of each triangle, (f,).
+        rays
+            Some rays.
+        path
+            The planned path, (n, 2) metres.
+        version, hits_version, rays_version
+            They change with the points, hits and rays.
+        """
+        self._draw_time()
+        self._draw_scene(hits, hits_version, cloud)
+        if self._scene is not None:
+            self._draw_rays(rays, rays_version)
+        if path is not None and self._changed("path"):
+            self._draw_path(path)
+        if cloud is not None:
+            self.cloud.show(cloud, version)
+            if self._trail is not None:
+                length, at = self._trail.value, self._time.value
+                limits = ((at - length) * 1e9, at * 1e9) if length > 0 else None
+                self.cloud.trail = Filter().with_limits("time", limits)
+            self.cloud.draw(self.cut, self._point_size.value, self._playing)
         self._labels.draw()
 
-    def draw_scene(self, hits: Callable[[], Hits], version: Hashable) -> None:
-        """Show the scene; another version has other hits."""
+    def _draw_scene(
+        self, hits: Callable[[], NDArray[Any]], version: Hashable, cloud: Cloud | None
+    ) -> None:
+        """Show the surfaces of all objects, or of those that the filter keeps."""
         self._mesh.settle()
         if self._scene is None:
             return
-        if self._surface is None:
-            self._surface = Surface(self._scene, self._reflectance)
-            self._look_around(self._surface)
-        colour = self._scene_colour.value
-        if colour != HIDDEN and self._changed(
-            "scene", version if colour == "hits" else 0, self.cut, colour
-        ):
-            counts, cloud = hits() if colour == "hits" else (np.zeros(0), None)
-            places = np.zeros((0, 3), np.float32) if cloud is None else self._on_scene(cloud)
-            corners, colours, legend = self._surface.coloured(colour, counts, places)
+        if not self._surfaces:
+            self._surfaces[None] = Surface(self._scene, self._reflectance)
+            self._look_around(self._surfaces[None])
+        colour, only = self._scene_colour.value, self.cloud.filter.of("object")
+        seen = version if colour == "hits" else 0
+        if colour != HIDDEN and self._changed("scene", seen, self.cut, colour, only):
+            rows = within(self._scene.face_object, only)
+            corners, colours, legend = NO_TRIANGLES, np.zeros((0, 3), np.uint8), ""
+            if rows.any():
+                counts, places = np.zeros(0), NO_TRIANGLES[:, 0]
+                if colour == "hits":
+                    counts, places = hits()[rows], self._on_scene(cloud, only)
+                corners, colours, legend = self._surface(only, rows).coloured(
+                    colour, counts, places
+                )
             corners, kept = below(corners, self.cut)
             self._scene_legend.content = legend
             self._mesh.show(corners, colours[kept])
@@ -205,20 +232,30 @@ class View:
             self._mesh.set_visible(colour != HIDDEN)
             self._scene_legend.visible = colour != HIDDEN
 
+    def _surface(self, only: Limits, rows: NDArray[np.bool_]) -> Surface:
+        """Surface of the objects within these limits, whose triangles are these (f,)."""
+        scene, whole = self._scene, self._surfaces[None]
+        assert scene is not None
+        if only not in self._surfaces:
+            part = replace(scene, faces=scene.faces[rows], face_object=scene.face_object[rows])
+            self._surfaces = {None: whole, only: Surface(part, self._reflectance)}
+        return self._surfaces[only]
+
     def _colour_actors(self, own: bool) -> None:
         """Give actors their objects' colours, or grey."""
-        names = () if self._scene is None else self._scene.all_names
-        colours = as_bytes(
-            object_colours(len(names)) if own else rgb(CLAY)[None].repeat(len(names), 0)
-        )
-        for body, colour in zip(self._bodies[::-1], colours[::-1].tolist(), strict=False):
-            body.color = tuple(colour)
+        count = self._first_actor + len(self._bodies)
+        colours = object_colours(count) if own else np.tile(rgb(CLAY), (count, 1))
+        for body, colour in zip(self._bodies, as_bytes(colours[self._first_actor :]), strict=True):
+            body.color = tuple(colour.tolist())
 
-    def _on_scene(self, cloud: Cloud) -> NDArray[np.float32]:
+    def _on_scene(self, cloud: Cloud | None, only: Limits) -> NDArray[np.float32]:
         """Positions (n, 3) of points on static objects, local."""
+        if cloud is None:
+            return NO_TRIANGLES[:, 0]
         places = (cloud.positions - self._origin).astype(np.float32)
-        if self._actors and "object" in cloud.columns and self._scene is not None:
-            places = places[cloud["object"] < len(self._scene.names)]
+        if "object" in cloud.columns and self._scene is not None:
+            static = cloud["object"] < len(self._scene.names)
+            places = places[static & within(cloud["object"], only)]
         return places
 
     def _look_around(self, surface: Surface) -> None:
@@ -230,23 +267,22 @@ class View:
             height = top + CUT * (roof - top) + float(self._origin[2])
             self._cut.value = min(max(height, self._cut.min), self._top)
 
-    def draw_rays(self, rays: NDArray[np.float32], version: Hashable) -> None:
-        """Show some of the rays (n, 2, 3) in local coordinates, if they end below the cut."""
-        cut, shown = self.cut, self._show_rays.value
+    def _draw_rays(self, rays: Rays, version: Hashable) -> None:
+        """Show some of the rays if they end below the cut and no object is looked at alone."""
+        cut = self.cut
+        shown = self._show_rays.value and self.cloud.filter.of("object") is None
         if not self._changed("rays", version, cut, shown):
             return
         if cut is not None:
             rays = rays[(rays[:, :, 2] <= cut).all(axis=1)]
-        self._draw_lines("/rays", rays[:: len(rays) // MOST_RAYS + 1] if shown else rays[:0])
-
-    def _draw_lines(self, name: str, lines: NDArray[np.float32]) -> None:
-        if name in self._lines:
-            self._lines[name].visible = len(lines) > 0
-            if len(lines):
-                self._lines[name].points = lines
-        elif len(lines):
-            self._lines[name] = self._page.scene.add_line_segments(
-                name, lines, _PALE, thickness=1.0, thickness_units="screen"
+        rays = rays[:: len(rays) // MOST_RAYS + 1]
+        if self._rays is not None:
+            self._rays.visible = shown and len(rays) > 0
+            if self._rays.visible:
+                self._rays.points = rays
+        elif shown and len(rays):
+            self._rays = self._page.scene.add_line_segments(
+                "/rays", rays, _PALE, thickness=1.0, thickness_units="screen"
             )
 
     def _start_or_stop(self) -> None:
@@ -260,7 +296,7 @@ class View:
         elif not self._playing:
             self._time.value = time_ns / 1e9
 
-    def draw_time(self) -> None:
+    def _draw_time(self) -> None:
         """Show sensors and actors at the chosen or played time."""
         while (choices := self._page.opened_link()) is not None:
             self.choose(choices)
@@ -275,7 +311,8 @@ class View:
 
     def _place(self, time_ns: float) -> None:
         time_ns = min(time_ns, self._ends_ns)  # the slider ends at a round number
-        if not self._changed("time", time_ns):
+        only = self.cloud.filter.of("object")
+        if not self._changed("time", time_ns, only):
             return
         scene = self._page.scene
         for number, way in enumerate(self._sensors[len(self._markers) :], len(self._markers)):
@@ -293,15 +330,14 @@ class View:
         with self._page.atomic():
             for marker, way in zip(self._markers, self._sensors, strict=True):
                 marker.position = way.at(time_ns)
-            for body, actor, name in zip(
-                self._bodies, self._actors, self._actor_names, strict=True
-            ):
+            for number, (body, actor) in enumerate(zip(self._bodies, self._actors, strict=True)):
                 positions, rotations = actor.trajectory.poses(0, np.array([time_ns]))
                 body.position = positions[0]
                 if rotations is not None:
                     body.wxyz = np.roll(quaternions_of(rotations)[0], 1)
-                top = float(actor.mesh.vertices[:, 2].max())
-                self._labels.put(name, positions[0] + [0.0, 0.0, top])
+                body.visible = bool(within(self._first_actor + number, only))
+                top = positions[0] + [0.0, 0.0, float(actor.mesh.vertices[:, 2].max())]
+                self._labels.put(actor.name, top if body.visible else None)
 
     def _follow_carrier(self, time_ns: float) -> None:
         """Move all cameras as the carrier has moved."""
@@ -313,7 +349,7 @@ class View:
             for client in self._page.get_clients().values():
                 client.camera.position = client.camera.position + at - before  # looks along
 
-    def _carrier(self, time_ns: float) -> NDArray[np.float64]:
+    def _carrier(self, time_ns: float) -> Floats:
         """Position of the first moving sensor, or of the first of all, (3,)."""
         way = next((way for way in self._sensors if way.moves), self._sensors[0])
         return way.at(time_ns)
@@ -404,11 +440,11 @@ class View:
                 self._page.scene.add_line_segments(
                     f"/ways/{number}", line, _RED, thickness=3.0, thickness_units="screen"
                 )
-        standing = places_of([way for way in self._sensors if not way.moves])
-        if not len(standing):
+        standing = [place for way in self._sensors if not way.moves for place in way.positions]
+        if not standing:
             return
         count = min(len(standing), MOST_POSES)
-        some = standing[np.linspace(0, len(standing) - 1, count).astype(np.int64)]
+        some = np.array(standing)[np.linspace(0, len(standing) - 1, count).astype(np.int64)]
         ball = trimesh.creation.icosphere(subdivisions=2, radius=_POSE * self._size_m)
         self._page.scene.add_batched_meshes_simple(
             "/poses",
@@ -422,10 +458,8 @@ class View:
             receive_shadow=False,
         )
 
-    def draw_path(self, path: NDArray[np.float64], planning: Planning | None) -> None:
-        """Show a path, (n, 2) in metres, and its obstacles over the ground, once."""
-        if not self._changed("path"):
-            return
+    def _draw_path(self, path: Floats) -> None:
+        """Show a path, (n, 2) in metres, and its obstacles over the ground."""
         scene, size = self._page.scene, self._size_m
         corners = np.column_stack([path, np.full(len(path), self._ground + 0.004 * size)])
         scene.add_line_segments(
@@ -438,11 +472,11 @@ class View:
         for name, at in (("start", corners[0]), ("target", corners[-1])):
             scene.add_icosphere(f"/path/{name}", _END * size, _PATH, position=at, cast_shadow=False)
             self._labels.put(name, at)
-        if planning is None:
+        if self._planning is None:
             return
         height = 0.002 * size
         for number, ((x, y), radius) in enumerate(
-            zip(planning.centres.tolist(), planning.radii.tolist(), strict=True)
+            zip(self._planning.centres.tolist(), self._planning.radii.tolist(), strict=True)
         ):
             scene.add_cylinder(
                 f"/discs/{number}",
@@ -457,25 +491,12 @@ class View:
             )
 
 
-def places_of(sensors: Sequence[SensorWay]) -> NDArray[np.float64]:
-    """All positions of sensors, (p, 3) metres, local."""
-    return np.concatenate([np.empty((0, 3)), *(way.positions for way in sensors)])
-
-
-def described(sensors: Sequence[SensorWay]) -> str:
-    """Models of the sensors, with their names if any, as HTML."""
-    words = (f"{way.name}: {way.model}" if way.name else way.model for way in sensors)
-    return "<br>".join(map(escape, words))
-
-
-def bounds_of(
-    scene: Scene, poses: NDArray[np.float64], planning: Planning | None
-) -> NDArray[np.float64]:
+def _whole(pictured: Pictured, poses: Floats) -> Floats:
     """Box (2, 3) around the scene, the sensors at (p, 3) and both ends of the path, local."""
-    places = [*scene.bounds, *poses]
-    low, high = np.min(places, axis=0), np.max(places, axis=0)
-    if planning is not None:
-        ends = np.array([planning.start, planning.target])
+    places = np.concatenate([pictured.scene.bounds, poses])
+    low, high = places.min(axis=0), places.max(axis=0)
+    if pictured.planning is not None:
+        ends = np.array([pictured.planning.start, pictured.planning.target])
         low[:2] = np.minimum(low[:2], ends.min(axis=0))
         high[:2] = np.maximum(high[:2], ends.max(axis=0))
     return np.stack([low, high])
