@@ -20,14 +20,8 @@ Search = Generator[float, None, tuple[Cloud, int]]
 class Blocks:
     """A file in blocks of rows; remembers the bounding box of each block read.
 
-    Parameters
-    ----------
-    file
-        The file.
-    origin
-        World position of the local origin, (3,), metres.
-    most
-        Points of the whole that are shown, and as many of a near view.
+    `origin` is the world position of the local origin, (3,). At most `most` points of the whole are
+    shown, and as many of a near view.
     """
 
     def __init__(self, file: CloudFile, origin: NDArray[np.float64], most: int) -> None:
@@ -44,21 +38,9 @@ class Blocks:
     ) -> Search:
         """Search for points, block by block; yields the share that was searched.
 
-        Parameters
-        ----------
-        wanted
-            Filter for the points.
-        most
-            Most points to keep: an evenly spaced sample.
-        eye, shares
-            Only points in a picture, and this share of each of its parts (t,).
-
-        Returns
-        -------
-        cloud
-            The points, in order.
-        count
-            Number of matching points.
+        Returns at most `most` of the points that pass the filter, evenly spaced and in order, and
+        the number of all of them. With an eye, only those in its picture count, and this share of
+        each of its parts, (t,).
         """
         random, kept, thin, found, held = np.random.default_rng(0), [], 1.0, 0, 0
         low, high = self.file.rows_of(wanted.of("scan") or self.file.scans)

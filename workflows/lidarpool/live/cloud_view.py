@@ -55,18 +55,8 @@ class _Near:
 class CloudView:
     """A cloud on a page.
 
-    Parameters
-    ----------
-    page
-        The page.
-    columns
-        Columns except positions.
-    names
-        {label: names of its values 0, 1, 2, …}.
-    origin
-        World position of the local origin, (3,), metres.
-    size_m
-        Diagonal of the visible scene.
+    `columns` are all but the positions; `names` are those of the values 0, 1, 2, … of a label;
+    `origin` is the world position of the local origin, (3,); `size_m` the diagonal of the scene.
     """
 
     def __init__(

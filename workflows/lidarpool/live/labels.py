@@ -61,12 +61,7 @@ def without_overlap(
 ) -> NDArray[np.bool_]:
     """Whether to show labels (n,), so that none covers an earlier one.
 
-    Parameters
-    ----------
-    places
-        (n, 3): where each has its lower left corner, metres, local.
-    height
-        Of the picture, pixels.
+    Each has its lower left corner at a place, (n, 3) local; the picture is `height` pixels high.
     """
     at, inside = eye.seen(places)
     corner = at * [height * eye.aspect / 2, height / 2]

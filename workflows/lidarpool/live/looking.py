@@ -40,13 +40,7 @@ def within(values: Any, limits: Limits) -> Any:
 
 @dataclass(frozen=True)
 class Filter:
-    """Filter: points whose columns are within limits.
-
-    Parameters
-    ----------
-    limits
-        (column, lowest, highest), both included; a label has its value twice.
-    """
+    """Filter: points whose columns are within limits, (column, lowest, highest) each."""
 
     limits: tuple[tuple[str, float, float], ...] = ()
 
@@ -69,24 +63,12 @@ class Filter:
 
 @dataclass(frozen=True)
 class Eye:
-    """Pose and field of view of a browser's camera.
+    """Pose and field of view of a browser's camera."""
 
-    Parameters
-    ----------
-    position
-        Metres, local coordinates.
-    wxyz
-        Rotation from its axes (x to the right, y down, z ahead) to the scene's.
-    fov
-        Angle from the upper to the lower edge, radians.
-    aspect
-        Width of the picture by its height.
-    """
-
-    position: tuple[float, float, float]
-    wxyz: tuple[float, float, float, float]
-    fov: float
-    aspect: float
+    position: tuple[float, float, float]  # metres, local
+    wxyz: tuple[float, float, float, float]  # from (right, down, ahead) to the scene's axes
+    fov: float  # from the upper to the lower edge, radians
+    aspect: float  # width of the picture by its height
 
     @classmethod
     def of(cls, camera: viser.CameraHandle) -> Eye:
@@ -125,16 +107,9 @@ class Eye:
 
 
 def even_shares(counts: NDArray[Any], most: int) -> NDArray[np.float64]:
-    """Shares (t,) of the points of each part of a picture, so that as many of each are shown.
+    """Shares (t,) of the points (t,) of each part of a picture, so that each part shows as many.
 
-    A part with fewer points shows all of them.
-
-    Parameters
-    ----------
-    counts
-        (t,): points of each.
-    most
-        Points that are shown in all.
+    A part with fewer points shows all of them; they are `most` in all.
     """
     each, few = np.inf, np.zeros(len(counts), np.bool_)
     for _ in range(len(counts)):
@@ -150,16 +125,10 @@ def even_shares(counts: NDArray[Any], most: int) -> NDArray[np.float64]:
 def picked(
     places: Floats, origin: Sequence[float], direction: Sequence[float], pixel: float
 ) -> int | None:
-    """Pick one of the points (n, 3) by a ray, or none.
+    """Pick one of the points (n, 3) by a ray from the camera through the mouse, or none.
 
-    It is the nearest to the ray among those on the first surface.
-
-    Parameters
-    ----------
-    origin, direction
-        Of the ray, from the camera through the mouse.
-    pixel
-        Angle between two rows of the picture, radians.
+    It is the nearest to the ray among those on the first surface. `pixel` is the angle between two
+    rows of the picture, radians.
     """
     ahead = np.array(direction) / np.linalg.norm(direction)
     away = places - np.array(origin)

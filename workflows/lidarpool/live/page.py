@@ -61,20 +61,14 @@ _LOGGER = logging.getLogger(__name__)
 
 
 class LivePage(viser.ViserServer):
-    """A page for users of this machine only.
-
-    Parameters
-    ----------
-    title
-        Title of its panel.
-    port
-        Port to listen on, or the next that is free; 0 for any.
-    """
+    """A page for users of this machine only, on a port or the next that is free; 0 for any."""
 
     def __init__(self, title: str, port: int) -> None:
         super().__init__(host=HOST, port=port, label=title, verbose=False)
         self._links: SimpleQueue[str] = SimpleQueue()  # paths
-        refuse_strangers(self, self._links.put)
+        self._websock_server.on_client_connect(self._admit)
+        # Earlier connections reconnect: viser listens before this check is in place.
+        self._websock_server.disconnect_all_clients()
         _set_theme(self, dark=False)
         self._dark: dict[int, viser.GuiCheckboxHandle] = {}  # {client: its choice}
         self.on_client_connect(self._add_dark)
@@ -85,6 +79,28 @@ class LivePage(viser.ViserServer):
 
     SIDES = tuple(_SIDES)
     _bounds = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+
+    async def _admit(self, client: WebsockClientConnection) -> None:
+        """Keep pages from elsewhere from reading the content or pressing buttons.
+
+        viser itself accepts every connection. Listening on the loopback interface does not help:
+        the browser with the foreign page is on this machine.
+        """
+        connection = self._websock_server._live_connections[client.client_id]
+        request = connection.request
+        origins = request.headers.get_all("Origin") if request else []
+        if may_connect(origins):
+            if request is not None and request.path.strip("/"):
+                self._links.put(request.path)
+            return
+        _LOGGER.warning("a page of %r wanted to connect to the live page: refused", origins)
+        await connection.close(_POLICY_VIOLATION, "only pages of this machine may connect")
+        # Its messages so far would still be handled, so closing is not enough. The next
+        # that the handler of this connection does is to wait for what sends and takes messages:
+        # cancelled by then, it starts neither, and takes the client off its tables.
+        task = asyncio.current_task()
+        assert task is not None
+        task.cancel()
 
     def _add_dark(self, client: viser.ClientHandle) -> None:
         """Give a browser its own choice of colours, at first as its system has it.
@@ -233,40 +249,6 @@ def _is_own(origin: str) -> bool:
         return False
 
 
-def refuse_strangers(
-    server: viser.ViserServer, admitted: Callable[[str], None] = lambda path: None
-) -> None:
-    """Keep pages from elsewhere from reading a server's content or pressing its buttons.
-
-    `admitted` is called with the path to which a page of this machine connects, if it has one.
-
-    viser itself accepts every connection. Listening on the loopback interface does not help: the
-    browser with the foreign page is on this machine.
-    """
-    sockets = server._websock_server
-
-    async def admit(client: WebsockClientConnection) -> None:
-        connection = sockets._live_connections[client.client_id]
-        request = connection.request
-        origins = request.headers.get_all("Origin") if request else []
-        if may_connect(origins):
-            if request is not None and request.path.strip("/"):
-                admitted(request.path)
-            return
-        _LOGGER.warning("a page of %r wanted to connect to the live page: refused", origins)
-        await connection.close(_POLICY_VIOLATION, "only pages of this machine may connect")
-        # Its messages so far would still be handled, so closing is not enough. The next
-        # that the handler of this connection does is to wait for what sends and takes messages:
-        # cancelled by then, it starts neither, and takes the client off its tables.
-        task = asyncio.current_task()
-        assert task is not None
-        task.cancel()
-
-    sockets.on_client_connect(admit)
-    # Earlier connections reconnect: viser listens before this check is in place.
-    sockets.disconnect_all_clients()
-
-
 def _set_theme(whose: viser.ViserServer | viser.ClientHandle, dark: bool) -> None:
     whose.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=dark)
 
@@ -296,16 +278,9 @@ def _without_words() -> Iterator[None]:
 
 @contextmanager
 def announced(page: LivePage, words: str, browser: bool) -> Iterator[None]:
-    """Show a page's address on stderr while the body runs, or in a notebook the page itself.
+    """Tell a page's address while the body runs, or show the page in the cell of a notebook.
 
-    Parameters
-    ----------
-    page
-        The page.
-    words
-        The message with its address.
-    browser
-        Whether to open a browser where there is a desktop, and no notebook.
+    `browser`: open one where there is a desktop, and no notebook.
     """
     display = cell_display()
     if display is None:
@@ -327,14 +302,9 @@ def announced(page: LivePage, words: str, browser: bool) -> Iterator[None]:
 def redrawn(draw: Callable[[], float], every_s: float) -> Iterator[None]:
     """Call a function repeatedly in a thread while the body runs, and once at its end.
 
-    The function draws changes. An error is logged, and ends the drawing but not the body.
-
-    Parameters
-    ----------
-    draw
-        Returns the share of one core that it may take of the time until it is called again.
-    every_s
-        Seconds between calls, at least.
+    The function draws changes, and returns the share of one core that it may take of the time until
+    it is called again; that is in `every_s` seconds at least. An error is logged, and ends the
+    drawing but not the body.
     """
     ended = threading.Event()
 

@@ -25,14 +25,8 @@ _BOX = (
 class PickedPoints:
     """The last clicked point, and a second one for measuring.
 
-    Parameters
-    ----------
-    columns
-        {name: column shown for a point}.
-    names
-        {label: names of its values 0, 1, 2, …}.
-    origin
-        World position of the local origin, (3,), metres.
+    `columns` are shown of a point; `names` are those of the values 0, 1, 2, … of a label; `origin`
+    is the world position of the local origin, (3,).
     """
 
     def __init__(

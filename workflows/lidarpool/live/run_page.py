@@ -90,12 +90,8 @@ class LiveRun:
     def with_progress(self, show: Show, partitions: Mapping[str, Partition]) -> Show:
         """Return a function to call with the progress: it calls `show` and updates the page.
 
-        It raises KeyboardInterrupt if a user of the page has stopped the run.
-
-        Parameters
-        ----------
-        partitions
-            Those whose slots are shown.
+        It raises KeyboardInterrupt if a user of the page has stopped the run. The page shows the
+        busy slots of `partitions`.
         """
         self._partitions = partitions
         self._starting = "starting: workers read the scene and make their trees"
@@ -142,12 +138,9 @@ class LiveRun:
         self._stop.label = "Close"
 
     def stay(self, cloud: Path) -> None:
-        """Keep the page until Ctrl-C, or until it is closed from the page itself.
+        """Keep the page until Ctrl-C or its button.
 
-        Parameters
-        ----------
-        cloud
-            The written cloud, from which more points are read, because the parts are gone.
+        More points are read from the written `cloud`, because the parts are gone.
         """
         own = [column for column in self._job.survey.stored_columns if column.name not in TABLE]
         file = CloudFile(cloud, own)

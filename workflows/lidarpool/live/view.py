@@ -46,18 +46,8 @@ class View:
     """Scene, cloud, sensors, rays and path on a page, with their controls.
 
     One thread draws everything, in the scene's local coordinates. Unchanged things are not drawn
-    again.
-
-    Parameters
-    ----------
-    page
-        Where they are shown.
-    table
-        The columns of the cloud.
-    pictured
-        Scene and sensors; None for a cloud alone.
-    around
-        Of a cloud alone: world position of the local origin, (3,), and its box (2, 3) from there.
+    again. `table` has the columns of the cloud. For a cloud alone, without `pictured`, `around` is
+    the world position of the local origin, (3,), and the cloud's box (2, 3) from there.
     """
 
     def __init__(
@@ -94,6 +84,7 @@ class View:
         self._rays: Any = None  # viser shows no lines without points
         self._markers: list[Any] = []  # of the sensors, once the time is known
         self._bodies: list[Any] = []  # of the actors
+        self._linked: dict[str, Any] = {}  # {name in a link: slider or menu}
         self._time: Any = None  # slider, where anything moves
         self._follow: Any = None  # checkbox, where a sensor moves
         self._trail: Any = None  # slider, where points have a time
@@ -123,6 +114,7 @@ class View:
             colours = colours_for(self._scene, self._reflectance)
             self._scene_colour = gui.add_dropdown("scene colour", (*colours, HIDDEN))
             self._scene_legend = gui.add_html("")
+            self._linked["scene"] = self._scene_colour
         self.cloud.add_filter()
         with gui.add_folder("view", expand_by_default=False):
             sides = (*self._page.SIDES, *(("sensor",) if self._sensors else ()))
@@ -134,11 +126,12 @@ class View:
             gui.add_button("Save picture").on_click(self._save)
             gui.add_button("Link to this view").on_click(self._link)
             self._link_text = gui.add_html("")
+        self._linked |= {"cut": self._cut, "colour": self.cloud.colour}
 
     def _add_time(self, duration_s: float, carried: bool, timed: bool) -> None:
         gui, step = self._page.gui, 10.0 ** math.floor(math.log10(duration_s / 200))
         end = round(step * math.ceil(duration_s / step), 9)  # as many digits are shown as it has
-        self._time = gui.add_slider("time, s", 0.0, end, step, 0.0)
+        self._time = self._linked["time"] = gui.add_slider("time, s", 0.0, end, step, 0.0)
         self._play = gui.add_button("Play")
         self._play.on_click(lambda _: self._start_or_stop())
         if carried:
@@ -146,7 +139,7 @@ class View:
                 "follow", initial_value=False, hint="the carrier, with the camera"
             )
         if timed:
-            self._trail = gui.add_slider(
+            self._trail = self._linked["last"] = gui.add_slider(
                 "last, s", 0.0, end, step, 0.0, hint="of the points, up to the time; 0: all"
             )
 
@@ -172,20 +165,10 @@ class View:
         rays_version: Hashable = 0,
         path: Floats | None = None,
     ) -> None:
-        """Draw what has changed.
+        """Draw what has changed, as the versions tell.
 
-        Parameters
-        ----------
-        cloud
-            An evenly spaced sample of the points, world coordinates.
-        hits
-            Returns the hits of each triangle, (f,).
-        rays
-            Some rays.
-        path
-            The planned path, (n, 2) metres.
-        version, hits_version, rays_version
-            They change with the points, hits and rays.
+        `cloud` is an evenly spaced sample of the points, in world coordinates; `hits` returns the
+        hits of each triangle, (f,); `path` is the planned path, (n, 2) metres.
         """
         self._draw_time()
         self._draw_scene(hits, hits_version, cloud)
@@ -384,33 +367,27 @@ class View:
     @property
     def choices(self) -> list[tuple[str, str]]:
         """(name, value) of the current choices, for `choose`."""
-        chosen = [("cut", f"{self._cut.value:g}"), ("colour", self.cloud.colour.value)]
-        if self._scene is not None:
-            chosen.append(("scene", self._scene_colour.value))
-        if self._time is not None:
-            chosen.append(("time", f"{self._time.value:g}"))
-        if self._trail is not None:
-            chosen.append(("last", f"{self._trail.value:g}"))
+        values = {name: control.value for name, control in self._linked.items()}
+        chosen = [(n, v if isinstance(v, str) else f"{v:g}") for n, v in values.items()]
         limits = self.cloud.filter.limits
         return chosen + [("only", f"{name},{low!r},{high!r}") for name, low, high in limits]
 
     def choose(self, choices: Sequence[tuple[str, str]]) -> None:
         """Apply the choices of a link; invalid ones are ignored."""
-        menus: dict[str, Any] = {"colour": self.cloud.colour}
-        sliders: dict[str, Any] = {"cut": self._cut, "time": self._time, "last": self._trail}
-        if self._scene is not None:
-            menus["scene"] = self._scene_colour
         wanted = Filter()
         for name, value in choices:
+            control = self._linked.get(name)
             with suppress(ValueError):
-                if name in menus and value in menus[name].options:
-                    menus[name].value = value
-                elif (slider := sliders.get(name)) is not None:
-                    slider.value = min(max(slider.min, float(value)), slider.max)
-                elif name == "only":
+                if name == "only":
                     column, low, high = value.split(",")
                     if column in self.cloud.filtered:
                         wanted = wanted.with_limits(column, (float(low), float(high)))
+                elif control is None:
+                    continue
+                elif not isinstance(control.value, str):
+                    control.value = min(max(control.min, float(value)), control.max)
+                elif value in control.options:
+                    control.value = value
         self.cloud.set_filter(wanted)
 
     def _save(self, event: Any) -> None:
