@@ -77,7 +77,7 @@ def test_columns_that_nobody_knows_are_in_the_menu(tmp_path, page):
     file = CloudFile(tmp_path / "theirs.ply")
     view = ResultView(page, file)
     view.draw()
-    assert view._view.cloud.colour.options == ("z", "nx", HIDDEN)
+    assert view._view.cloud.colour.options == ("z", "x", "y", "nx", HIDDEN)
     assert file.choose(100)[0]["nx"].tolist() == list(range(20))
 
 

@@ -14,7 +14,7 @@ import viser
 from numpy.typing import NDArray
 
 from ..columns.cloud import Cloud
-from ..columns.table import AXES, SCAN, Column, X, Y, Z
+from ..columns.table import AXES, Column, X, Y, Z
 from ..render.colouring import MOST_ENTRIES, Colouring, colours_of
 from .blocks import Blocks, Search
 from .colouring import as_bytes, boxed, legend_of
@@ -71,10 +71,7 @@ class CloudView:
         self._page, self._labels, self._names = page, labels, names
         self._origin, self._size_m = origin, size_m
         rest = {column.name: column for column in columns if column not in AXES}
-        self._columns = {"z": Z, **rest}
-        # {column: description for the filter}
-        self.filtered = {**({"scan": SCAN} if "scan" in rest else {}), "x": X, "y": Y, "z": Z}
-        self.filtered |= {name: column for name, column in rest.items() if name != "scan"}
+        self.columns = {"z": Z, "x": X, "y": Y, **rest}  # to colour and filter by
         self.blocks: Blocks | None = None  # file with more points
         self._even: Cloud | None = None  # of all points
         self._even_version: Hashable = None
@@ -104,18 +101,18 @@ class CloudView:
     def add_colour(self) -> None:
         """Add the menu of colours and their legend."""
         gui = self._page.gui
-        self.colour = gui.add_dropdown("cloud colour", (*self._columns, HIDDEN))
+        self.colour = gui.add_dropdown("cloud colour", (*self.columns, HIDDEN))
         self._legend = gui.add_html("")
 
     def add_filter(self) -> None:
         """Add the panel of clicked points and the controls of the filter."""
         gui = self._page.gui
         self.picked = PickedPoints(
-            self._page, self._labels, self._columns, self._names, self._origin
+            self._page, self._labels, self.columns, self._names, self._origin
         )
         self._folder = gui.add_folder("filter", expand_by_default=False)
         with self._folder:
-            self._filter_by = gui.add_dropdown("column", tuple(self.filtered))
+            self._filter_by = gui.add_dropdown("column", tuple(self.columns))
             self._filter_text = gui.add_html("", order=1e4)
             self._all = gui.add_button("Show all", order=1e5, visible=False)
         self._all.on_click(lambda _: self.set_filter(Filter()))
@@ -140,7 +137,7 @@ class CloudView:
         self._all.visible = bool(words)
 
     def _filter_input(self, name: str) -> Any:
-        gui, column, limits = self._page.gui, self.filtered[name], self.filter.of(name)
+        gui, column, limits = self._page.gui, self.columns[name], self.filter.of(name)
         values = np.zeros(0) if self._even is None else values_of(self._even, name)
         values = values[np.isfinite(values)]
         if column.kind == "label" and (labels := self._values_by_name(name, values)):
@@ -152,14 +149,12 @@ class CloudView:
         span = max(high - low, 1e-6 * abs(high), 1e-6)  # resolution of a slider
         step = 10.0 ** math.floor(math.log10(span / 500))
         step = max(step, 1.0) if values.dtype.kind in "iu" and unit == 1.0 else step
-        first, last = (
-            round(step * end, 9) for end in (math.floor(low / step), math.ceil(high / step))
-        )
-        last = last if last > first else first + step
+        first = round(step * math.floor(low / step), 9)
+        last = max(round(step * math.ceil(high / step), 9), first + step)
         ends = (first, last) if limits is None else (limits[0] / unit, limits[1] / unit)
-        ends = (max(ends[0], first), min(ends[1], last))
         title = f"{name}, {'s' if unit == _NS else column.unit}".rstrip(", ")
-        return gui.add_multi_slider(title, first, last, step, ends)
+        shown = max(ends[0], first), min(ends[1], last)
+        return gui.add_multi_slider(title, first, last, step, shown)
 
     def _values_by_name(self, name: str, values: NDArray[Any]) -> dict[str, int]:
         """Return {name: value} of a label with few values, or with names."""
@@ -179,14 +174,14 @@ class CloudView:
         low, high = handle.value
         if low <= handle.min and high >= handle.max:
             return None
-        unit = _NS if self.filtered[name].unit == "ns" else 1.0
+        unit = _NS if self.columns[name].unit == "ns" else 1.0
         return low * unit, high * unit
 
     def _in_words(self, name: str, low: float, high: float) -> str:
         names = self._names.get(name, ())
         if low == high and 0 <= low < len(names):
             return f"only {names[int(low)]}"
-        unit = self.filtered[name].unit
+        unit = self.columns[name].unit
         low, high, unit = (low / _NS, high / _NS, "s") if unit == "ns" else (low, high, unit)
         span = f"{low:g}" if low == high else f"{low:g} to {high:g}"
         return f"{name} {span} {unit}".rstrip()
@@ -250,7 +245,7 @@ class CloudView:
         self._scaled = (self._version, self.filter, name)
         base = self._base()
         values = values_of(base, name)[self.filter.keeps(base)]
-        self._colouring = colours_of(values, self._columns[name], self._names.get(name, ()))
+        self._colouring = colours_of(values, self.columns[name], self._names.get(name, ()))
 
     def _draw(
         self, scene: viser.SceneApi, node: Any, cloud: Cloud, cut: float | None, size: float

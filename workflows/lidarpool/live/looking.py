@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -79,27 +80,27 @@ class Eye:
 
     def seen(self, places: Floats) -> tuple[Floats, NDArray[np.bool_]]:
         """Project points (n, 3) to the picture, (n, 2) in -1 to 1, and whether they are in it."""
-        axes = SO3(np.array(self.wxyz)).as_matrix()
-        x, y, z = ((places - np.array(self.position)) @ axes).astype(np.float32).T
+        x, y, z = self._before(places).astype(np.float32)
         depth = np.maximum(z, _NEAR)
         tangent = np.tan(self.fov / 2)
         at = np.stack([x / depth / (tangent * self.aspect), y / depth / tangent], axis=1)
         return at, (np.abs(at) < 1).all(axis=1) & (z > _NEAR)
 
+    def _before(self, places: Floats) -> Floats:
+        """Points (n, 3) in the camera's axes, (3, n)."""
+        axes = SO3(np.array(self.wxyz)).as_matrix()
+        return np.asarray(((places - np.array(self.position)) @ axes).T)
+
     def tiles(self, places: Floats) -> NDArray[np.int64]:
         """Part of the picture of each point (n, 3): (n,); -1 outside."""
         at, inside = self.seen(places)
-        column, row = ((np.clip(at, -1, 0.9999).T + 1) / 2 * np.array([[_ACROSS], [_DOWN]])).astype(
-            np.int64
-        )
+        across, down = (np.clip(at, -1, 0.9999).T + 1) / 2
+        column, row = (across * _ACROSS).astype(np.int64), (down * _DOWN).astype(np.int64)
         return np.where(inside, row * _ACROSS + column, -1)
 
     def may_see(self, box: Floats) -> bool:
         """Whether a box (2, 3) may be partly in the picture."""
-        low, high = box
-        corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
-        axes = SO3(np.array(self.wxyz)).as_matrix()
-        x, y, z = ((corners - np.array(self.position)) @ axes).T
+        x, y, z = self._before(np.array(list(itertools.product(*box.T))))
         tall = z * np.tan(self.fov / 2)
         wide = tall * self.aspect
         outside = (z < 0, x > wide, x < -wide, y > tall, y < -tall)

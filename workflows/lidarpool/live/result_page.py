@@ -117,13 +117,7 @@ def wait_for_interrupt() -> None:
 
 
 def view_result(path: Path, *, port: int, browser: bool = True) -> None:
-    """Show a folder of a result, or a cloud, until Ctrl-C; see `result_page`.
-
-    Raises
-    ------
-    LidarpoolError
-        If there is no cloud, or it is damaged.
-    """
+    """Show a folder of a result, or a cloud, until Ctrl-C; see `result_page`."""
     file, pictured, note = open_result(path)
     if note:
         click.echo(f"note: {note}", err=True)
@@ -133,30 +127,30 @@ def view_result(path: Path, *, port: int, browser: bool = True) -> None:
 
 
 def open_result(path: Path) -> tuple[CloudFile, Pictured | None, str]:
-    """Open a cloud or the folder of a result; with the scene if there is one, and a note."""
+    """Open a cloud or the folder of a result; with the scene if there is one, and a note.
+
+    That the scene cannot be read is only noted, because the cloud is complete.
+
+    Raises
+    ------
+    LidarpoolError
+        If there is no cloud, or it is damaged.
+    """
+    cloud, scene = path / CLOUD, path / PICTURE_FILE
     if not path.is_dir():
         return CloudFile(path), None, ""
-    if (path / CLOUD).exists():
-        pictured, note = _pictured_in(path)
-        return CloudFile(path / CLOUD, pictured.own if pictured else ()), pictured, note
-    if (path / RUN_FOLDER / FILE).exists():
+    if not cloud.exists() and (path / RUN_FOLDER / FILE).exists():
         raise LidarpoolError(
             f"{path} holds an unfinished run: continue it with lidarpool run --resume, where "
             "--live shows its points."
         )
-    raise LidarpoolError(
-        f"{path} holds no {CLOUD}: give the folder of a result (its --out), or a cloud."
-    )
-
-
-def _pictured_in(folder: Path) -> tuple[Pictured | None, str]:
-    """Read what pictures of a result show; if that fails, return a sentence that says so.
-
-    This is not an error, because the cloud is complete.
-    """
-    if not (folder / PICTURE_FILE).exists():
-        return None, ""
+    if not cloud.exists():
+        raise LidarpoolError(
+            f"{path} holds no {CLOUD}: give the folder of a result (its --out), or a cloud."
+        )
+    pictured, note = None, ""
     try:
-        return Pictured.load(folder / PICTURE_FILE), ""
+        pictured = Pictured.load(scene) if scene.exists() else None
     except LidarpoolError as error:
-        return None, f"The cloud is shown without the scene. {error}"
+        note = f"The cloud is shown without the scene. {error}"
+    return CloudFile(cloud, pictured.own if pictured else ()), pictured, note

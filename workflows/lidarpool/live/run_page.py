@@ -207,7 +207,7 @@ class LiveRun:
             if getattr(progress, total)
         ]
         lines.append(escape(self._models))
-        lines += [escape(self._newest)] if self._newest else []
+        lines += [escape(self._newest)] if self._newest and not self._over else []
         shown = len(points.cloud) if points is not None and points.cloud is not None else 0
         some = "" if shown == progress.points else f", {shown:,} of them displayed"
         of_file = self._view.cloud.facts if self._view.cloud.blocks is not None else []

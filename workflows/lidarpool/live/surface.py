@@ -12,7 +12,6 @@ from trimesh.exchange.gltf import export_glb
 
 from ..base.open3d_module import load_open3d
 from ..columns.table import OBJECT
-from ..render.closeup import floor_and_roof
 from ..render.colouring import TURBO, colours_of
 from ..render.intensity import density_colours, density_range
 from ..render.theme import UNSEEN, mapped, rgb
@@ -42,20 +41,12 @@ _MATERIAL = {
 
 
 class Surface:
-    """A scene's triangles, or a simplified mesh, in the chosen colours.
+    """A scene's triangles, or a simplified mesh of at most so many, in the chosen colours.
 
     Vertices in the same cell of a grid are merged (Rossignac and Borrel, 1993), and hits go to the
     nearest remaining triangle. Each triangle is moved inwards a little, so that touching objects,
-    such as the top of a wall and a ceiling, do not show through each other.
-
-    Parameters
-    ----------
-    scene
-        The scene.
-    reflectance
-        (objects,): share of the light that each object reflects, 0 to 1; None if not known.
-    most
-        Most triangles.
+    such as the top of a wall and a ceiling, do not show through each other. `reflectance` is the
+    share of the light that each object reflects, (objects,), if it is known.
     """
 
     def __init__(
@@ -83,12 +74,8 @@ class Surface:
     ) -> tuple[NDArray[np.float32], NDArray[np.uint8], str]:
         """Triangles (k, 3, 3), their colours (k, 3) and a legend as HTML.
 
-        Parameters
-        ----------
-        by
-            One of `colours_for` the scene.
-        hit_counts, points
-            Hits (f,) of each triangle of the scene, and some of the hit points (n, 3), for "hits".
+        `by` is one of `colours_for` the scene; "hits" needs the hits (f,) of its triangles, and
+        some of the hit points, (n, 3).
         """
         legend = ""
         if by == "hits":
@@ -117,13 +104,6 @@ class Surface:
         middle = (low * high) ** 0.5
         marks = [f"{n:.2g}" if n < 10 else f"{n:,.0f}" for n in (low, middle, high)]
         return corners, as_bytes(colours), colour_bar(TITLE, marks) if density.any() else ""
-
-    def around(self, sensors: NDArray[np.float64]) -> tuple[float | None, float | None]:
-        """Heights of the floor under sensors at (p, 3) and of the roof over them, metres.
-
-        None if there is none: under the sky, or over an abyss.
-        """
-        return floor_and_roof(self.coarse, sensors) if len(self.corners) else (None, None)
 
 
 def colours_for(scene: Scene, reflectance: NDArray[np.float64] | None) -> tuple[str, ...]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..columns.cloud import Cloud
 from ..columns.table import Column
-from ..render.closeup import CUT, around_ways
+from ..render.closeup import CUT, around_ways, floor_and_roof
 from ..render.theme import CLAY, object_colours, rgb
 from ..run.picture_file import Pictured, ways_of
 from ..sensor.trajectory import quaternions_of
@@ -243,7 +243,7 @@ class View:
 
     def _look_around(self, surface: Surface) -> None:
         """Cut a building open if the sensors stand in one, and find the floor."""
-        floor, roof = surface.around(self._poses)
+        floor, roof = floor_and_roof(surface.coarse, self._poses)
         self._ground = self._ground if floor is None else floor
         if roof is not None and (self.cut is None or roof < self.cut):
             top = float(self._poses[:, 2].max())
@@ -380,7 +380,7 @@ class View:
             with suppress(ValueError):
                 if name == "only":
                     column, low, high = value.split(",")
-                    if column in self.cloud.filtered:
+                    if column in self.cloud.columns:
                         wanted = wanted.with_limits(column, (float(low), float(high)))
                 elif control is None:
                     continue
