@@ -128,8 +128,7 @@ def test_a_run_is_watched_from_its_first_part_to_its_path():
         for name in ("/sensors/0", "/poses", "/rays", "/path", "/discs/0"):
             wait_for(lambda name=name: live.page.scene.get_handle_by_name(name) is not None)
         live._view._scene_colour.value = "hits"
-        live.draw()
-        assert "hits per square metre" in live._view._scene_legend.content
+        wait_for(lambda: "hits per square metre" in live._view._scene_legend.content)
         cloud = live._points.cloud
     assert busy == {"GPU", "LIDAR", "OTHER"}
     assert shown[-1].collected == survey.scan_count

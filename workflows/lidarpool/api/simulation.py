@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -160,7 +161,7 @@ def simulate(
             run = Run(client, store, logger.info)
             if page is not None:
                 page.follow(store)
-                on_frame = page.with_frames(on_frame)
+                on_frame = partial(page.on_frame, take=on_frame)
                 show = page.with_progress(show, run.partitions)
             with nullcontext() if own else run.partitions_page():
                 result = run.drive(on_frame, show)

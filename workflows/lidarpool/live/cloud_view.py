@@ -83,7 +83,7 @@ class CloudView:
         self._version = 0  # of what is drawn from
         self.filter = Filter()
         self.trail = Filter()  # of the time that is played
-        self._counted = (-1, Filter(), 0)  # points of a version that a filter keeps
+        self._kept = 0  # points that the filter keeps of those that are drawn from
         self._colouring: Colouring | None = None
         self._scaled: Hashable = None  # inputs of the colours
         self._drawn: Hashable = None
@@ -238,21 +238,24 @@ class CloudView:
         return min(_POINT, _POINT_OF_MANY / len(self._base()) ** 0.5) * self._size_m
 
     def _scale(self) -> None:
-        """Fit the colour scale to the filtered points."""
+        """Fit the colour scale and its legend to the filtered points."""
         name = self.colour.value
-        if name == HIDDEN or self._scaled == (self._version, self.filter, name):
+        if self._scaled == (self._version, self.filter, name):
             return
-        self._scaled = (self._version, self.filter, name)
+        self._scaled, self._colouring = (self._version, self.filter, name), None
         base = self._base()
-        values = values_of(base, name)[self.filter.keeps(base)]
-        self._colouring = colours_of(values, self.columns[name], self._names.get(name, ()))
+        kept = self.filter.keeps(base)
+        self._kept = int(np.count_nonzero(kept))
+        if name != HIDDEN and self._kept:
+            values, names = values_of(base, name)[kept], self._names.get(name, ())
+            self._colouring = colours_of(values, self.columns[name], names)
+        self._legend.content = legend_of(self._colouring) if self._colouring else ""
 
     def _draw(
         self, scene: viser.SceneApi, node: Any, cloud: Cloud, cut: float | None, size: float
     ) -> Any:
         """Draw the filtered points; returns the node."""
         rows = np.flatnonzero(self._wanted(cloud, cut))
-        self._legend.content = legend_of(self._colouring) if self._colouring and len(rows) else ""
         if not len(rows) or self._colouring is None:
             if node is not None:
                 node.visible = False
@@ -357,12 +360,7 @@ class CloudView:
         if self._even is None:
             return ["reading the points …"]
         whole = len(self._even) if self.blocks is None else len(self.blocks.file)
-        base = self._base()
-        if self._counted[:2] != (self._version, self.filter):
-            kept = np.count_nonzero(self.filter.keeps(base))
-            self._counted = self._version, self.filter, int(kept)
-        shown = self._counted[2]
-        count = self._count
+        shown, count = self._kept, self._count
         if count is None:
             count = shown if self.filter.limits else whole
         words = "all shown" if shown == count else f"{shown:,} shown"

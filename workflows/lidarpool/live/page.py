@@ -238,13 +238,9 @@ def may_connect(origins: Iterable[str]) -> bool:
     >>> may_connect(["https://localhost.example.com"]), may_connect(["null"])
     (False, False)
     """
-    return all(map(_is_own, origins))
-
-
-def _is_own(origin: str) -> bool:
     try:
-        parts = urlsplit(origin)
-        return parts.scheme in ("http", "https") and parts.hostname in OWN_NAMES
+        parts = [urlsplit(origin) for origin in origins]
+        return all(p.scheme in ("http", "https") and p.hostname in OWN_NAMES for p in parts)
     except ValueError:  # no address at all
         return False
 

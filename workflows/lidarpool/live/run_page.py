@@ -102,24 +102,15 @@ class LiveRun:
 
         return tell
 
-    def on_frame(self, frame: Frame) -> None:
-        """Record a frame; it is displayed unless many others come at once."""
+    def on_frame(self, frame: Frame, take: Callable[[Frame], None] | None = None) -> None:
+        """Record a frame, which is displayed unless many others come at once, and call `take`."""
         self._frames.append(frame)
-
-    def with_frames(self, take: Callable[[Frame], None] | None) -> Callable[[Frame], None]:
-        """Return a function to call with each frame: it updates the page, and calls `take`."""
-
-        def tell(frame: Frame) -> None:
-            self.on_frame(frame)
-            if take is not None:
-                take(frame)
-
-        return tell
+        if take is not None:
+            take(frame)
 
     def on_progress(self, progress: Progress) -> None:
         """Record the progress; raises KeyboardInterrupt if the run was stopped."""
-        self._first = self._first or progress
-        self._progress = progress
+        self._first, self._progress = self._first or progress, progress
         now = time.monotonic()
         if now >= self._ask_at:
             self._ask_at = now + ASK_EVERY_S

@@ -326,11 +326,10 @@ class View:
         """Move all cameras as the carrier has moved."""
         if self._follow is None:
             return
-        at, before = self._carrier(time_ns), self._followed
-        self._followed = at
-        if self._follow.value and before is not None and (at != before).any():
-            for client in self._page.get_clients().values():
-                client.camera.position = client.camera.position + at - before  # looks along
+        before, self._followed = self._followed, self._carrier(time_ns)
+        if self._follow.value and before is not None:
+            for client in self._page.get_clients().values():  # the camera looks along
+                client.camera.position = client.camera.position + self._followed - before
 
     def _carrier(self, time_ns: float) -> Floats:
         """Position of the first moving sensor, or of the first of all, (3,)."""
@@ -344,11 +343,9 @@ class View:
         if event.target.value != "sensor":
             self._page.look_from(event.client, event.target.value)
             return
-        time_ns = 0.0 if self._time is None else self._time.value * 1e9
+        time_ns, step = 0.0 if self._time is None else self._time.value * 1e9, 0.02 * self._ends_ns
         at = self._carrier(time_ns)
-        way = self._carrier(time_ns + 0.02 * self._ends_ns) - self._carrier(
-            time_ns - 0.02 * self._ends_ns
-        )
+        way = self._carrier(time_ns + step) - self._carrier(time_ns - step)
         length = float(np.linalg.norm(way[:2]))
         ahead = np.array([*way[:2] / length, 0.0]) if length > 1e-6 else np.array([1.0, 0.0, 0.0])
         back = 5 * _BALL * self._size_m  # and up: it would hide everything
@@ -396,18 +393,16 @@ class View:
 
     def _add_actors(self) -> None:
         for number, actor in enumerate(self._actors):
-            name = f"/actors/{number}"
-            self._bodies.append(
-                self._page.scene.add_mesh_simple(
-                    name,
-                    actor.mesh.vertices,
-                    actor.mesh.faces,
-                    flat_shading=True,
-                    side="double",
-                    cast_shadow=False,
-                    receive_shadow=False,
-                )
+            body = self._page.scene.add_mesh_simple(
+                f"/actors/{number}",
+                actor.mesh.vertices,
+                actor.mesh.faces,
+                flat_shading=True,
+                side="double",
+                cast_shadow=False,
+                receive_shadow=False,
             )
+            self._bodies.append(body)
 
     def _add_poses(self) -> None:
         """Show trajectories of moving sensors as lines, and positions of others as balls."""
