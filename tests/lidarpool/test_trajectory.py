@@ -105,6 +105,24 @@ def test_files(files, name, options):
     assert fingerprint(track) != fingerprint(moved)
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "time_s,x,y,z\n0,1,2,3\n1,4,5,6\n",
+        "# made by hand\n\ntime_s;x;y;z\r\n0;1;2;3\r\n1;4;5;6\r\n",
+        '"z"\t"y"\t"x"\t"time_s"\n3\t2\t1\t0\n# a remark\n6\t5\t4\t1\n',
+        "time_s,x,y,z,of,\n0,1,2,3,car,\n1,4,5,6,car,\n",
+        "#time_ns,x,y,z\n0,1,2,3\n1000000000,4,5,6\n",
+    ],
+)
+def test_tables_as_programs_write_them(tmp_path, text):
+    (tmp_path / "way.csv").write_text(text, newline="")
+    columns = {"time_ns": "#time_ns"} if text[1:8] == "time_ns" else {}
+    track = load_trajectory(tmp_path / "way.csv", columns=columns)
+    assert track.times_s.tolist() == [0, 1]
+    assert track.positions.tolist() == [[1, 2, 3], [4, 5, 6]]
+
+
 class TestSurveys:
     track = Track([0, 1.05], [[0, 0, 1], [21, 0, 1]])
 

@@ -17,6 +17,7 @@ from .trajectory import Pose, Track, quaternions_of
 FORMATS = ("tum", "kitti", "csv")
 _PLACE = ("x", "y", "z")
 _TURNS = (("qx", "qy", "qz", "qw"), ("yaw_deg", "pitch_deg", "roll_deg"))
+_MARKS = ",;\t"  # that separate the columns of a table
 # Cameras look along z with y down; carriers look along x with z up.
 _CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
@@ -39,9 +40,10 @@ def load_trajectory(
     Parameters
     ----------
     path
-        TUM (rows of time, x, y, z, qx, qy, qz, qw), KITTI (rows of a 3 x 4 matrix), or
-        comma-separated with a header: time_s or time_ns, x, y, z, and qx, qy, qz, qw, or any of
-        yaw_deg, pitch_deg, roll_deg; without them the carrier faces its direction of travel.
+        TUM (rows of time, x, y, z, qx, qy, qz, qw), KITTI (rows of a 3 x 4 matrix), or a table
+        with a header, separated by commas, semicolons or tabs: time_s or time_ns, x, y, z, and
+        qx, qy, qz, qw, or any of yaw_deg, pitch_deg, roll_deg; without them the carrier faces its
+        direction of travel.
     format
         "tum", "kitti" or "csv"; by default kitti with `times`, csv for a .csv, else tum.
     times
@@ -90,13 +92,13 @@ def load_trajectory(
         raise LidarpoolError(f"{path} is not a usable trajectory: {said(error)}") from error
 
 
-def _numbers(text: str, columns: int, delimiter: str | None = None) -> NDArray[np.float64]:
-    """Rows of numbers; lines that begin with # are comments."""
+def _numbers(text: str, columns: int | None = None, **options: Any) -> NDArray[np.float64]:
+    """Rows of numbers, by `np.loadtxt`; lines that begin with # are comments."""
     lines = [line for line in text.splitlines() if line.strip() and line.strip()[0] != "#"]
     if not lines:
         raise ValueError("it has no poses")
-    rows = np.loadtxt(lines, delimiter=delimiter, ndmin=2)
-    if rows.shape[1:] != (columns,):
+    rows = np.loadtxt(lines, ndmin=2, **options)
+    if columns is not None and rows.shape[1:] != (columns,):
         raise ValueError(f"its rows have {rows.shape[1]} numbers, not {columns}")
     return rows
 
@@ -110,7 +112,11 @@ def _rotations(given: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _table(text: str, names: dict[str, str]) -> tuple[Any, Any, Any]:
     """Seconds, positions and quaternions, or None, of a table with a header."""
-    head = [name.strip() for name in text.partition("\n")[0].split(",")]
+    lines = text.splitlines()
+    # Remarks may come first, and some programs write # before the header as well.
+    first = next((i for i, line in enumerate(lines) if any(m in line for m in _MARKS)), 0)
+    mark = next((mark for mark in _MARKS if mark in lines[first]), ",")
+    head = [name.strip().strip('"') for name in lines[first].split(mark)]
     known = ("time_s", "time_ns", *_PLACE, *_TURNS[0], *_TURNS[1])
     if unknown := [name for name in names if name not in known]:
         raise ValueError(f"columns names {unknown[0]!r}; possible names are {', '.join(known)}")
@@ -122,7 +128,10 @@ def _table(text: str, names: dict[str, str]) -> tuple[Any, Any, Any]:
     needed = (clock, *_PLACE, *(_TURNS[0] if quaternion else ()))
     if missing := [names.get(n, n) for n in {**dict.fromkeys(needed), **names} if n not in at]:
         raise ValueError(f"it has no column {missing[0]!r}; it has {', '.join(head)}")
-    rows = _numbers(text.partition("\n")[2], len(head), ",")
+    used = list(at.values())  # others may hold text
+    rest = "\n".join(lines[first + 1 :])
+    rows = _numbers(rest, delimiter=mark, quotechar='"', usecols=used)
+    at = {name: number for number, name in enumerate(at)}
     seconds = rows[:, at[clock]] / (1e9 if clock == "time_ns" else 1.0)
     places = rows[:, [at[name] for name in _PLACE]]
     if quaternion:
