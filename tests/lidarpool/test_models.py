@@ -173,6 +173,11 @@ def test_refraction_is_that_of_the_scalar_law():
     assert angle == pytest.approx(-19.17279, abs=1e-5), "towards the thick edges"
 
 
+def test_a_prism_that_reflects_all_light_is_refused():
+    with pytest.raises(LidarpoolError, match="A prism reflects light back"):
+        PrismSensor(prisms=(Prism(60, 1.9, 7),))
+
+
 def test_an_airborne_scanner_sweeps_across_below(tmp_path):
     mirror, polygon = load_sensor("airborne/leica-als50-ii"), load_sensor("airborne/riegl-vq780i")
     x, y, z = mirror.directions(np.array([0, 1875, 3750, 937]))[:, 0].T
@@ -305,6 +310,7 @@ def test_a_sensor_is_added_by_one_file(tmp_path):
 LIVOX = "Time/s,Azimuth/deg,Zenith/deg\n"
 GOOD = "name: A\nsources: {}\n"
 VELODYNE = "num_lasers: 2\nlasers: [{laser_id: 0, vert_correction: 0.1, rot_correction: 0.2}"
+OWN = "name: Own\nsources: {}\n"
 BAD = {
     "field.yaml": (GOOD + "firing_us: 5\nrage_m: [0, 1]", "rage_m: this is not a field"),
     "optic.yaml": (GOOD + "firing_us: 5\noptics: {wavelenght_nm: 9}", "mean 'wavelength_nm'"),
@@ -317,6 +323,8 @@ BAD = {
     "even.yaml": (GOOD + "firing_us: 5\nbeams: {elevation_deg: {first: 1}}", "'last' is missing"),
     "yaml.yaml": ("name: [", "not a usable model: while parsing"),
     "empty.csv": ("\n", "it is empty"),
+    "part.yaml": (OWN + "firing_us: 1/0\nbeams: {elevation_deg: [0]}", "not a usable model"),
+    "many.yaml": (OWN + "beams: {elevation_deg: {first: 0, last: 1, count: 9999999999999}}", "not"),
     "prose.csv": ("dear reader\n1,2", "'dear reader', has no known format"),
     "prose.json": ("{", "Expecting property name"),
     "other.json": ('{"format": 3}', "no beam_altitude_angles"),

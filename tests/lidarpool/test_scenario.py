@@ -212,6 +212,8 @@ def laughs():
 
 IDENTITY = "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"
 BAD = [
+    ("sensor: {layers: 4}\nsensors: {a: {}}", "give either sensor and mount, or sensors"),
+    ("output: {write: [laz, mcap, {format: mcap, layout: ouster}]}", "write has mcap twice"),
     # (text, what the message says after the file's name)
     ("sensor: {layers: 0}", r"sensor\.layers is 0; input should be greater than or equal to 1"),
     ("sensor: {layers: '40'}", r"sensor\.layers is '40'; input should be a valid integer"),

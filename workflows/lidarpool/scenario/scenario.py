@@ -238,7 +238,7 @@ class Scenario(Section):
                 "give either poses or a trajectory, not both.",
             ),
             (
-                self.sensors and (self.sensor.model or self.sensor.calibration or self.mount),
+                self.sensors and (self.sensor != SensorSection() or self.mount),
                 "give either sensor and mount, or sensors, each with a mount.",
             ),
         )

@@ -348,6 +348,16 @@ class OutputSection(Section):
         ),
     ] = ()
 
+    @model_validator(mode="after")
+    def _each_once(self) -> OutputSection:
+        names = [one.format for one in self.write]
+        if twice := next((name for name in names if names.count(name) > 1), None):
+            raise ValueError(
+                f"write has {twice} twice, which are the same file: lidarpool export --out writes "
+                "another beside it."
+            )
+        return self
+
     @property
     def needs(self) -> tuple[str, ...]:
         """Names of the columns that the formats need."""

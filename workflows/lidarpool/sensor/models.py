@@ -142,7 +142,7 @@ class SensorModel(_Part):
                 )
             return float(1_000_000 / (self.firing_us * Fraction(str(rate)))), rate
         assert self.firings_per_turn is not None
-        return columns or self.firings_per_turn, rate
+        return self.firings_per_turn if columns is None else columns, rate
 
 
 def model_names() -> tuple[str, ...]:
@@ -188,7 +188,10 @@ def _read(path: Path | Traversable) -> SensorModel:
             fields = {field for part in _Part.__subclasses__() for field in part.model_fields}
             said_of_it = f"this is not a field.{did_you_mean(str(first['loc'][-1]), fields)}"
         raise LidarpoolError(f"{path}, {place}: {said_of_it}") from error
-    except (OSError, ValueError, TypeError, KeyError, yaml.YAMLError, LidarpoolError) as error:
+    except (
+        OSError, ValueError, TypeError, KeyError, ArithmeticError, MemoryError, RecursionError,
+        yaml.YAMLError, LidarpoolError,
+    ) as error:  # fmt: skip
         raise LidarpoolError(f"{path} is not a usable model: {said(error)}") from error
 
 

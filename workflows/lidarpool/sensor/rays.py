@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.errors import LidarpoolError
 from .beams import Beams
 from .sensor import Sensor
 
@@ -56,6 +57,10 @@ class PrismSensor(Sensor):
     prisms: tuple[Prism, ...] = (Prism(18, 1.5, 7294), Prism(18, 1.5, -4664, 0, True))
     cycle: ClassVar[str] = "frame"
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.directions(np.arange(0, 100_000, 97))  # LidarpoolError if light does not get through
+
     @property
     def period(self) -> int | None:
         """See `Sensor.period`."""
@@ -90,7 +95,13 @@ def _refracted(
     The normals (3, k, 1), or (3, 1, 1), point along the light's direction.
     """
     along = (rays * normals).sum(axis=0)
-    behind = np.sqrt(1 - ratio**2 * (1 - along**2))
+    behind = 1 - ratio**2 * (1 - along**2)
+    if not (behind >= 0).all():
+        raise LidarpoolError(
+            "A prism reflects light back at its inner face, so that no ray leaves the sensor: "
+            "make its wedge or its index smaller."
+        )
+    behind = np.sqrt(behind)
     return ratio * rays + (behind - ratio * along) * normals
 
 

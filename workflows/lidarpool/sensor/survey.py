@@ -23,6 +23,8 @@ from .trajectory import CENTRE, Pose, Stations, Trajectory
 STEPS = 36  # default at each pose: one turn of most sensors
 STEPS_MOST = 10_000_000  # along a trajectory
 SENSORS_MOST = 255  # the type of the column
+RAYS_MOST = 1 << 32  # of a scan, which is cast in one call
+LASTS_MOST_NS = 2.0**63  # the type of the column time: 292 years
 
 
 @dataclass(frozen=True)
@@ -193,6 +195,19 @@ class Survey:
                     f"steps {steps} take until {needed:.6g} s and the trajectory lasts "
                     f"{there:.6g} s, {needed - there:.6g} s less: take fewer steps, or leave them "
                     "out for as many as it lasts."
+                )
+            first, stop = carried.sensor.firings(0)
+            if (rays := (stop - first) * carried.sensor.channels) > RAYS_MOST:
+                raise LidarpoolError(
+                    f"A scan would have {rays:,} rays, more than {RAYS_MOST:,}: make step_deg "
+                    "smaller, or take fewer rays."
+                )
+            lasts = _begin_ns(carried.sensor, carried.sensor.firings(steps - 1)[1])
+            if not lasts * self.path.stations < LASTS_MOST_NS:
+                raise LidarpoolError(
+                    f"The survey would last {lasts * self.path.stations / 1e9:.3g} s, and times "
+                    "are counted in nanoseconds for 292 years: make rate_hz larger, or start_s or "
+                    "steps smaller."
                 )
 
     @cached_property

@@ -226,7 +226,7 @@ class Track:
         last = times[-1] if self.duration_s is None else start + self.duration_s
         for what, time in (("start_s", start), ("the end by duration_s", last)):
             gap = max(times[0] - time, time - times[-1])
-            if gap > _CLOCK_S:
+            if not gap <= _CLOCK_S:  # or NaN
                 raise LidarpoolError(
                     f"{what} is {time:.9g} s, {gap:.6g} s outside the trajectory, which goes from "
                     f"{times[0]:.9g} to {times[-1]:.9g} s."
