@@ -130,6 +130,9 @@ def test_sweeps_come_back(sweeps, tmp_path):
     (tmp_path / "s.npz").write_bytes((tmp_path / "s.npz").read_bytes()[:300])
     with pytest.raises(LidarpoolError, match="damaged"):
         Sweeps.load(tmp_path / "s.npz")
+    replace(sweeps, sensor=sweeps.sensor[1:]).save(tmp_path / "s.npz")
+    with pytest.raises(LidarpoolError, match=r"damaged.*do not fit together"):
+        Sweeps.load(tmp_path / "s.npz")
 
 
 @pytest.mark.parametrize("name", ["las", "laz"])

@@ -203,6 +203,21 @@ class Sweeps:
         np.savez_compressed(memory, **arrays)
         path.write_bytes(memory.getbuffer())
 
+    def _check(self) -> None:
+        """ValueError if arrays of a file do not fit together."""
+        count = len(self)
+        shapes = {
+            (self.begins_ns.shape, (count,)),
+            (self.scans.shape, (count + 1,)),
+            (self.sensor.shape, (count,)),
+            (self.actor_bounds.shape, (len(self.actors), 2, 3)),
+        }
+        for placed in (self.pose, *self.actor_poses):
+            shapes |= {(placed.positions.shape, (count, 3)), (placed.quaternions.shape, (count, 4))}
+        wrong = [f"{one} for {other}" for one, other in shapes if one != other]
+        if wrong or (count and self.sensor.max() >= len(self.sensors)):
+            raise ValueError(f"its arrays do not fit together {'; '.join(wrong[:1])}".strip())
+
     @classmethod
     def load(cls, path: Path) -> Sweeps:
         """Read what `save` wrote; nothing in the file is run.
@@ -221,7 +236,7 @@ class Sweeps:
                     Placed(arrays[f"actor{k}_positions"], arrays[f"actor{k}_quaternions"])
                     for k in range(len(words["actors"]))
                 ]
-                return cls(
+                found = cls(
                     arrays["scans"],
                     arrays["begins_ns"],
                     arrays["sensor"],
@@ -234,6 +249,8 @@ class Sweeps:
                     words["coordinates"],
                     words["precision_m"],
                 )
+            found._check()
+            return found
         except OSError as error:
             raise LidarpoolError(f"{path} cannot be read: {error.strerror or error}.") from error
         except Exception as error:  # zipfile, zlib and NumPy have many
