@@ -110,7 +110,7 @@ def start_partitions(
     def say(words: str) -> None:
         line = " ".join(words.split())[:400]
         alike = re.sub(r"\d+", "", line)  # but for the numbers of jobs
-        if alike not in told:
+        if not any(one in alike for one in told):  # also in the log of this program itself
             told.add(alike)
             tell(line)
 
