@@ -15,7 +15,8 @@ from .errors import PoolError
 from .page import leave_page, partitions_page
 from .partition import Partition
 from .probe import probe_worker
-from .rules import Count, PerGpu, PerHost, Rule, check_name, divide, named
+from .rules import Rule, check_name, divide, named, per_gpu, per_host
+from .rules import n_workers as count
 from .workers import WorkerInfo, all_workers, ask_workers
 
 logger = logging.getLogger(__name__)
@@ -121,9 +122,16 @@ class Pool:
         Raises
         ------
         PoolError
-            If a partition has fewer, or a worker declares two of the partitions.
+            If a partition has fewer, or a worker declares two of the partitions or a number of
+            slots that is not whole.
         """
         for worker in self.workers:
+            for name in slots.keys() & worker.resources.keys():
+                if (has := worker.resources[name]) % 1 or not 0 <= has < 2**31:
+                    raise PoolError(
+                        f"Worker {worker.name} declares {name}={has:g}: give it a whole number of "
+                        f'slots, such as --resources "{name}=1".'
+                    )
             if len(several := [name for name in slots if name in worker.partitions]) > 1:
                 raise PoolError(
                     f"Worker {worker.name} declares {' and '.join(several)}: give each worker "
@@ -231,13 +239,12 @@ class Pool:
             another partition, there are too few, or other workers have this partition.
         """
         common: dict[str, Any] = {"slots": slots, "minimum": minimum, "exclusive": exclusive}
-        given: list[Rule] = []
-        if max_workers_per_gpu is not None:
-            given.append(PerGpu(most=max_workers_per_gpu, **common))
-        if max_workers_per_host is not None:
-            given.append(PerHost(most=max_workers_per_host, **common))
-        if n_workers is not None:
-            given.append(Count(workers=n_workers, **common))
+        numbers = (
+            (max_workers_per_gpu, per_gpu),
+            (max_workers_per_host, per_host),
+            (n_workers, count),
+        )
+        given: list[Rule] = [rule(n, **common) for n, rule in numbers if n is not None]
         if workers is not None:
             given.append(named(*workers, **common))
         if len(given) != 1:

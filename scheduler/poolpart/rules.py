@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from .errors import PoolError
@@ -15,7 +15,7 @@ NO_GPU = "no GPU in the pool: CPU workers instead"
 
 @dataclass(frozen=True, kw_only=True)
 class Rule:
-    """Rule of a partition.
+    """Rule of a partition; every rule takes these by name.
 
     Parameters
     ----------
@@ -47,16 +47,22 @@ class Rule:
         return self.slots or worker.nthreads
 
 
-@dataclass(frozen=True, kw_only=True)
-class PerGpu(Rule):
-    """At most so many workers for each GPU, or without GPUs for each host."""
+@dataclass(frozen=True)
+class per_gpu(Rule):  # noqa: N801 - the name of a rule, not of a kind of rules, as of all below
+    """At most so many workers for each GPU; without GPUs so many CPU workers a host.
+
+    Examples
+    --------
+    >>> per_gpu(1)
+    per_gpu(slots=None, minimum=1, exclusive=False, most=1)
+    """
 
     most: int
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
         """Workers that share the GPUs evenly."""
         if not any(worker.gpus for worker in free):
-            return _by_host(free, self.most)
+            return per_host(self.most).choose(free)
         taken: Counter[str] = Counter()  # {GPU: workers chosen for it}
         chosen = []
         # Those that see the fewest GPUs first: the others have more choice.
@@ -78,29 +84,25 @@ class PerGpu(Rule):
         return super().wants(worker, alike, everyone)
 
 
-@dataclass(frozen=True, kw_only=True)
-class PerHost(Rule):
+@dataclass(frozen=True)
+class per_host(Rule):  # noqa: N801
     """At most so many workers of each host."""
 
     most: int
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
         """Take the first of each host."""
-        return _by_host(free, self.most)
+        taken: Counter[str] = Counter()
+        chosen = []
+        for worker in free:
+            if taken[worker.host] < self.most:
+                taken[worker.host] += 1
+                chosen.append(worker)
+        return chosen
 
 
-def _by_host(free: Sequence[WorkerInfo], most: int) -> list[WorkerInfo]:
-    taken: Counter[str] = Counter()
-    chosen = []
-    for worker in free:
-        if taken[worker.host] < most:
-            taken[worker.host] += 1
-            chosen.append(worker)
-    return chosen
-
-
-@dataclass(frozen=True, kw_only=True)
-class Count(Rule):
+@dataclass(frozen=True)
+class n_workers(Rule):  # noqa: N801
     """So many workers, wherever they are."""
 
     workers: int
@@ -110,9 +112,9 @@ class Count(Rule):
         return list(free[: self.workers])
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Named(Rule):
-    """Workers of these names or addresses."""
+    """The rule that `named` makes."""
 
     names: tuple[str, ...]
 
@@ -121,16 +123,18 @@ class Named(Rule):
         return [worker for worker in free if {worker.name, worker.address} & set(self.names)]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Rest(Rule):
-    """Every worker that no earlier rule takes."""
+@dataclass(frozen=True)
+class rest(Rule):  # noqa: N801
+    """Every worker that no earlier rule takes, perhaps none."""
+
+    minimum: int = field(default=0, kw_only=True)
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
         """All of them."""
         return list(free)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Declared(Rule):
     """Workers that were started with the resource, and no others."""
 
@@ -139,37 +143,9 @@ class Declared(Rule):
         return []
 
 
-def per_gpu(most: int, **common: Any) -> PerGpu:
-    """At most so many workers for each GPU; without GPUs so many CPU workers a host.
-
-    `common` are `slots`, `minimum` and `exclusive`, as in every `Rule`.
-
-    Examples
-    --------
-    >>> per_gpu(1)
-    PerGpu(slots=None, minimum=1, exclusive=False, most=1)
-    """
-    return PerGpu(most=most, **common)
-
-
-def per_host(most: int, **common: Any) -> PerHost:
-    """At most so many workers of each host; `common` as in every `Rule`."""
-    return PerHost(most=most, **common)
-
-
-def n_workers(workers: int, **common: Any) -> Count:
-    """So many workers, wherever they are; `common` as in every `Rule`."""
-    return Count(workers=workers, **common)
-
-
 def named(*names: str, **common: Any) -> Named:
-    """Workers of these names or addresses, also those that join later; `common` as in `Rule`."""
-    return Named(names=tuple(map(str, names)), **common)
-
-
-def rest(*, minimum: int = 0, **common: Any) -> Rest:
-    """Every worker that no earlier rule takes, perhaps none; `common` as in every `Rule`."""
-    return Rest(minimum=minimum, **common)
+    """Workers of these names or addresses, also those that join later."""
+    return Named(tuple(map(str, names)), **common)
 
 
 def divide(
@@ -200,7 +176,7 @@ def divide(
                 f"that it needs: {len(free)} of {len(pool)} are left for it. Start more, or list "
                 "it first. Workers that declare another resource are not taken."
             )
-        if isinstance(rule, PerGpu) and free and not any(worker.gpus for worker in free):
+        if isinstance(rule, per_gpu) and free and not any(worker.gpus for worker in free):
             notes[name] = NO_GPU
     return chosen, notes
 
@@ -220,7 +196,7 @@ def partition_for(
     short = [
         name
         for name in willing
-        if len(members[name]) < max(rules[name].minimum, not isinstance(rules[name], Rest))
+        if len(members[name]) < max(rules[name].minimum, not isinstance(rules[name], rest))
     ]
     by_name = [name for name in willing if isinstance(rules[name], Named)]
     return next(iter([*by_name, *short, *willing]), None)

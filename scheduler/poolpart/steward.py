@@ -38,7 +38,7 @@ from .internals import (
     wake,
 )
 from .probe import probe_worker
-from .rules import Count, Declared, PerGpu, Rest, Rule, partition_for
+from .rules import Declared, Rule, n_workers, partition_for, per_gpu, rest
 from .workers import WorkerInfo
 
 logger = logging.getLogger(__name__)
@@ -132,7 +132,7 @@ class Steward(SchedulerPlugin):
 
     def remainder(self) -> str | None:
         """Partition that has the rest, if there is one."""
-        return next((name for name, rule in self.rules.items() if isinstance(rule, Rest)), None)
+        return next((name for name, rule in self.rules.items() if isinstance(rule, rest)), None)
 
     def wanted(self, seat: Seat) -> Resources:
         """Resources that a worker should declare: its own, and its partition's."""
@@ -155,7 +155,7 @@ class Steward(SchedulerPlugin):
         """Add a partition, or change its rule. The one that has the rest stays last."""
         self._names.add(name)
         rules = {**self.rules, name: rule}.items()
-        self.rules = dict(sorted(rules, key=lambda item: isinstance(item[1], Rest)))
+        self.rules = dict(sorted(rules, key=lambda item: isinstance(item[1], rest)))
 
     def adopt(self, name: str) -> None:
         """Add a partition whose workers declare it by themselves.
@@ -179,7 +179,7 @@ class Steward(SchedulerPlugin):
 
     def resize(self, name: str | None, change: int) -> None:
         """Change the number of workers of a rule, if it has one."""
-        if name in self.rules and isinstance(rule := self.rules[name], Count):
+        if name in self.rules and isinstance(rule := self.rules[name], n_workers):
             workers = rule.workers + change
             self.rules[name] = replace(rule, workers=workers, minimum=min(rule.minimum, workers))
 
@@ -270,7 +270,7 @@ class Steward(SchedulerPlugin):
         return name is not None
 
     async def _ask_for_gpus(self, seat: Seat) -> None:
-        if not any(isinstance(rule, PerGpu) for rule in self.rules.values()):
+        if not any(isinstance(rule, per_gpu) for rule in self.rules.values()):
             return
         try:
             facts = await call(self.scheduler, seat.info.address, probe_worker)

@@ -1,6 +1,7 @@
 """Pools on clusters: what they find, how they are divided, what they refuse."""
 
 import logging
+import math
 
 import pytest
 from distributed import Client, LocalCluster
@@ -160,6 +161,14 @@ def test_slots_that_are_missing_are_named_with_their_purpose(start):
         pool.require({"IO": 4}, {"IO": "four stages"})
     with pytest.raises(PoolError, match="'GPU' has 0 of the 1 slots needed: start workers"):
         pool.require({"GPU": 1}, {"IO": "four stages"})
+
+
+@pytest.mark.parametrize("slots", [0.5, -1, math.inf])
+def test_slots_that_are_no_whole_number(start, slots):
+    pool = Pool.from_client(start({"w": {"resources": {"GPU": slots}}}))
+    pool.require({"IO": 0})
+    with pytest.raises(PoolError, match=f"Worker w declares GPU={slots:g}: give it a whole number"):
+        pool.require({"GPU": 0})
 
 
 def test_a_worker_in_two_partitions(start):
