@@ -18,7 +18,14 @@ from .fence import fences_of
 from .internals import depth_of, link_from_dashboard, serve, serve_no_longer
 from .pipe import pipes_of
 from .stats import NAME as STATISTICS
-from .stats import forget_statistics, running_on, slots_of, statistics_of, told
+from .stats import (
+    StageStats,
+    forget_statistics,
+    running_on,
+    slots_of,
+    statistics_of,
+    stats_of,
+)
 from .steward import NAME as STEWARD
 from .workers import on_scheduler
 
@@ -42,7 +49,7 @@ th:first-child, td:first-child { text-align: left; }
 </style>
 """
 
-_COUNTS = ("waiting", "queued", "running", "done", "failed")
+_COUNTS = ("waiting", "queued", "running", "done", "failed", "seconds")
 
 
 def page_of(scheduler: Any) -> str:
@@ -51,30 +58,22 @@ def page_of(scheduler: Any) -> str:
     workers = list(scheduler.workers.values())
     names = {name for worker in workers for name, slots in worker.resources.items() if slots}
     names |= fences_of(scheduler) | {name for name, _ in statistics.tallies if name}
-    partitions = told([*sorted(names), ""], scheduler)
+    partitions = stats_of([*sorted(names), ""], scheduler)
     stages = [
-        [
-            stage,
-            _shown(p["name"]),
-            *(counts[count] for count in _COUNTS),
-            f"{counts['seconds']:.1f}",
-        ]
+        [stage, _shown(p.name), *_counts(counts)]
         for p in partitions
-        for stage, counts in p["stages"].items()
+        for stage, counts in p.stages.items()
     ]
+    rows = [
+        [f"{_shown(p.name)}{' (exclusive)' * p.exclusive}", p.workers, p.slots, p.busy, *_counts(p)]
+        for p in partitions
+    ]
+    given = ["", "partition", "slots", "busy", "tasks given", "status", "address"]
     sections = [
         _HEAD,
-        _table(
-            "Partitions",
-            ["", "workers", "slots", "busy", *_COUNTS, "seconds"],
-            [_partition(p) for p in partitions],
-        ),
-        _table("Stages", ["", "partition", *_COUNTS, "seconds"], stages),
-        _table(
-            "Workers",
-            ["", "partition", "slots", "busy", "tasks given", "status", "address"],
-            [_worker(worker) for worker in workers],
-        ),
+        _table("Partitions", ["", "workers", "slots", "busy", *_COUNTS], rows),
+        _table("Stages", ["", "partition", *_COUNTS], stages),
+        _table("Workers", given, [_worker(worker) for worker in workers]),
         _table("Pipes", ["", "depth", "state"], _pipes(scheduler)),
     ]
     return "".join(sections)
@@ -97,12 +96,8 @@ def _shown(partition: str) -> str:
     return partition or "remainder"
 
 
-def _partition(p: dict[str, Any]) -> list[object]:
-    stages = p["stages"].values()
-    sums = [sum(counts[count] for counts in stages) for count in _COUNTS]
-    name = _shown(p["name"]) + (" (exclusive)" if p["exclusive"] else "")
-    seconds = sum(counts["seconds"] for counts in stages)
-    return [name, p["workers"], p["slots"], p["busy"], *sums, f"{seconds:.1f}"]
+def _counts(stats: StageStats) -> list[object]:
+    return [*(getattr(stats, count) for count in _COUNTS[:-1]), f"{stats.seconds:.1f}"]
 
 
 def _worker(worker: Any) -> list[object]:

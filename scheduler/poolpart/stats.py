@@ -12,7 +12,7 @@ from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import islice
-from typing import Any
+from typing import Any, cast
 
 from distributed import Client
 from distributed.diagnostics.plugin import SchedulerPlugin
@@ -170,13 +170,8 @@ def partition_stats(client: Client, name: str) -> PartitionStats:
     PoolError
         If the scheduler lacks this package.
     """
-    [found] = on_scheduler(client, told, names=[name])
-    stages = {stage: StageStats(**counts) for stage, counts in found.pop("stages").items()}
-    sums = {
-        count: sum(getattr(stage, count) for stage in stages.values())
-        for count in StageStats.__dataclass_fields__
-    }
-    return PartitionStats(**found, **sums, stages=stages)
+    [found] = on_scheduler(client, stats_of, names=[name])
+    return cast(PartitionStats, found)
 
 
 def statistics_of(scheduler: Any) -> Statistics:
@@ -194,8 +189,8 @@ def forget_statistics(scheduler: Any) -> None:
         scheduler.remove_plugin(NAME)
 
 
-def told(names: Sequence[str], dask_scheduler: Any = None) -> list[dict[str, Any]]:
-    """Statistics of partitions as plain values; runs on the scheduler."""
+def stats_of(names: Sequence[str], dask_scheduler: Any = None) -> list[PartitionStats]:
+    """Statistics of partitions; runs on the scheduler."""
     scheduler = dask_scheduler
     statistics = statistics_of(scheduler)
     under_way: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)
@@ -214,20 +209,25 @@ def told(names: Sequence[str], dask_scheduler: Any = None) -> list[dict[str, Any
             if partition == name:
                 now, ended = under_way[place], statistics.tallies.get(place, Tally())
                 runs = min(running[stage], now["given"])
-                stages[stage] = {
-                    "waiting": now["waiting"],
-                    "queued": now["queued"] + now["given"] - runs,
-                    "running": runs,
+                stages[stage] = StageStats(
+                    waiting=now["waiting"],
+                    queued=now["queued"] + now["given"] - runs,
+                    running=runs,
                     **asdict(ended),
-                }
+                )
+        sums = {
+            count: sum(getattr(stage, count) for stage in stages.values())
+            for count in StageStats.__dataclass_fields__
+        }
         answers.append(
-            {
-                "name": name,
-                "workers": len(workers),
-                "slots": sum(slots_of(worker, name) for worker in workers),
-                "busy": sum(held for _, held in by_worker),
-                "exclusive": name in fences_of(scheduler),
-                "stages": stages,
-            }
+            PartitionStats(
+                name=name,
+                workers=len(workers),
+                slots=sum(slots_of(worker, name) for worker in workers),
+                busy=sum(held for _, held in by_worker),
+                exclusive=name in fences_of(scheduler),
+                stages=stages,
+                **sums,
+            )
         )
     return answers
