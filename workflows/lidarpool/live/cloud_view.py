@@ -47,9 +47,8 @@ class _Near:
     search: Search | None = None
     cloud: Cloud | None = None  # with what is outside the picture; None: as for everybody
     size: float = 1.0  # of the points, as a share of that for everybody
-    version: int = 0
     node: Any = None
-    drawn: Hashable = None
+    drawn: Hashable = None  # its inputs
 
 
 class CloudView:
@@ -209,8 +208,8 @@ class CloudView:
             self._node = self._draw(self._page.scene, self._node, self._base(), cut, size)
         for client, near in self._near.items():
             handle = self._page.get_clients().get(client)
-            if handle is not None and near.drawn != (near.version, state):
-                near.drawn = (near.version, state)
+            if handle is not None and near.drawn != state:
+                near.drawn = state
                 if near.cloud is not None:
                     # A node for one browser hides the common node of the same name.
                     sizes = near.size * size
@@ -341,7 +340,7 @@ class CloudView:
             shares = even_shares(counts, most)
             near.search = self.blocks.search(self.filter, most, near.eye, shares)
         elif near.cloud is not None:
-            near.cloud, near.version = None, near.version + 1
+            near.cloud = near.drawn = None
 
     def _keep_near(self, near: _Near, found: Cloud) -> None:
         """Show a browser the points found, and the common points outside its picture."""
@@ -352,7 +351,7 @@ class CloudView:
             size = _POINT_FROM_NEAR * float(np.percentile(away, 20)) / self._point_m()
             near.size = float(np.clip(size, _SMALLEST, 1.0))
         near.cloud = Cloud.joined([base.part(np.flatnonzero(~seen)), found])
-        near.version += 1
+        near.drawn = None
 
     @property
     def facts(self) -> list[str]:

@@ -94,11 +94,7 @@ def result_page(
     port: int = PORT,
     browser: bool = True,
 ) -> Iterator[None]:
-    """Serve the page of a result while the body runs, and print its address.
-
-    `port` is where to listen, or the next that is free; 0 for any. `browser` tells whether to open
-    one where there is a desktop.
-    """
+    """Serve the page of a result while the body runs; see `live_page` and `announced`."""
     with live_page(title, port) as page:
         view = ResultView(page, file, pictured, note)
         ends = "" if cell_display() else "; Ctrl-C ends it"

@@ -240,11 +240,7 @@ def _bar(label: str, done: int, whole: int) -> str:
 
 @contextmanager
 def live_run(job: Job, *, port: int = PORT, browser: bool = True) -> Iterator[LiveRun]:
-    """Serve the live page of a run while the body runs, and print its address.
-
-    `port` is where to listen, or the next that is free; 0 for any. `browser` tells whether to open
-    one where there is a desktop.
-    """
+    """Serve the live page of a run while the body runs; see `live_page` and `announced`."""
     with live_page("lidarpool", port) as page:
         live = LiveRun(page, job)
         with (

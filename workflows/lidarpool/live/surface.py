@@ -186,11 +186,6 @@ class MeshNode:
         while len(self._nodes) > count:
             self._nodes.pop(0).remove()
 
-    def set_visible(self, visible: bool) -> None:
-        """Show it, or not."""
-        for node in self._nodes:
-            node.visible = visible
-
 
 def coloured_mesh(corners: NDArray[np.float32], colours: NDArray[np.uint8]) -> bytes:
     """Write triangles (f, 3, 3), each of one colour, (f, 3) as on a screen, as binary glTF."""

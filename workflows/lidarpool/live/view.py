@@ -197,10 +197,10 @@ class View:
             self._look_around(self._surfaces[None])
         colour, only = self._scene_colour.value, self.cloud.filter.of("object")
         seen = version if colour == "hits" else 0
-        if colour != HIDDEN and self._changed("scene", seen, self.cut, colour, only):
+        if self._changed("scene", seen, self.cut, colour, only):
             rows = within(self._scene.face_object, only)
             corners, colours, legend = NO_TRIANGLES, np.zeros((0, 3), np.uint8), ""
-            if rows.any():
+            if colour != HIDDEN and rows.any():
                 counts, places = np.zeros(0), NO_TRIANGLES[:, 0]
                 if colour == "hits":
                     counts, places = hits()[rows], self._on_scene(cloud, only)
@@ -211,9 +211,6 @@ class View:
             self._scene_legend.content = legend
             self._mesh.show(corners, colours[kept])
             self._colour_actors(colour == "object")
-        if self._changed("scene shown", colour == HIDDEN):
-            self._mesh.set_visible(colour != HIDDEN)
-            self._scene_legend.visible = colour != HIDDEN
 
     def _surface(self, only: Limits, rows: NDArray[np.bool_]) -> Surface:
         """Surface of the objects within these limits, whose triangles are these (f,)."""
