@@ -18,12 +18,12 @@ from lidarpool.columns.table import CHANNEL, OBJECT, SCAN
 from lidarpool.export.cloud_file import CloudFile
 from lidarpool.export.ply_format import header, row_type
 from lidarpool.live.cloud_view import HIDDEN
-from lidarpool.live.hits import hit_grid
 from lidarpool.live.looking import Filter
 from lidarpool.live.page import live_page
 from lidarpool.live.result_page import ResultView, view_result
 from lidarpool.live.surface import Surface, coloured_mesh, colours_for
 from lidarpool.plan import Plan
+from lidarpool.render.hits import hit_colours
 from lidarpool.run.picture_file import PICTURE_FILE, Pictured, SensorWay
 from lidarpool.scene.actors import Actor, box
 from lidarpool.scene.mesh import Mesh
@@ -288,13 +288,13 @@ def test_damaged_pictures_are_noted_and_the_cloud_is_shown(cloud, capsys, monkey
 
 def test_triangles_come_back_from_their_file_in_their_colours():
     corners = np.random.default_rng(0).random((7, 3, 3)).astype(np.float32)
-    colours = np.arange(21, dtype=np.uint8).reshape(7, 3) * 12
+    colours = np.arange(63, dtype=np.uint8).reshape(7, 3, 3) * 4
     data = coloured_mesh(corners, colours)
     mesh = trimesh.load(io.BytesIO(data), file_type="glb", process=False).to_mesh()
     assert np.array_equal(mesh.vertices[mesh.faces].astype(np.float32), corners)
     linear = np.frombuffer(data[-4 * 21 :], np.uint8).reshape(7, 3, 4)[:, :, :3] / 255
     screen = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    assert np.allclose(255 * screen, colours[:, None], atol=7)  # dark ones are coarse, linear
+    assert np.allclose(255 * screen, colours, atol=7)  # dark ones are coarse, linear
 
 
 def test_many_triangles_become_few_that_keep_shape_and_hits():
@@ -309,7 +309,7 @@ def test_many_triangles_become_few_that_keep_shape_and_hits():
     middles = corners.mean(axis=1)
     low, high = scene.object_bounds[0]
     there = ((middles > low - 1) & (middles < high + 1)).all(axis=1)
-    vivid = np.ptp(colours.astype(int), axis=1) > 40
+    vivid = (np.ptp(colours.astype(int), axis=2) > 40).any(axis=1)
     assert vivid[there].mean() > 0.9
     assert not vivid[~there].any()
     assert "hits per square metre" in legend
@@ -323,16 +323,18 @@ def test_hits_of_a_wall_of_two_triangles_are_told_apart_on_a_grid():
     random = np.random.default_rng(0)
     points = random.uniform((0, 0, 0), (4, 0, 4), (800, 3)).astype(np.float32)  # every other hit
     corners = scene.vertices[scene.faces].astype(np.float32)
-    pieces, hit, density = hit_grid(scene, corners, np.array([800.0, 800.0]), points, 5000)
-    middle = pieces.mean(axis=1)
+    hits = np.array([800.0, 800.0])
+    pieces, _, colours, limits = hit_colours(scene, corners, hits, points, 5000)
     sides = pieces[:, 1:] - pieces[:, :1]
     areas = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) / 2
     assert areas.sum() == pytest.approx(32, rel=1e-4)
-    assert np.median(density[middle[:, 0] < 3.5]) == pytest.approx(100, rel=0.2)
-    assert not hit[middle[:, 0] > 5.5].any()
-    assert len(hit_grid(scene, corners, np.array([800.0, 0.0]), points, 3)[0]) <= 3
-    untouched, hit, density = hit_grid(scene, corners, np.zeros(2), points, 5000)
-    assert (len(untouched), hit.any(), density.any()) == (2, False, False)
+    assert limits[0] < 100 < limits[1] < 300
+    vivid = np.ptp(colours, axis=2) > 0.2
+    assert vivid[pieces[..., 0] < 3.5].all()
+    assert not vivid[pieces[..., 0] > 5.5].any()
+    assert len(hit_colours(scene, corners, np.array([800.0, 0.0]), points, 3)[0]) <= 3
+    untouched, _, colours, _ = hit_colours(scene, corners, np.zeros(2), points, 5000)
+    assert len(untouched) == 2 and (np.ptp(colours, axis=2) < 0.1).all()
 
 
 def test_what_touches_does_not_show_through():

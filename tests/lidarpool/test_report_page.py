@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -32,7 +31,7 @@ from poolpart import TaskRecord
 EVIL = (
     "\"'><script>alert(1)</script><img src=//evil.test/x onerror=y>&amp;{{ 7*7 }}\u202e\x00\udc80"
 )
-PICTURES = ["scene.png", "intensity.png", "cloud.png", "path.png"]
+PICTURES = ["scene", "intensity", "cloud", "path"]
 SCENARIO = Scenario.from_data({"steps": 35}, source="surveys/hall.yaml")
 PLANNING = Planning((0, 0), (10, 0), [(5, 0)], 2.0, trials=3, particles=20, iterations=30)
 RING = [(10 + 3 * np.cos(a), 3 * np.sin(a)) for a in np.arange(0, 6.28, 0.5)]
@@ -126,28 +125,26 @@ def write(tmp_path: Path) -> Callable[..., tuple[str, dict[str, Any]]]:
             }
             | changes
         )
-        pictures = PICTURES if plan else PICTURES[:3]
-        for name in pictures:
-            (tmp_path / name).write_bytes(f"picture {name}".encode())
-        files = [*pictures, "report.html", "report.json"]
+        drawn = PICTURES if plan else PICTURES[:3]
+        pictures = {name: f'<svg id="{name}"></svg>' for name in drawn}
+        files = [*(f"{name}.png" for name in drawn), "report.html", "report.json"]
         cloud = counted(result.points, len(scene.names))
         report = make_report(result, files, cloud)
-        write_page(tmp_path / "report.html", report, result, cloud, scenario)
+        write_page(tmp_path / "report.html", report, result, cloud, pictures, scenario)
         return (tmp_path / "report.html").read_text(encoding="utf-8"), report
 
     return write
 
 
-def test_the_page_refers_to_nothing_outside_and_has_its_pictures_within(write, tmp_path):
+def test_the_page_refers_to_nothing_outside_and_has_its_pictures_within(write):
     text, _ = write()
     page = html.fromstring(text)
     assert not page.xpath("//script | //link | //iframe | //object | //embed | //base")
     assert not page.xpath("//@href | //@srcset | //@action | //@poster | //@data")
     assert not re.search(r"url\(|@import|https?://|\son\w+=", text)
     assert "default-src 'none'" in page.xpath("//meta[@http-equiv]/@content")[0]
-    data = [base64.b64decode(uri.removeprefix("data:image/png;base64,"), validate=True)
-            for uri in page.xpath("//@src")]  # fmt: skip
-    assert data == [(tmp_path / name).read_bytes() for name in PICTURES]
+    assert not page.xpath("//@src")
+    assert page.xpath("//figure/svg/@id") == PICTURES
 
 
 def test_names_are_words_and_never_markup(write):
@@ -259,7 +256,7 @@ def test_what_is_unusual_is_told(write, changes, words):
 
 def test_without_planning(write):
     text, _ = write(plan=None, tasks=[task for task in records() if task.stage != TRIAL])
-    assert "The path" not in text and "swarm" not in text and text.count("<img") == 3
+    assert "The path" not in text and "swarm" not in text and text.count("<figure>") == 3
 
 
 def test_a_path_far_from_zero_is_told_in_world_coordinates(write):

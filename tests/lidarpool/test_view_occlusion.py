@@ -75,7 +75,7 @@ def test_points_behind_a_box_are_hidden_and_before_it_seen(row, shot):
 
 def drawn(shot, points):
     """Whether points, each by itself, leave something in the picture."""
-    blank = np.ones((*SIZE[::-1], 3), np.float32)
+    blank = np.ones((*SIZE[::-1], 4), np.float32)
     return np.array(
         [(with_points(blank, shot, p[None], np.zeros((1, 3))) < 1).any() for p in points]
     )

@@ -248,14 +248,22 @@ def run_lidarpool(
     logging.disable(logging.NOTSET)
 
 
+class BlankPage:
+    """Stands for a drawn picture."""
+
+    def save(self, path: Path) -> None:
+        path.write_bytes(b"x")
+
+    def svg(self) -> str:
+        return "<svg></svg>"
+
+
 @pytest.fixture
 def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave the drawing out, which takes longer than a small survey."""
     monkeypatch.setattr(lidarpool.report.pictures, "take_shot", lambda *_, **__: None)
     for name in ("draw_scene", "draw_intensity", "draw_cloud", "draw_path"):
-        monkeypatch.setattr(
-            lidarpool.report.pictures, name, lambda path, *_, **__: path.write_bytes(b"x")
-        )
+        monkeypatch.setattr(lidarpool.report.pictures, name, lambda *_, **__: BlankPage())
 
 
 @pytest.fixture

@@ -45,8 +45,12 @@ from lidarpool.scan.driver import SurveyDriver
 from lidarpool.base.tracing import trace_to
 
 pictures.take_shot = lambda *_, **__: None
-def draw(path, *_, **__): path.write_bytes(b"x")
-pictures.draw_scene = pictures.draw_intensity = pictures.draw_cloud = pictures.draw_path = draw
+class BlankPage:
+    def __init__(self, *_, **__): pass
+    def save(self, path): path.write_bytes(b"x")
+    def svg(self): return "<svg></svg>"
+pictures.draw_scene = pictures.draw_intensity = BlankPage
+pictures.draw_cloud = pictures.draw_path = BlankPage
 SurveyDriver._wished_scans = lambda *_: 10
 
 def drive(point, times):

@@ -12,19 +12,18 @@ from trimesh.exchange.gltf import export_glb
 
 from ..base.open3d_module import load_open3d
 from ..columns.table import OBJECT
-from ..render.colouring import TURBO, colours_of
-from ..render.intensity import density_colours, density_range
+from ..render.colouring import colours_of
+from ..render.hits import hit_colours
+from ..render.surface import apart
 from ..render.theme import UNSEEN, mapped, rgb
 from ..scene.scene import Scene
 from .colouring import as_bytes, colour_bar, legend_of
-from .hits import hit_grid
 from .page import LivePage
 
 MOST_TRIANGLES = 100_000  # 60 bytes each, whenever their colours have changed
 MOST_PIECES = 60_000  # that large ones are divided into, where hits are shown
 TITLE = "hits per square metre; grey: none"
 _INWARDS = 1e-4  # of the scene's diagonal
-_DEPTHS = 5  # of objects that are neighbours: walls that cross have sides in one plane
 _MOST_INWARDS_OF = 200.0  # metres: some centimetres are enough for any scene
 _GREYS = np.linspace(0.1, 1.0, 256)
 SWAP_S = 1.5  # a browser needs a moment to load a mesh
@@ -44,9 +43,8 @@ class Surface:
     """A scene's triangles, or a simplified mesh of at most so many, in the chosen colours.
 
     Vertices in the same cell of a grid are merged (Rossignac and Borrel, 1993), and hits go to the
-    nearest remaining triangle. Each triangle is moved inwards a little, so that touching objects,
-    such as the top of a wall and a ceiling, do not show through each other. `reflectance` is the
-    share of the light that each object reflects, (objects,), if it is known.
+    nearest remaining triangle. `reflectance` is the share of the light that each object reflects,
+    (objects,), if it is known.
     """
 
     def __init__(
@@ -61,18 +59,14 @@ class Surface:
         if len(scene.faces) > most:
             self.coarse, self._nearest = _simplified(scene, most)
             self._objects = scene.face_object[_nearest(scene, self.coarse)]
-        corners = self.coarse.vertices[self.coarse.faces].astype(np.float32)  # (f, 3, 3)
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-        normals = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0)
         size = float(np.linalg.norm(np.ptp(scene.bounds, axis=0)))
-        depth = _INWARDS * min(size, _MOST_INWARDS_OF) * (1 + self._objects % _DEPTHS / 2)
-        self.corners = corners - (depth[:, None] * normals)[:, None].astype(np.float32)
+        moved = apart(self.coarse, self._objects, _INWARDS * min(size, _MOST_INWARDS_OF))
+        self.corners = moved.vertices[moved.faces].astype(np.float32)  # (f, 3, 3)
 
     def coloured(
         self, by: str, hit_counts: NDArray[Any], points: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], NDArray[np.uint8], str]:
-        """Triangles (k, 3, 3), their colours (k, 3) and a legend as HTML.
+        """Triangles (k, 3, 3), colours (k, 3, 3) at their corners and a legend as HTML.
 
         `by` is one of `colours_for` the scene; "hits" needs the hits (f,) of its triangles, and
         some of the hit points, (n, 3).
@@ -89,7 +83,7 @@ class Surface:
             legend = colour_bar("reflectance", ("0", "0.5", "1"), mapped("gray", _GREYS))
         else:
             colours = np.tile(rgb(UNSEEN), (len(self.corners), 1))
-        return self.corners, as_bytes(colours), legend
+        return self.corners, as_bytes(colours).repeat(3, axis=0).reshape(-1, 3, 3), legend
 
     def _by_hits(
         self, hit_counts: NDArray[Any], points: NDArray[np.float32]
@@ -98,12 +92,11 @@ class Surface:
         if self._nearest is not None:
             hits = np.bincount(self._nearest, hits, len(self.corners)).astype(np.float64)
         most = len(self.corners) + MOST_PIECES
-        corners, hit, density = hit_grid(self.coarse, self.corners, hits, points, most)
-        low, high = density_range(density)
-        colours = density_colours(density, hit, (low, high), TURBO)
+        shown = self.coarse, self.corners
+        corners, _, colours, (low, high) = hit_colours(*shown, hits, points, most)
         middle = (low * high) ** 0.5
         marks = [f"{n:.2g}" if n < 10 else f"{n:,.0f}" for n in (low, middle, high)]
-        return corners, as_bytes(colours), colour_bar(TITLE, marks) if density.any() else ""
+        return corners, as_bytes(colours), colour_bar(TITLE, marks) if hits.any() else ""
 
 
 def colours_for(scene: Scene, reflectance: NDArray[np.float64] | None) -> tuple[str, ...]:
@@ -165,7 +158,7 @@ class MeshNode:
         self._alone_at = 0.0  # when to remove the last but one
 
     def show(self, corners: NDArray[np.float32], colours: NDArray[np.uint8]) -> None:
-        """Show triangles (f, 3, 3), each of one colour, (f, 3); nothing if there are none."""
+        """Show triangles (f, 3, 3) with colours (f, 3, 3) at their corners; or nothing."""
         self._keep(1 if len(corners) else 0)
         if not len(corners):
             return
@@ -188,12 +181,12 @@ class MeshNode:
 
 
 def coloured_mesh(corners: NDArray[np.float32], colours: NDArray[np.uint8]) -> bytes:
-    """Write triangles (f, 3, 3), each of one colour, (f, 3) as on a screen, as binary glTF."""
+    """Write triangles (f, 3, 3), with colours (f, 3, 3) of a screen at corners, as binary glTF."""
     flat = corners.reshape(-1, 3)
     mesh = trimesh.Trimesh(
         flat,
         np.arange(len(flat)).reshape(-1, 3),
-        vertex_colors=np.repeat(_LINEAR[colours], 3, axis=0),
+        vertex_colors=_LINEAR[colours].reshape(-1, 3),
         process=False,
     )
 

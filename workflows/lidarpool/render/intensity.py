@@ -61,10 +61,17 @@ def _share(faces: NDArray[np.int32], hits: Floats, area: Floats, vertices: int) 
     return np.where(area > 0, shared, hits)
 
 
-def density_range(density: Floats) -> tuple[float, float]:
-    """Choose the ends of a logarithmic scale over densities (f,), without outliers."""
-    hit = density[density > 0]
-    low, high = np.percentile(hit, [10, 99.5]) if len(hit) else (1.0, 10.0)
+def density_range(density: Floats, areas: Floats) -> tuple[float, float]:
+    """Choose the ends of a logarithmic scale over densities on areas (f,).
+
+    Few hits are on surfaces with less, and little area has more.
+    """
+    low, high = 1.0, 10.0
+    if (density * areas).any():
+        low, high = (
+            np.percentile(density, end, weights=weights, method="inverted_cdf")
+            for end, weights in ((1, density * areas), (99.5, areas * (density > 0)))
+        )
     low = max(low, high / WIDEST_RANGE)
     return float(low), float(max(high, 2 * low))
 
@@ -72,7 +79,7 @@ def density_range(density: Floats) -> tuple[float, float]:
 def density_colours(
     density: Floats, hit: NDArray[np.bool_], limits: tuple[float, float], table: Floats
 ) -> Floats:
-    """Colours (f, 3) of triangles by density and whether they were hit, both (f,).
+    """Colours (..., 3) by density and whether there were hits, both (...,).
 
     Shared hits fade out to grey; triangles that were hit themselves are never grey.
 
@@ -84,5 +91,5 @@ def density_colours(
     low, high = limits
     share = np.log(np.maximum(density, low) / low) / np.log(high / low)
     colours = table[np.clip(share * 255, 0, 255).astype(np.int64)]
-    seen = np.where(hit, 1.0, np.clip(density / low / 0.6 - 0.3, 0, 1))[:, None]
+    seen = np.where(hit, 1.0, np.clip(density / low / 0.6 - 0.3, 0, 1))[..., None]
     return np.asarray(rgb(UNSEEN) * (1 - seen) + colours * seen)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import io
 import math
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
@@ -55,7 +58,12 @@ class Page:
 
         The returned axes have the shot's pixels as coordinates.
         """
-        self.figure.figimage(np.round(255 * image).astype(np.uint8), zorder=-1)
+        opacity = image[..., 3:]
+        plain = np.divide(
+            image[..., :3], opacity, out=np.zeros_like(image[..., :3]), where=opacity > 0
+        )
+        bytes_ = np.round(255 * np.concatenate([plain, opacity], axis=2)).astype(np.uint8)
+        self.figure.figimage(bytes_, zorder=-1)
         axes = self.figure.add_axes((0, 0, 1, 1))
         axes.set_axis_off()
         axes.set(xlim=(0, self.size[0]), ylim=(self.size[1], 0))
@@ -224,7 +232,7 @@ class Page:
             axes.yaxis.set_minor_formatter(lambda value, _: "")
 
     def save(self, path: Path) -> None:
-        """Write the page as a PNG.
+        """Write the page as a PNG, in its light colours.
 
         Raises
         ------
@@ -238,6 +246,22 @@ class Page:
                 f"The picture {path} could not be written: {error.strerror or error}. "
                 "Choose a folder that exists, can be written to and has room."
             ) from error
+
+    def svg(self) -> str:
+        """Return the page as an element of HTML, whose ink may follow the style around it.
+
+        The colours of `theme.STYLED` are variables of CSS, such as --picture-ink.
+        """
+        text = io.StringIO()
+        with matplotlib.rc_context({"svg.hashsalt": "lidarpool"}):
+            self.figure.savefig(text, format="svg", dpi=DPI, metadata={"Date": None})
+        # Without what all elements of the document would share, and nobody reads.
+        svg = re.sub(r"<!--.*?-->|<style.*?</style>", "", text.getvalue(), flags=re.DOTALL)
+        svg = re.sub(r'^.*?<svg[^>]*(viewBox="[^"]*")[^>]*>', r"<svg \1>", svg, flags=re.DOTALL)
+        svg = re.sub(r' id="[a-zA-Z]+_\d+"|<metadata>.*?</metadata>', "", svg, flags=re.DOTALL)
+        for colour, name in theme.STYLED.items():
+            svg = svg.replace(colour, f"var(--picture-{name}, {colour})")
+        return svg
 
 
 def _grid(shot: Shot) -> Floats:

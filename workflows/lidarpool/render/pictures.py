@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,26 +15,21 @@ from ..columns.table import Column, Z
 from ..scene.scene import Scene
 from . import theme
 from .colouring import TURBO, colours_of
-from .intensity import density_colours, density_range, hit_density
+from .hits import hit_colours
 from .page import Page, without_common_prefix
 from .shot import Shot
 
 Floats = NDArray[np.float64]
 
 MOST_POINTS = 1_000_000  # of a cloud are drawn; a picture has a few more pixels
+MOST_HITS, MOST_PIECES = 200_000, 100_000  # to count, and to colour
 MOST_RAYS, MOST_OF_MOVING = 600, 150  # more from one trajectory would hide the surfaces
 # An object that covers this much of the ground is a floor or a hall.
 SURROUNDING = 0.6
 
 
-def draw_scene(path: Path, shot: Shot, triangles: int) -> None:
-    """Draw a scene, each object in its own colour, and the sensors; `triangles` is their number.
-
-    Raises
-    ------
-    LidarpoolError
-        If the file cannot be written; likewise for the other functions.
-    """
+def draw_scene(shot: Shot, triangles: int) -> Page:
+    """Draw a scene, each object in its own colour, and the sensors; `triangles` is their number."""
     scene = shot.scene
     colours = _object_colours(scene)
     page = Page(shot.camera.size)
@@ -50,53 +44,55 @@ def draw_scene(path: Path, shot: Shot, triangles: int) -> None:
         f"{counted(len(scene.names), 'object')} · {counted(triangles, 'triangle')} · {shot.when}",
         shot.models,
     )
-    page.save(path)
+    return page
 
 
 def draw_intensity(
-    path: Path,
     shot: Shot,
     hit_counts: NDArray[Any],
+    points: Floats,
     sample_rays: NDArray[np.floating],
     count: int,
-) -> None:
+) -> Page:
     """Draw a scene coloured by hits per square metre, with the sensors and sample rays.
 
     Parameters
     ----------
     hit_counts
         (f,) hits of each triangle that is drawn.
+    points
+        (n, 3) an evenly spaced sample of the hits, metres, local coordinates; it may lack some.
     sample_rays
         (n, 2, 3) start and end of rays, metres, local coordinates; some of those that end in the
         picture are drawn.
     count
         Number of all hits.
     """
-    density = hit_density(shot.scene, hit_counts)
-    low, high = density_range(density)
-    colours = density_colours(density, hit_counts > 0, (low, high), TURBO)
+    corners = shot.scene.vertices[shot.scene.faces].astype(np.float32)
+    some = points[:: -(-len(points) // MOST_HITS) or 1].astype(np.float32)
+    most = MOST_PIECES + len(corners)
+    pieces, owner, colours, limits = hit_colours(shot.scene, corners, hit_counts, some, most)
     page = Page(shot.camera.size)
-    axes = page.show(shot, shot.paint(colours, 0.5))
+    axes = page.show(shot, shot.divided(pieces, owner).paint(colours, 0.5))
     slack, (lowest, highest) = 1e-3 * shot.stage.size, shot.stage.bounds
     ends = sample_rays[:, 1]
     inside = (ends >= lowest - slack) & (ends <= highest + slack)
     sample_rays = sample_rays[inside.all(axis=1)]
     most = min(len(sample_rays), MOST_OF_MOVING if shot.paths else MOST_RAYS)
-    some = np.linspace(0, len(sample_rays) - 1, most).astype(int)
-    page.lines(axes, shot, sample_rays[some].astype(np.float64), 0.45, 0.5)
-    page.colour_bar(TURBO, LogNorm(low, high), "hits per square metre; grey: none")
+    rays = np.linspace(0, len(sample_rays) - 1, most).astype(int)
+    page.lines(axes, shot, sample_rays[rays].astype(np.float64), 0.45, 0.5)
+    page.colour_bar(TURBO, LogNorm(*limits), "hits per square metre; grey: none")
     page.title("Ray intensity", f"{counted(count, 'hit')} · {shot.when}", shot.models)
-    page.save(path)
+    return page
 
 
 def draw_cloud(
-    path: Path,
     shot: Shot,
     cloud: Cloud,
     count: int,
     column: Column = Z,
     names: Sequence[str] = (),
-) -> None:
+) -> Page:
     """Draw points of a cloud coloured by a column, over the scene drawn pale.
 
     Parameters
@@ -128,7 +124,7 @@ def draw_cloud(
     page.show(shot, image)
     by = "height" if column is Z else column.name.replace("_", " ")
     page.title(f"Point cloud by {by}", f"{counted(count, 'point')} · {shot.when}", shot.models)
-    page.save(path)
+    return page
 
 
 def _object_colours(scene: Scene) -> Floats:
@@ -168,7 +164,8 @@ def with_points(
     order = order[np.argsort(-distance[order])]
     pixels = pixels[order]
     light = shot.camera.look_up(shot.whole.light.reshape(shot.depth.shape), pixels, 1.0)
-    shaded = _packed(colours[order] * (0.5 + 0.5 * light)[:, None].clip(0, 1))
+    shaded = np.ones((len(order), 4), np.float32)
+    shaded[:, :3] = colours[order] * (0.5 + 0.5 * light)[:, None].clip(0, 1)
     # Discs are drawn at twice the resolution and averaged down, so that their edges are smooth.
     width, height = shot.camera.size
     radius = max(min(320 / np.sqrt(len(points) + 1), 5.2) * width / 1600, 1.5)
@@ -186,13 +183,11 @@ def with_points(
     ]
     column, row = (2 * pixels.T).astype(np.int64) + margin
     # The last of several colours for one pixel, which is nearest, stays.
-    fine.ravel()[(row * wide + column)[:, None] + disc] = shaded[:, None]
-    out = np.ascontiguousarray(inner).view(np.uint8).reshape(height, 2, width, 2, 4)[..., :3]
+    fine.ravel()[(row * wide + column)[:, None] + disc] = _packed(shaded)[:, None]
+    out = np.ascontiguousarray(inner).view(np.uint8).reshape(height, 2, width, 2, 4)
     return out.mean(axis=(1, 3), dtype=np.float32) / 255
 
 
 def _packed(colours: NDArray[np.floating]) -> NDArray[np.uint32]:
-    """Colours (..., 3) in 0 to 1 as one number each, with a byte for each part."""
-    parts = np.zeros((*colours.shape[:-1], 4), np.uint8)
-    parts[..., :3] = np.round(255 * colours)
-    return parts.view(np.uint32)[..., 0]
+    """Colours (..., 4) in 0 to 1 as one number each, with a byte for each part."""
+    return np.round(255 * colours).astype(np.uint8).view(np.uint32)[..., 0]

@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw
 
+from raybeam import RayCaster
+
 from ..base.words import counted
 from ..scene.scene import Scene
 from . import theme
@@ -17,7 +19,7 @@ from .camera import Camera, fit_camera
 from .cutaway import cast_through, plan_cutaway
 from .light import STRIDE, alike, make_light_map, plane_tolerance
 from .stage import Stage
-from .surface import Surface
+from .surface import Surface, apart, unit
 
 Floats = NDArray[np.float64]
 Reals = NDArray[np.float32]
@@ -28,6 +30,8 @@ SIZE = (1600, 1000)  # pixels of a finished picture
 FRAME = (0.08, 0.115, 0.79, 0.91)
 SKY, GROUND = -1, -2  # instead of a triangle
 STEPS = 700  # points along a line where its visibility is tested
+# Of the scene's diagonal: between objects that touch, and to the pieces of a triangle.
+_APART, _NEAR = 5e-6, 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,25 +43,34 @@ class Samples:
     position: Reals  # (n, 3) metres, NaN for the sky
     normal: Reals  # (n, 3) unit length, NaN for the sky
     light: Reals  # (n,) brightness: 1 on open ground
+    weights: Reals  # (n, 3) of the triangle's corners
 
     def among(self, which: NDArray[np.int64], count: int) -> Samples:
         """Put the samples at `which` (n,) among `count`; the others are sky."""
         whole = Samples(
             np.full(count, SKY), np.full(count, np.inf, np.float32),
             np.full((count, 3), np.nan, np.float32), np.full((count, 3), np.nan, np.float32),
-            np.ones(count, np.float32),
+            np.ones(count, np.float32), np.zeros((count, 3), np.float32),
         )  # fmt: skip
         for field in fields(self):
             getattr(whole, field.name)[which] = getattr(self, field.name)
         return whole
 
     def paint(self, face_colours: Floats, contrast: float) -> Reals:
-        """Colours (n, 3) of the samples; see `Shot.paint`."""
-        surface = self.triangle >= 0
-        shade = np.where(surface, 1 - contrast * (1 - self.light), self.light)
-        table = np.vstack([face_colours, theme.rgb(theme.GROUND), theme.rgb(theme.PAGE)])
-        shade[self.triangle == SKY] = 1
-        return table[self.triangle] * shade[:, None]  # GROUND and SKY are the last two rows
+        """Colours (n, 4) of the samples; see `Shot.paint`."""
+        image = np.zeros((len(self.triangle), 4), np.float32)
+        surface, ground = (
+            np.flatnonzero(there) for there in (self.triangle >= 0, self.triangle == GROUND)
+        )
+        colours = face_colours.astype(np.float32)[self.triangle[surface]]
+        if colours.ndim == 3:
+            colours = np.einsum("nc,nck->nk", self.weights[surface], colours)
+        image[surface, :3] = colours * (1 - contrast * (1 - self.light[surface, None]))
+        image[surface, 3] = 1
+        light = self.light[ground, None]
+        image[ground, :3] = theme.VEIL * light * theme.rgb(theme.MUTED)
+        image[ground, 3:] = 1 - light * (1 - theme.VEIL)  # shadows darken the page, too
+        return image
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,19 +100,45 @@ class Shot:
         Parameters
         ----------
         face_colours
-            (f, 3) in 0 to 1.
+            (f, 3) in 0 to 1, or (f, 3, 3) at the corners.
         contrast
             0 for flat colours, 1 for full light and shade.
 
         Returns
         -------
-        (height, width, 3) in 0 to 1
+        (height, width, 4) in 0 to 1: red, green and blue times opacity, and opacity. The page
+        shows through the ground, and where there is nothing.
         """
         image = self.whole.paint(face_colours, contrast)
         finer = self.finer.paint(face_colours, contrast)
         if len(self.edges):
-            image[self.edges] = finer.reshape(len(self.edges), -1, 3).mean(axis=1)
-        return np.clip(image, 0, 1).reshape(*self.camera.size[::-1], 3)
+            image[self.edges] = finer.reshape(len(self.edges), -1, 4).mean(axis=1)
+        return np.clip(image, 0, 1).reshape(*self.camera.size[::-1], 4)
+
+    def divided(self, pieces: Reals, owner: NDArray[np.int64]) -> Shot:
+        """Return the same shot of triangles divided into pieces (k, 3, 3), to paint these.
+
+        The first piece of each triangle has its number, and `owner` (k,) says whose each is.
+        """
+        cut, back = np.append(np.bincount(owner) > 1, [False, False]), _NEAR * self.stage.size
+        number = np.flatnonzero(cut[owner])
+        if not len(number):
+            return self
+        corners = pieces[number].reshape(-1, 3)
+        caster = RayCaster(corners, np.arange(len(corners)).reshape(-1, 3))
+
+        def find(samples: Samples) -> Samples:
+            piece, weights = samples.triangle.copy(), samples.weights.copy()
+            some = np.flatnonzero(cut[piece])
+            place = samples.position[some].astype(np.float64)
+            ahead = unit(place - self.camera.eye)
+            found = caster.cast(place - back * ahead, ahead, t_max=2 * back)
+            mine = owner[number[found.triangle]] == piece[some]
+            piece[some[mine]] = number[found.triangle[mine]]
+            weights[some] = np.stack([1 - found.u - found.v, found.u, found.v], axis=1)
+            return replace(samples, triangle=piece, weights=weights)
+
+        return replace(self, whole=find(self.whole), finer=find(self.finer))
 
     def visible(self, points: ArrayLike) -> tuple[Floats, Bools]:
         """Pixel coordinates (n, 2) of points (n, 3), local metres, and whether they can be seen."""
@@ -177,8 +216,9 @@ def take_shot(
         Ray caster, see `raybeam.RayCaster`.
     """
     sensors = np.asarray(poses, dtype=np.float64).reshape(-1, 3) - scene.origin
+    stage = _stage(scene, np.concatenate([sensors, *paths]))
+    scene = apart(scene, scene.face_object, _APART * float(np.linalg.norm(np.ptp(scene.bounds, 0))))
     everywhere = np.concatenate([sensors, *paths])
-    stage = _stage(scene, everywhere)
     surface = Surface.of(scene, backend)
     # Moving objects are on the ground, between other objects.
     camera, reach = _camera(stage, size, 48.0 if len(paths) or actors else 33.0), np.inf
@@ -202,7 +242,8 @@ def take_shot(
             position = (camera.eye + distance[:, None] * directions).astype(np.float32)
         position[triangle == SKY] = np.nan
         light = np.ones(len(pixels), np.float32)
-        return Samples(triangle, distance.astype(np.float32), position, normal, light)
+        weights = np.stack([1 - u - v, u, v], axis=1).astype(np.float32)
+        return Samples(triangle, distance.astype(np.float32), position, normal, light, weights)
 
     width, height = size
     grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)

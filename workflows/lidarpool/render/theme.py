@@ -14,6 +14,12 @@ Floats = NDArray[np.float64]
 PAGE, GROUND, LINE = "#ffffff", "#f1f3f5", "#c3cad3"
 INK, MUTED = "#1c2430", "#5d6876"
 CLAY, UNSEEN, SENSOR = "#d9dde2", "#c9ccd1", "#e0182d"
+VEIL = 0.085  # of MUTED over the page: the ground in a rendered picture
+# In pictures within a page, the page's style says what these are.
+STYLED = {
+    PAGE: "page", GROUND: "ground", LINE: "line", INK: "ink", MUTED: "muted", UNSEEN: "unseen",
+    SENSOR: "sensor",
+}  # fmt: skip
 
 # Distinct also for most colour-blind readers (after Paul Tol's "bright" and "muted" sets, 2021,
 # in an order that keeps neighbours apart).

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Collection, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..base.errors import LidarpoolError
 from ..base.interrupts import deferred_interrupts
@@ -23,10 +23,13 @@ from ..scenario.scenario import Scenario
 from .cloud_numbers import CountedCloud
 from .report import make_report
 
+if TYPE_CHECKING:
+    from ..render.page import Page
+
 ROOM_BYTES = 32 << 20  # room for pictures and report
 
 CLOUD, PAGE, REPORT = "cloud.ply", "report.html", LAST_FILE
-_OF_CLOUD = "cloud.png"  # is drawn from the cloud's file
+_OF_CLOUD = ("intensity", "cloud")  # are drawn from the cloud's file
 _IMAGES = tuple(f"{name}.png" for name in PICTURES)
 FILES = (CLOUD, *_IMAGES, PICTURE_FILE, SWEEPS_FILE, PAGE, REPORT)
 _SURVEY = ("scene", "survey")  # what tells one from another
@@ -88,7 +91,8 @@ def write_result(
     staged = staging(folder)
     scene, survey = result.scene, result.survey
     counted = CountedCloud(result.points, len(scene.all_names))
-    makers: dict[str, Callable[[Path], object]] = {}
+    makers: dict[str, Callable[[], Page]] = {}
+    drawn: dict[str, Future[str]] = {}
     # Pictures are drawn while the cloud is written, which keeps one core busy.
     beside = ThreadPoolExecutor(1, "pictures")
     if not only_cloud:
@@ -98,16 +102,19 @@ def write_result(
 
         shown = Pictured.of(result)
         # The cloud is drawn from its file, as by `lidarpool plot`, so that both draw the same.
-        pictures = picture_makers(shown, staged / CLOUD)
-        makers = {f"{name}.png": draw for name, draw in pictures.items()} | {
-            PICTURE_FILE: shown.save
-        }
+        makers = picture_makers(shown, staged / CLOUD)
     exported = [one.file for one in formats]
-    shown_on = [] if only_cloud else [PAGE]
-    files = [CLOUD, *exported, *makers, SWEEPS_FILE, *shown_on, REPORT]
+    pictures = [] if only_cloud else [*(f"{name}.png" for name in makers), PICTURE_FILE]
+    files = [CLOUD, *exported, *pictures, SWEEPS_FILE, *([] if only_cloud else [PAGE]), REPORT]
+
+    def draw(name: str) -> str:
+        page = makers[name]()
+        page.save(staged / f"{name}.png")
+        return page.svg()
+
     try:
         staged.mkdir()
-        drawn = [beside.submit(make, staged / n) for n, make in makers.items() if n != _OF_CLOUD]
+        drawn |= {name: beside.submit(draw, name) for name in makers if name not in _OF_CLOUD}
         save_cloud(staged / CLOUD, counted, precision_m=survey.precision_m)
         sweeps = Sweeps.of(survey, scene)
         sweeps.save(staged / SWEEPS_FILE)
@@ -116,10 +123,10 @@ def write_result(
         report = make_report(result, files, counted)
         report["notes"] += [note for one in formats for note in one.notes(result.points)]
         if not only_cloud:
-            drawn.append(beside.submit(makers[_OF_CLOUD], staged / _OF_CLOUD))
-            for each in drawn:
-                each.result()
-            write_page(staged / PAGE, report, result, counted, scenario)
+            drawn |= {name: beside.submit(draw, name) for name in _OF_CLOUD}
+            shown.save(staged / PICTURE_FILE)
+            images = {name: drawn[name].result() for name in makers}
+            write_page(staged / PAGE, report, result, counted, images, scenario)
         text = json.dumps(report, indent=1, allow_nan=False) + "\n"
         (staged / REPORT).write_text(text, encoding="utf-8")
         for name in files:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -29,13 +28,12 @@ PATH_COLOUR, TRIAL_COLOUR = "#d6336c", "#5b8fd0"
 
 
 def draw_path(
-    path: Path,
     planning: Planning,
     plan: Plan,
     trials: Sequence[Floats],
     origin: Floats,
     size: tuple[int, int],
-) -> None:
+) -> Page:
     """Draw a plan from above: obstacles, ends, the trials' paths faint and the best one bold.
 
     Parameters
@@ -46,11 +44,6 @@ def draw_path(
         x and y of the local origin: the axes have world coordinates, local + origin.
     size
         Width and height in pixels.
-
-    Raises
-    ------
-    LidarpoolError
-        If the file cannot be written.
     """
     page = Page(size)
     unit = page.unit
@@ -83,7 +76,7 @@ def draw_path(
         )  # fmt: skip
     page.key(key, 7.4)
     page.title("Planned path", _verdict(plan, every))
-    page.save(path)
+    return page
 
 
 def _verdict(plan: Plan, trials: Sequence[Floats]) -> str:

@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 from ..base.errors import LidarpoolError
 from ..base.vocabulary import PICTURES
 from ..base.words import did_you_mean
+from ..columns.cloud import Cloud
 from ..columns.table import Z
 from ..export.cloud_file import CloudFile
 from ..render.closeup import CUT, around_ways, cut_out, floor_and_roof
+from ..render.page import Page
 from ..render.pictures import MOST_POINTS, draw_cloud, draw_intensity, draw_scene
 from ..render.shot import SIZE, Shot, take_shot
 from ..run.picture_file import Pictured, ways_of
@@ -63,14 +65,14 @@ def draw_pictures(
         ) from error
     for name in only or makers:
         path = Path(folder) / f"{name}.png"
-        makers[name](path)
+        makers[name]().save(path)
         yield path
 
 
 def picture_makers(
     shown: Pictured, cloud: Path, size: tuple[int, int] = SIZE, colour: str = Z.name
-) -> dict[str, Callable[[Path], object]]:
-    """Return functions that draw pictures to a file, all from the same viewpoint.
+) -> dict[str, Callable[[], Page]]:
+    """Return functions that draw pictures, all from the same viewpoint.
 
     Without planning there is no picture of the path.
 
@@ -122,12 +124,18 @@ def picture_makers(
             size=size,
         )
 
-    def draw_hits(path: Path) -> None:
+    @cache
+    def points() -> tuple[Cloud, int]:
+        return CloudFile(cloud, shown.own).choose(MOST_POINTS)
+
+    def draw_hits() -> Page:
         _, parents, shares, _ = part()
         hits = int(shown.hit_counts.sum())
-        draw_intensity(path, shot(), shown.hit_counts[parents] * shares, shown.sample_rays, hits)
+        counts = shown.hit_counts[parents] * shares
+        places = points()[0].positions - shown.scene.origin
+        return draw_intensity(shot(), counts, places, shown.sample_rays, hits)
 
-    def draw_points(path: Path) -> None:
+    def draw_points() -> Page:
         file = CloudFile(cloud, shown.own)
         columns = {name: c for c in (Z, *file.table) for name in (c.name, c.in_files)}
         if colour not in columns:
@@ -137,16 +145,16 @@ def picture_makers(
                 + (did_you_mean(colour, columns) or f" There are {', '.join(there)}.")
             )
         column = columns[colour]
-        draw_cloud(path, shot(), *file.choose(MOST_POINTS), column, shown.names_of(column))
+        return draw_cloud(shot(), *points(), column, shown.names_of(column))
 
-    makers: dict[str, Callable[[Path], object]] = {
-        "scene": lambda path: draw_scene(path, shot(), shown.scene.triangles),
+    makers: dict[str, Callable[[], Page]] = {
+        "scene": lambda: draw_scene(shot(), shown.scene.triangles),
         "intensity": draw_hits,
         "cloud": draw_points,
     }
     planning, plan = shown.planning, shown.plan
     if planning is not None and plan is not None:
-        makers["path"] = lambda path: draw_path(
-            path, planning, plan, shown.trials, shown.scene.origin[:2], size
+        makers["path"] = lambda: draw_path(
+            planning, plan, shown.trials, shown.scene.origin[:2], size
         )
     return makers

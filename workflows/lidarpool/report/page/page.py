@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import math
 from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
@@ -48,9 +47,9 @@ class Fact(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """A picture within the page."""
+    """A picture within the page: an element of HTML."""
 
-    uri: str
+    image: Markup
     caption: str
 
 
@@ -69,6 +68,7 @@ def write_page(
     report: Report,
     result: RunResult,
     cloud: CountedCloud,
+    pictures: Mapping[str, str],
     scenario: Scenario | None = None,
 ) -> None:
     """Write a report as one HTML file that needs no other files and no network.
@@ -76,11 +76,13 @@ def write_page(
     Parameters
     ----------
     path
-        The file; pictures and cloud of the result are in its folder.
+        The file.
     report
         From `make_report`; most numbers of the page come from it.
     result, cloud
         The result, and the statistics of its cloud.
+    pictures
+        Pictures of the result by name, each an SVG element.
     scenario
         The scenario of the run, if there is one.
 
@@ -99,7 +101,7 @@ def write_page(
         begun=f"{datetime.fromtimestamp(begun, UTC):%Y-%m-%d %H:%M UTC}" if ordered else "",
         summary=_summary(report),
         facts=list(_facts(report)),
-        pictures=list(_pictures(report, path.parent)),
+        pictures=list(_pictures(report, pictures)),
         stages=ordered,
         names=STAGES,
         timeline=make_timeline(ordered, result.records, STAGES),
@@ -204,8 +206,8 @@ def _facts(report: Report) -> Iterator[Fact]:
     yield Fact(f"{wrong:,}", "tasks outside their partition", bad=wrong > 0)
 
 
-def _pictures(report: Report, folder: Path) -> Iterator[Picture]:
-    """Return the pictures of the result."""
+def _pictures(report: Report, images: Mapping[str, str]) -> Iterator[Picture]:
+    """Return the pictures of the result, with captions."""
     parameters = report["parameters"]
     objects = counted(parameters["objects"], "object")
     poses = counted(parameters["poses"], "sensor position")
@@ -217,14 +219,13 @@ def _pictures(report: Report, folder: Path) -> Iterator[Picture]:
     every = parameters["keep_every"]
     kept = "one for each hit" if every == 1 else f"one for every {every:,} hits of a scan"
     captions = {
-        "scene.png": f"The scene: {objects} of {counted(parameters['triangles'], 'triangle')}, "
+        "scene": f"The scene: {objects} of {counted(parameters['triangles'], 'triangle')}, "
         f"{poses} in red{halfway}.",
-        "intensity.png": f"The {counted(report['hits'], 'hit')} per square metre, and some rays.",
-        "cloud.png": f"The cloud: {counted(report['points'], 'point')}, {kept}, rounded to "
+        "intensity": f"The {counted(report['hits'], 'hit')} per square metre, and some rays.",
+        "cloud": f"The cloud: {counted(report['points'], 'point')}, {kept}, rounded to "
         f"{parameters['precision_m']:g} m.",
-        "path.png": "The planned path and those of the other trials, from above.",
+        "path": "The planned path and those of the other trials, from above.",
     }
     for name, caption in captions.items():
-        if name in report["files"]:
-            data = base64.b64encode((folder / name).read_bytes()).decode()
-            yield Picture(f"data:image/png;base64,{data}", caption)
+        if name in images:
+            yield Picture(Markup(images[name]), caption)

@@ -1,0 +1,169 @@
+"""Hits per square metre on a grid, which divides large triangles with many hits."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..scene.scene import Scene
+from .colouring import TURBO
+from .intensity import density_colours, density_range, hit_density
+
+Floats = NDArray[np.float64]
+
+_LEVELS = 24  # of a grid whose cells are half as wide each time
+_ENOUGH = 12  # points in a cell of the grid
+
+
+def hit_colours(
+    scene: Scene,
+    corners: NDArray[np.float32],
+    hits: Floats,
+    points: NDArray[np.float32],
+    most: int,
+) -> tuple[NDArray[np.float32], NDArray[np.int64], Floats, tuple[float, float]]:
+    """Colour triangles by hits per square metre, large ones with many hits in pieces.
+
+    Large triangles have the density of a grid of points, the finest with enough of them around;
+    small ones share their hits, see `hit_density`.
+
+    Parameters
+    ----------
+    scene
+        Scene of the triangles.
+    corners
+        (f, 3, 3): the drawn triangles, metres.
+    hits
+        (f,): hits of each.
+    points
+        (n, 3): an evenly spaced sample of hit points; it may lack those of some places.
+    most
+        Most pieces.
+
+    Returns
+    -------
+    pieces
+        (k, 3, 3): their corners; the first of each triangle has its number.
+    owner
+        (k,): the triangle of each.
+    colours
+        (k, 3, 3) at the corners.
+    limits
+        Ends of the logarithmic scale, hits per square metre; its colours are `TURBO`.
+    """
+    whole = hit_density(scene, hits)
+    pieces, owner, areas, found = _divided(corners, hits > 0, points, most)
+    read, density = np.isfinite(found), whole[owner]
+    if found[read].any():
+        each = (density * areas)[read].sum() / (found * areas)[read].sum()
+        density[read] = each * found[read]
+    limits = density_range(density, areas)
+    density = np.repeat(density[:, None], 3, axis=1)
+    if read.any():
+        # The mean of all pieces around a corner, for smooth transitions.
+        places = np.ascontiguousarray(pieces[read]).view("V12").ravel()
+        _, corner = np.unique(places, return_inverse=True)
+        room = np.repeat(areas[read], 3)
+        means = np.bincount(corner, room * density[read].ravel()) / np.bincount(corner, room)
+        density[read] = means[corner].reshape(-1, 3)
+    # Where points were counted, none are grey; elsewhere the hits are known.
+    colours = density_colours(density, (~read & (hits[owner] > 0))[:, None], limits, TURBO)
+    return pieces, owner, colours, limits
+
+
+def _divided(
+    pieces: NDArray[np.float32],
+    hit: NDArray[np.bool_],
+    points: NDArray[np.float32],
+    most: int,
+) -> tuple[NDArray[np.float32], NDArray[np.int64], Floats, Floats]:
+    """Divide triangles that were hit (f,), for as long as there are points enough around.
+
+    Returns pieces, owners and areas, and points per square metre, NaN for whole triangles.
+    """
+    owner, areas = np.arange(len(pieces)), _areas(pieces)
+    found, busy = np.full(len(pieces), np.nan), hit & bool(len(points))
+    if not busy.any():
+        return pieces, owner, areas, found
+    low = np.minimum(points.min(axis=0), pieces.min(axis=(0, 1)))
+    width, one = float(_longest(pieces)[1].max()), np.ones(len(points))
+    for _ in range(_LEVELS):
+        there, middles = hit[owner], pieces.mean(axis=1)
+        near = _Grid(points, one, width, low).around(middles[busy])
+        room = _Grid(middles[there], areas[there], width, low).around(middles[busy])
+        # Where there are few points, this is the last time that they are counted.
+        parts = np.bincount(owner)[owner[busy]]
+        found[busy] = np.where(parts > 1, near / np.maximum(room, 1e-30), np.nan)
+        busy[busy] = near >= _ENOUGH
+        width /= 2
+        while True:
+            wide = np.flatnonzero(busy)
+            wide = wide[_longest(pieces[wide])[1] > width]
+            if not len(wide):
+                break
+            if len(pieces) + len(wide) > most:
+                return pieces, owner, areas, found
+            halves = _halved(pieces[wide])
+            pieces = np.concatenate([pieces, halves[1]])
+            pieces[wide] = halves[0]
+            areas[wide] /= 2
+            owner, areas, found, busy = (
+                np.append(values, values[wide]) for values in (owner, areas, found, busy)
+            )
+        if not busy.any():
+            break
+    return pieces, owner, areas, found
+
+
+class _Grid:
+    """Sums of weights (n,) of places (n, 3) in the cells of a grid."""
+
+    def __init__(
+        self,
+        places: NDArray[np.float32],
+        weights: Floats,
+        width: float,
+        low: NDArray[np.float32],
+    ) -> None:
+        self._width, self._low = width, low
+        cells = np.floor((places - low) / width).astype(np.int64)
+        self._keys, cells = np.unique(_keys(cells), return_inverse=True)
+        self._sums = np.bincount(cells, weights)
+
+    def around(self, places: NDArray[np.float32]) -> Floats:
+        """Sum (n,) at each place, interpolated between the eight cells that are nearest to it."""
+        at, total = (places - self._low) / self._width - 0.5, np.zeros(len(places))
+        cells = np.floor(at).astype(np.int64)
+        part = at - cells
+        for step in itertools.product((0, 1), repeat=3):
+            keys = _keys(cells + step)
+            found = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
+            weight = np.where(step, part, 1 - part).prod(axis=1)
+            total += np.where(self._keys[found] == keys, weight * self._sums[found], 0.0)
+        return total
+
+
+def _keys(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    cells = cells + 1  # the neighbours of the lowest are not negative
+    return (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
+
+
+def _longest(pieces: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+    """Return the longest edge of each piece, (k,), and its length."""
+    lengths = np.linalg.norm(pieces - np.roll(pieces, -1, axis=1), axis=2)
+    return lengths.argmax(axis=1), lengths.max(axis=1)
+
+
+def _halved(pieces: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Cut each piece through the middle of its longest edge."""
+    rows, edge = np.arange(len(pieces)), _longest(pieces)[0]
+    a, b, c = (pieces[rows, (edge + k) % 3] for k in range(3))
+    middle = (a + b) / 2
+    return np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)
+
+
+def _areas(pieces: NDArray[np.float32]) -> Floats:
+    sides = pieces[:, 1:] - pieces[:, :1]
+    return np.asarray(np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) / 2, np.float64)
