@@ -70,7 +70,7 @@ def density_range(density: Floats, areas: Floats) -> tuple[float, float]:
     if (density * areas).any():
         low, high = (
             np.percentile(density, end, weights=weights, method="inverted_cdf")
-            for end, weights in ((1, density * areas), (99.5, areas * (density > 0)))
+            for end, weights in ((2, density * areas), (99.5, areas * (density > 0)))
         )
     low = max(low, high / WIDEST_RANGE)
     return float(low), float(max(high, 2 * low))
