@@ -94,7 +94,7 @@ def test_points_are_clicked_at_measured_seen_from_near_and_linked_to(served, new
     client = next(iter(page.get_clients().values()))
     eye = Eye.of(client.camera)
     wide, tall = client.camera.image_width, client.camera.image_height
-    (start, end), _ = eye.seen(view._even.positions[[10_000, 12_000]] - view._origin)
+    (start, end), _ = eye.seen(view._even.positions[[10_000, 12_000]] - view._view.origin)
     for shift, place, told in ((False, start, "wetness"), (True, end, "distance")):
         x, y = (place + 1) / 2 * (wide, tall)
         tab.press(x, y, shift=shift)

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from viser.transforms import SO3
 
 from ..columns.cloud import Cloud
+from ..export.ply_format import AXES
 
 Floats = NDArray[np.floating]
 Limits = tuple[float, float] | None  # lowest and highest, both included; None for all
 
-COORDINATES = ("x", "y", "z")
 _ACROSS, _DOWN = 48, 27
 TILES = _ACROSS * _DOWN  # parts of a picture
 _NEAR = 1e-6  # metres ahead of a camera; nearer points are not visible
@@ -27,9 +27,7 @@ _BEHIND = 1.03  # times the distance of the nearest: on another surface
 
 def values_of(cloud: Cloud, name: str) -> NDArray[Any]:
     """Values (n,) of a column; x, y and z are the positions, world coordinates."""
-    if name in COORDINATES:
-        return np.asarray(cloud.positions[:, COORDINATES.index(name)])
-    return cloud[name]
+    return np.asarray(cloud.positions[:, "xyz".index(name)]) if name in AXES else cloud[name]
 
 
 def within(values: Any, limits: Limits) -> Any:

@@ -43,10 +43,8 @@ class ResultView:
     ) -> None:
         self._file, self._pictured, self._note, self._most = file, pictured, note, most
         self._facts = page.gui.add_html("")
-        around = _around(file) if pictured is None else (pictured.scene.origin, np.zeros((2, 3)))
-        self._origin = around[0]
-        self._view = View(page, file.table, pictured, around)
-        self._view.cloud.blocks = Blocks(file, self._origin, most)
+        self._view = View(page, file.table, pictured, None if pictured else _around(file))
+        self._view.cloud.blocks = Blocks(file, self._view.origin, most)
         self._even: Cloud | None = None
 
     def draw(self) -> float:
@@ -65,8 +63,8 @@ class ResultView:
 
     def _told(self) -> str:
         lines = self._view.cloud.facts
-        if self._origin.any():
-            away = ", ".join(f"{metres:.0f}" for metres in self._origin)
+        if self._view.origin.any():
+            away = ", ".join(f"{metres:.0f}" for metres in self._view.origin)
             lines.append(f"relative to {away} m")
         lines += [self._pictured.models] if self._pictured is not None else []
         lines += [self._note] if self._note else []

@@ -55,7 +55,7 @@ class View:
         page: LivePage,
         table: Sequence[Column],
         pictured: Pictured | None,
-        around: tuple[Floats, Floats] = (np.zeros(3), np.zeros((2, 3))),
+        around: tuple[Floats, Floats] | None = None,
     ) -> None:
         self._page = page
         self._scene = None if pictured is None else pictured.scene
@@ -66,9 +66,7 @@ class View:
         self._first_actor = 0 if self._scene is None else len(self._scene.names)
         self._ends_ns = 0.0 if pictured is None else pictured.duration_ns
         self._poses = np.concatenate([np.empty((0, 3)), *(way.positions for way in self._sensors)])
-        self._origin, bounds = around
-        if pictured is not None:
-            self._origin, bounds = pictured.scene.origin, _whole(pictured, self._poses)
+        self.origin, bounds = around or _whole(pictured, self._poses)
         self._ground = float(bounds[0, 2])
         near = around_ways(bounds, ways_of(self._sensors, self._actors, self._ends_ns))
         from_near = near is not None
@@ -76,7 +74,7 @@ class View:
         self._size_m = float(np.linalg.norm(near[1] - near[0])) or 1.0
         self._labels = Labels(page)
         names = {} if pictured is None else {c.name: pictured.names_of(c) for c in table}
-        self.cloud = CloudView(page, self._labels, table, names, self._origin, self._size_m)
+        self.cloud = CloudView(page, self._labels, table, names, self.origin, self._size_m)
         self._drawn: dict[str, Hashable] = {}  # {name: its inputs when it was drawn}
         # {limits of the objects: surface}; of all, and of those that were shown last
         self._surfaces: dict[Limits, Surface] = {}
@@ -94,13 +92,13 @@ class View:
         page.frame_scene(near)
         self._add_controls(bounds, any(column.name == "time" for column in table))
         if from_near:  # towers would hide the street
-            self._cut.value = min(float(near[1, 2] + self._origin[2]), self._top)
+            self._cut.value = min(float(near[1, 2] + self.origin[2]), self._top)
         self._add_poses()
         self._add_actors()
 
     def _add_controls(self, bounds: Floats, timed: bool) -> None:
         gui = self._page.gui
-        low, high = (bounds[:, 2] + self._origin[2]).tolist()
+        low, high = (bounds[:, 2] + self.origin[2]).tolist()
         step = 10.0 ** math.floor(math.log10(max(high - low, 1e-3) / 50))
         first, self._top = (
             round(step * math.floor(low / step), 6),
@@ -147,7 +145,7 @@ class View:
     def cut(self) -> float | None:
         """Height above which nothing is shown, metres; None to show all."""
         value = self._cut.value
-        return None if value >= self._top else float(value) - float(self._origin[2])
+        return None if value >= self._top else float(value) - float(self.origin[2])
 
     def _changed(self, name: str, *state: Hashable) -> bool:
         """Whether to draw something with these inputs."""
@@ -232,7 +230,7 @@ class View:
         """Positions (n, 3) of points on static objects, local."""
         if cloud is None:
             return NO_TRIANGLES[:, 0]
-        places = (cloud.positions - self._origin).astype(np.float32)
+        places = (cloud.positions - self.origin).astype(np.float32)
         if "object" in cloud.columns and self._scene is not None:
             static = cloud["object"] < len(self._scene.names)
             places = places[static & within(cloud["object"], only)]
@@ -244,7 +242,7 @@ class View:
         self._ground = self._ground if floor is None else floor
         if roof is not None and (self.cut is None or roof < self.cut):
             top = float(self._poses[:, 2].max())
-            height = top + CUT * (roof - top) + float(self._origin[2])
+            height = top + CUT * (roof - top) + float(self.origin[2])
             self._cut.value = min(max(height, self._cut.min), self._top)
 
     def _draw_rays(self, rays: Rays, version: Hashable) -> None:
@@ -460,12 +458,13 @@ class View:
             )
 
 
-def _whole(pictured: Pictured, poses: Floats) -> Floats:
-    """Box (2, 3) around the scene, the sensors at (p, 3) and both ends of the path, local."""
+def _whole(pictured: Pictured | None, poses: Floats) -> tuple[Floats, Floats]:
+    """Local origin, and the box (2, 3) around scene, sensors at (p, 3) and ends of the path."""
+    assert pictured is not None
     places = np.concatenate([pictured.scene.bounds, poses])
     low, high = places.min(axis=0), places.max(axis=0)
     if pictured.planning is not None:
         ends = np.array([pictured.planning.start, pictured.planning.target])
         low[:2] = np.minimum(low[:2], ends.min(axis=0))
         high[:2] = np.maximum(high[:2], ends.max(axis=0))
-    return np.stack([low, high])
+    return pictured.scene.origin, np.stack([low, high])
