@@ -71,8 +71,7 @@ class ClusterFile(BaseModel):
         try:
             file = cls.model_validate(content)
         except ValidationError as error:
-            names = [*cls.model_fields, *Workers.model_fields]
-            told = [f"{path}: {line}" for line in validation_errors(error, names)]
+            told = [f"{path}: {line}" for line in validation_errors(error, cls)]
             raise LidarpoolError("\n".join(told)) from error
         file._source = str(path)
         for name in file.partitions:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import re
 import reprlib
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any
+from typing import Any, get_args
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from ..base.words import counted, did_you_mean
@@ -15,17 +15,16 @@ from ..base.words import counted, did_you_mean
 _GIVEN_LETTERS = 160  # letters of the value given
 
 
-def validation_errors(error: ValidationError, fields: Iterable[str]) -> Iterator[str]:
+def validation_errors(error: ValidationError, model: type[BaseModel]) -> Iterator[str]:
     """Yield a line for each error: field, value given, values allowed.
 
     Parameters
     ----------
     error
         What a model raised.
-    fields
-        Names of all fields, to suggest one for a misspelt name.
+    model
+        The model; a field of the same section is suggested for a misspelt name.
     """
-    fields = list(fields)
     alike: dict[Any, list[ErrorDetails]] = {}  # {field and kind of mistake: where it was made}
     places = [detail["loc"] for detail in error.errors()]
     for detail in error.errors():
@@ -37,16 +36,17 @@ def validation_errors(error: ValidationError, fields: Iterable[str]) -> Iterator
         alike.setdefault((field, detail["type"]), []).append(detail)
     for first, *others in alike.values():
         more = f" {counted(len(others), 'more entry', 'more entries')} like it." if others else ""
-        yield _line(first, fields) + more
+        yield _line(first, model) + more
 
 
-def _line(detail: ErrorDetails, fields: Iterable[str]) -> str:
+def _line(detail: ErrorDetails, model: type[BaseModel]) -> str:
     place, kind, message = _dotted(detail["loc"]), detail["type"], detail["msg"]
     if kind == "value_error":
         message = str(detail["ctx"]["error"])
         return f"{place}: {message}" if place else message
     if kind in ("extra_forbidden", "invalid_key"):
-        return f"{place} is not a field.{did_you_mean(str(detail['loc'][-1]), fields)}"
+        *section, name = detail["loc"]
+        return f"{place} is not a field.{did_you_mean(str(name), _fields(model, section))}"
     if kind == "missing":
         return f"{place} is missing; it must be given."
     given = detail["input"]
@@ -54,6 +54,29 @@ def _line(detail: ErrorDetails, fields: Iterable[str]) -> str:
     if kind == "literal_error" and isinstance(given, str):
         hint = did_you_mean(given, re.findall(r"'([^']*)'", detail["ctx"]["expected"]))
     return f"{place} is {_shown(given)}; {message[:1].lower()}{message[1:]}.{hint}"
+
+
+def _fields(model: type[BaseModel], place: Iterable[int | str]) -> set[str]:
+    """Names of the fields at a place, such as ("scene", "files", 0)."""
+    found = [model]
+    for step in place:
+        inner = [
+            deeper
+            for one in found
+            for name, field in one.model_fields.items()
+            if step in (name, field.alias)
+            for deeper in _models(field.annotation)
+        ]
+        found = inner or found  # it may be the number of an entry, or a key
+    return {field.alias or name for one in found for name, field in one.model_fields.items()}
+
+
+def _models(annotation: Any) -> Iterator[type[BaseModel]]:
+    """Models in an annotation, such as `tuple[Model, ...] | None`."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for inner in get_args(annotation):
+        yield from _models(inner)
 
 
 def _dotted(place: Sequence[int | str]) -> str:
