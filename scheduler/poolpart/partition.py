@@ -76,7 +76,11 @@ class Partition:
         return f"<Partition {self.name!r}{'; ' + self.note if self.note else ''}>"
 
     def stats(self) -> PartitionStats:
-        """Its load and its finished tasks, whoever submitted them."""
+        """Its load and its finished tasks, whoever submitted them.
+
+        Tasks are counted from the division of the pool on; in a partition that the workers were
+        started with, from the first call.
+        """
         return partition_stats(self.client, self.name)
 
     # -- tasks -------------------------------------------------------------------------

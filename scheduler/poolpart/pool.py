@@ -103,8 +103,9 @@ class Pool:
         return [worker.name for worker in self.workers]
 
     def partitions(self) -> dict[str, Partition]:
-        """Find the partitions that the workers declare, by name."""
-        names = sorted({name for worker in self.workers for name in worker.partitions})
+        """Find the partitions that the cluster's workers declare now, by name."""
+        workers = all_workers(self.client)
+        names = sorted({name for worker in workers for name in worker.partitions})
         return {name: Partition(name, self.client) for name in names}
 
     def require(self, slots: Mapping[str, int], purpose: Mapping[str, str] | None = None) -> None:
@@ -313,8 +314,13 @@ class Pool:
 
         Returns also a pool of the workers that are left.
         """
-        for name in rules:
+        for name, rule in rules.items():
             check_name(name)
+            if not isinstance(rule, Rule):
+                raise PoolError(
+                    f"The rule of partition {name!r} is {rule!r}: give one such as n_workers(2), "
+                    "per_gpu(1) or rest()."
+                )
         cluster = all_workers(self.client)
         # By name: a restarted worker has another address.
         gpus = {worker.name: worker.gpus for worker in self.workers}

@@ -171,10 +171,14 @@ def divide(
         chosen[name] = rule.choose(free)
         taken |= {worker.address for worker in chosen[name]}
         if len(chosen[name]) < rule.minimum:
+            advice = f"{len(free)} of {len(pool)} are left for it. Start more, or list it first."
+            if isinstance(rule, Named):
+                names = ", ".join(repr(worker.name) for worker in pool[:9])
+                advice = f"it asks for {', '.join(map(repr, rule.names))}, and there are {names}"
+                advice += ", …." if len(pool) > 9 else "."
             raise PoolError(
                 f"Partition {name!r} would have {len(chosen[name])} of the {rule.minimum} workers "
-                f"that it needs: {len(free)} of {len(pool)} are left for it. Start more, or list "
-                "it first. Workers that declare another resource are not taken."
+                f"that it needs: {advice} Workers that declare another resource are not taken."
             )
         if isinstance(rule, per_gpu) and free and not any(worker.gpus for worker in free):
             notes[name] = NO_GPU

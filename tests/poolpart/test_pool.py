@@ -107,6 +107,9 @@ def test_a_worker_that_has_left_is_not_chosen(start, wait_until):
     wait_until(lambda: len(declared(client)) == 2)
     part, rest = pool.partition("P", n_workers=2)
     assert ([w.name for w in part.workers], rest.names) == (["b", "c"], [])
+    assert list(pool.partitions()) == ["P"]
+    with pytest.raises(PoolError, match=r"rule of partition 'Q' is 3: .* n_workers\(2\)"):
+        pool.divide({"Q": 3})
     with pytest.raises(PoolError, match="would have 0 of the 1 workers"):
         pool.partition("Q", workers=["a"])
 

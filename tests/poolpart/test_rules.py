@@ -62,6 +62,8 @@ def test_fewer_than_the_minimum():
     with pytest.raises(PoolError, match=message):
         divide({"P": n_workers(2), "Q": per_host(1)}, pool)
     assert names({"P": n_workers(2), "Q": per_host(1, minimum=0)}, pool)["Q"] == []
+    with pytest.raises(PoolError, match=r"asks for 'c', and there are 'a', 'b'\."):
+        divide({"P": named("c")}, pool)
     with pytest.raises(PoolError, match="would have 2 of the 3 workers"):
         divide({"P": rest(minimum=3)}, pool)
 

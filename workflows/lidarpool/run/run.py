@@ -99,7 +99,8 @@ class Run:
                 raise self._told_lost() from error
             raise
         self._pool = pool
-        self.partitions: dict[str, Partition] = pool.partitions()
+        names = sorted({name for worker in pool for name in worker.partitions})
+        self.partitions = {name: Partition(name, client) for name in names}
         self.notes: list[str] = []
         if not any(worker.gpus for worker in casting):
             self.notes.append(f"no GPU in partition GPU: CPU workers cast the rays with {backend}")
