@@ -33,13 +33,13 @@ def sensors(model: str | None, out: Path | None) -> None:
             cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
             click.echo("  ".join(cells).rstrip())
         return
+    described = read_model(model)
     from ..render.beam_picture import draw_beams  # imports Matplotlib, which lists do not need
 
     target = out or Path("-".join(Path(model).with_suffix("").parts[-2:]) + ".png")
     if target.suffix.lower() != ".png":
         raise click.UsageError(f"{target} is not a picture: give a name that ends in .png.")
     draw_beams(target, load_sensor(model))
-    described = read_model(model)
     click.echo(described.name)
     for figure, source in described.sources.items():
         click.echo(f"{figure:<10}  {source}")

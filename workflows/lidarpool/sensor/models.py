@@ -33,7 +33,10 @@ class _Part(BaseModel):
 def _numbers(value: Any) -> Any:
     """Expand {first, last, count} to evenly spaced numbers, both ends included."""
     if isinstance(value, dict):
-        return np.linspace(value["first"], value["last"], value["count"]).tolist()
+        try:
+            return np.linspace(value["first"], value["last"], value["count"]).tolist()
+        except (KeyError, TypeError, ValueError):
+            raise ValueError("give numbers, or first, last and count, a whole number") from None
     return value
 
 
@@ -101,7 +104,7 @@ class SensorModel(_Part):
     """Data file of a sensor. `docs/how-to/sensor.md` describes its fields."""
 
     name: str
-    sources: dict[str, str]
+    sources: dict[str, str] = {}
     axis: Literal["z", "x"] = "z"
     clockwise: bool = False
     zero_deg: float = 0.0
@@ -120,6 +123,12 @@ class SensorModel(_Part):
     def _whole(self) -> SensorModel:
         if (self.firing_us is None) == (self.firings_per_turn is None):
             raise ValueError("give either firing_us or firings_per_turn")
+        if self.range_m is not None and not 0 <= self.range_m[0] < self.range_m[1]:
+            raise ValueError(
+                f"range_m is {list(self.range_m)}; give the shortest, then the longest"
+            )
+        if any(abs(angle) > 90 for angle in self.beams.elevation_deg):
+            raise ValueError("beams.elevation_deg goes beyond 90 degrees")
         self.beams.beams()  # LidarpoolError if it cannot be made
         Optics(**self.optics.model_dump())  # the same
         return self
@@ -164,12 +173,20 @@ def read_model(name: str | Path) -> SensorModel:
     """
     if str(name).endswith((".yaml", ".yml")):
         return _read(Path(name))
-    if str(name) not in model_names():
+    known = model_names()
+    if str(name) not in known:
+        near = [model for model in known if _plain(str(name)) in _plain(model)][:3]
+        hint = f" Did you mean {' or '.join(map(repr, near))}?" if near else ""
         raise LidarpoolError(
-            f"There is no sensor model {str(name)!r}.{did_you_mean(str(name), model_names())} "
+            f"There is no sensor model {str(name)!r}.{hint or did_you_mean(str(name), known)} "
             "lidarpool sensors lists them; give your own as a file, such as mine.yaml."
         )
     return _built_in(str(name))
+
+
+def _plain(name: str) -> str:
+    """Return letters and digits of a name: «VLP-16» and «velodyne/vlp16» have them in common."""
+    return "".join(filter(str.isalnum, name.lower()))
 
 
 @cache
@@ -183,7 +200,7 @@ def _read(path: Path | Traversable) -> SensorModel:
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"])) or "as a whole"
-        said_of_it = f"{first['msg']}."
+        said_of_it = f"{first['msg'].removeprefix('Value error, ')}."
         if first["type"] == "extra_forbidden":
             fields = {field for part in _Part.__subclasses__() for field in part.model_fields}
             said_of_it = f"this is not a field.{did_you_mean(str(first['loc'][-1]), fields)}"
