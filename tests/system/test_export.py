@@ -73,6 +73,9 @@ def test_a_run_writes_what_its_scenario_asks_for_and_a_result_is_exported(
 def test_what_is_no_result_or_has_been_cut_is_one_line(lidarpool, tmp_path):
     told = lidarpool("export", tmp_path, "-f", "laz")
     assert told.code == 2 and "holds no cloud.ply: give the folder of a finished run" in told.err
+    (tmp_path / "cloud.ply").touch()
+    told = lidarpool("export", tmp_path / "cloud.ply", "--format", "laz")
+    assert told.code == 2 and f"cloud.ply is a file: give its folder, {tmp_path}" in told.err
     for name in ("cloud.ply", "report.json"):
         (tmp_path / name).touch()
     (tmp_path / "sweeps.npz").write_bytes(b"PK")

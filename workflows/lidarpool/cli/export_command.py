@@ -62,6 +62,8 @@ def export(
     # The report of a result is moved into place last.
     needed = ("cloud.ply", SWEEPS_FILE, "report.json")
     place = result if out is None else out
+    if isinstance(result, Path) and result.is_file():
+        raise LidarpoolError(f"{result} is a file: give its folder, {result.parent}.")
     with local_result(result, needed) as made:
         for name in needed:
             if not (made / name).exists():
