@@ -13,7 +13,7 @@ from trimesh.exchange.gltf import export_glb
 
 from lidarpool.base.errors import LidarpoolError
 from lidarpool.base.fingerprint import fingerprint
-from lidarpool.scenario.scenario import Scenario
+from lidarpool.scenario.scenario import SEED_KEPT, Scenario
 from lidarpool.scenario.yamlfile import read_yaml
 from lidarpool.sensor import Noise, Returns, Sensor, Survey
 from lidarpool.sensor.materials import MaterialTable
@@ -78,7 +78,8 @@ def test_the_seed_example_writes_out_the_defaults():
     plain, scenario = Scenario().model_dump(), Scenario.load(EXAMPLES / "seed.yaml")
     loaded = scenario.model_dump()
     assert stated["cloud"].keys() == plain["cloud"].keys()
-    assert loaded["cloud"] == {**plain["cloud"], "precision_m": Sensor().optics.resolution_m}
+    chosen = {"keep_every": SEED_KEPT, "precision_m": Sensor().optics.resolution_m}
+    assert loaded["cloud"] == plain["cloud"] | chosen
     sensors = (scenario.sensor.sensor(Path()), Sensor(), Sensor.grid())
     assert len({fingerprint(sensor) for sensor in sensors}) == 1
     for section in ("planning", "pool"):
@@ -219,11 +220,14 @@ BAD = [
     ("sensor: {layers: '40'}", r"sensor\.layers is '40'; input should be a valid integer"),
     ("sensor: {layers: }", r"is empty; input should be a valid integer"),
     ("sensor: {layer: 4}", r"sensor\.layer is not a field\. Did you mean 'layers'\?"),
+    ("sensor: {modle: a}", r"sensor\.modle is not a field\. Did you mean 'model'\?"),
+    ("sensors: {a: {mount: {positon: [0, 0, 0]}}}", "a.mount.positon .* mean 'position'"),
     ("sensr: {}", r"sensr is not a field\. Did you mean 'sensor'\?"),
     ("sensor: {vertical_fov_deg: .nan}", r"is nan; input should be a finite number"),
     ("sensor: {step_deg: 0.1}", "less than one firing"),
     ("sensor: {min_range_m: 5, max_range_m: 2}", "must be above min_range_m"),
     ("sensor: {model: velodyne/vlp61}", "no sensor model .* Did you mean 'velodyne/vlp16'"),
+    ("sensor: {model: OS1-64}", r"no sensor model .* Did you mean 'ouster/os1-64'\?"),
     ("sensor: {model: ouster/os1-64, layers: 64}", "a model defines the beams: leave out layers"),
     ("sensor: {calibration: a.json, rays_per_revolution: 512}", "leave out rays_per_revolution"),
     ("sensor: {columns: 512, rays_per_revolution: 512}", "mean the same: give one of them"),

@@ -167,7 +167,7 @@ def test_a_cluster_that_lacks_a_partition(check, cluster):
     assert said["reasons"][0] in outcome.err
 
 
-@pytest.mark.parametrize(("size", "unit"), [((8000, 6000, 3000), "mm"), ((8, 6, 3), None)])
+@pytest.mark.parametrize(("size", "unit"), [((400, 300, 250), "mm"), ((8, 6, 3), None)])
 def test_sizes_that_speak_of_another_unit(size, unit, check, tmp_path, lidarpool):
     mesh = trimesh.creation.box(size)
     (tmp_path / "my box.stl").write_bytes(mesh.export(file_type="stl"))
@@ -175,5 +175,6 @@ def test_sizes_that_speak_of_another_unit(size, unit, check, tmp_path, lidarpool
     assert outcome.code == 0
     assert ("my box.stl states no unit" in outcome.out) == (unit is not None)
     assert unit is None or f"give the file's unit ({unit}?) in scene.files" in outcome.out
+    assert unit is None or f"lidarpool init DIR --mesh FILE --unit {unit}" in outcome.out
     given = check(text="scene: {files: [{file: my box.stl, unit: m}]}")
     assert given.code == 0 and "states no unit" not in given.out

@@ -48,7 +48,7 @@ def test_init_with_meshes_names_them_as_seen_from_the_scenario(tmp_path, lidarpo
         ("../../#1: é.glb", "mm"),
     ]
     assert len(made.build_scene().names) == 2
-    assert (made.cloud.keep_every, made.cloud.precision_m) == (1, 0.001)
+    assert (made.cloud.keep_every, made.cloud.precision_m) == (None, 0.001)
     rest = {"scene": {"files", "preset"}, "cloud": True}
     assert made.model_dump(exclude=rest) == Scenario().model_dump(exclude=rest)
 
@@ -114,5 +114,6 @@ def test_sensors_lists_models_and_draws_the_beams_of_one(tmp_path, lidarpool, mo
         assert lidarpool("sensors", name, "--out", target).code == 0
     pictures = ("velodyne-vlp16.png", "rose.png", "lines.png")
     assert {(tmp_path / name).read_bytes()[:4] for name in pictures} == {b"\x89PNG"}
+    assert lidarpool("sensors", "").code == 2
     outcome = lidarpool("sensors", "velodyne/vlp61")
     assert outcome.code == 2 and "Did you mean 'velodyne/vlp16'?" in outcome.err

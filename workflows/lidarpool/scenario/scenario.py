@@ -50,16 +50,19 @@ from .yamlfile import read_yaml
 # Objects lower than this are floors and markings, which a path may cross.
 FLAT_M = 0.2
 
-# Sizes of halls and parts in metres are between these.
-LARGE_M, SMALL_M = 500.0, 0.2
+# Sizes of scenes in metres are between these. An .stl is mostly a part, in millimetres.
+LARGE_M, LARGE_STL_M, SMALL_M = 500.0, 20.0, 0.2
 
 SEED_START = (25.0, 25.0)
 SEED_TARGET = (-30.0, -20.0)
 # Heights of the sensor, if no poses are given; and its least distance from the ceiling.
 _HEIGHTS_M, _BELOW_M = (1.0, 2.0, 3.0), 0.2
 
-# For a mesh file without a scenario: the cloud keeps everything.
-WHOLE_CLOUD = {"keep_every": 1, "precision_m": 0.001}
+# Of the hits in a scene with the default objects, every so many are kept.
+SEED_KEPT = 5
+
+# The cloud of a mesh file without a scenario.
+MESH_CLOUD = {"precision_m": 0.001}
 
 
 class Scenario(Section):
@@ -177,7 +180,7 @@ class Scenario(Section):
         """
         path = Path(path)
         if path.suffix.lower() in SUFFIXES:
-            data = {"scene": {"files": [path.name]}, "cloud": WHOLE_CLOUD}
+            data = {"scene": {"files": [path.name]}, "cloud": MESH_CLOUD}
             return cls.from_data(data, source=str(path), folder=path.parent)
         return cls.from_data(read_yaml(path), source=str(path), folder=path.parent)
 
@@ -206,7 +209,7 @@ class Scenario(Section):
             try:
                 scenario = cls.model_validate(data)
             except ValidationError as error:
-                told = validation_errors(error, _field_names())
+                told = validation_errors(error, cls)
                 mistakes.lines += [f"{source}: {line}" for line in told]
                 # Validate again without the wrong sections, to find further errors.
                 wrong = {str(detail["loc"][0]) for detail in error.errors() if detail["loc"]}
@@ -271,12 +274,16 @@ class Scenario(Section):
             if entry.unit is None and Path(entry.file).suffix.lower() in UNITLESS
         ]
         side = float(np.ptp(scene.bounds, axis=0).max())
-        if not unitless or SMALL_M <= side <= LARGE_M:
+        parts = any(file.lower().endswith(".stl") for file in unitless)
+        large = LARGE_STL_M if parts else LARGE_M
+        if not unitless or SMALL_M <= side <= large:
             return notes
+        unit = "mm" if side > large else "km"
         return [
             *notes,
             f"{unitless[0]} states no unit, and in metres the scene is {side:,.5g} m long. If that "
-            f"is wrong, give the file's unit ({'mm' if side > LARGE_M else 'km'}?) in scene.files",
+            f"is wrong, give the file's unit ({unit}?) in scene.files (lidarpool init DIR --mesh "
+            f"FILE --unit {unit} writes such a scenario)",
         ]
 
     def build_scene(self) -> Scene:
@@ -349,7 +356,7 @@ class Scenario(Section):
                 **self._sensors(),
                 coordinates=self.cloud.coordinates,
                 steps=self.steps,
-                keep_every=self.cloud.keep_every,
+                keep_every=self.cloud.keep_every or (SEED_KEPT if self.scene.has_seed else 1),
                 precision_m=self.cloud.precision_m,  # type: ignore[arg-type]  # the sensor's
                 columns=(*self.cloud.columns, *self.output.needs),
                 materials=self._materials(),
@@ -477,16 +484,6 @@ class Scenario(Section):
             yield
         except LidarpoolError as error:
             raise LidarpoolError(f"{self._source}: {error}") from error
-
-
-def _field_names() -> set[str]:
-    """Names of the fields of all sections."""
-    todo, names = [Section], set()
-    while todo:
-        section = todo.pop()
-        todo += section.__subclasses__()
-        names |= {field.alias or name for name, field in section.model_fields.items()}
-    return names
 
 
 def _ground(section: Ground, scene: Scene) -> Mesh:

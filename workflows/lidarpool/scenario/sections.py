@@ -293,8 +293,13 @@ class CloudSection(Section):
     """Which hits become points, and their columns."""
 
     keep_every: Annotated[
-        int, Field(ge=1, le=1_000_000, description="keep every n-th hit of a scan; by default 5")
-    ] = 5
+        Annotated[int, Field(ge=1, le=1_000_000)] | None,
+        Field(
+            description="keep every n-th hit of a scan; by default every hit, of a scene with the "
+            "default objects every 5th",
+            examples=[5],
+        ),
+    ] = None
     precision_m: Annotated[
         Annotated[float, Field(ge=1e-6, le=1000)] | None,
         Field(

@@ -10,7 +10,7 @@ import yaml
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from .scenario import WHOLE_CLOUD, Scenario
+from .scenario import MESH_CLOUD, Scenario
 from .schema import SCHEMA_FILE
 
 SCENARIO_FILE = "scenario.yaml"
@@ -40,7 +40,7 @@ def scenario_template(files: Sequence[dict[str, str]] = ()) -> str:
     lines = [_HEAD]
     given: dict[str, dict[str, Any]] = {}
     if files:
-        given = {"scene": {"files": list(files)}, "cloud": WHOLE_CLOUD}
+        given = {"scene": {"files": list(files)}, "cloud": MESH_CLOUD}
     for name, field in Scenario.model_fields.items():
         lines += ["\n", *(f"{line}\n" for line in _top(name, field, given.get(name, {})))]
     return "".join(lines)

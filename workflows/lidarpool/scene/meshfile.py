@@ -111,7 +111,7 @@ def load_meshes(
         (tell if why else remark)(
             f"{path} was turned from Y-up to Z-up, as glTF asks{why}. If it lies on its side now, "
             "say up_axis: z in scene.files (lidarpool init --mesh … --up-axis z writes such a "
-            "scenario), or up_axis='z' in Python; if not, y"
+            "scenario), or up_axis='z' in Python; y there confirms it, and ends this note"
         )
     return meshes
 
