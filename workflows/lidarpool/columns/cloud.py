@@ -146,7 +146,8 @@ class Cloud(Savable):
             return self.columns[name]
         except KeyError:
             raise KeyError(
-                f"the cloud has no column {name!r}; it has {list(self.columns)}"
+                f"the cloud has no column {name!r}; it has {list(self.columns)}, and x, y and z "
+                "in `positions`"
             ) from None
 
     def __getattr__(self, name: str) -> NDArray[Any]:
