@@ -136,7 +136,7 @@ class PageOwners(SchedulerPlugin):
     name = NAME
 
     def __init__(self, scheduler: Any) -> None:
-        self.owners: set[str | None] = set()  # None stands for `stay`
+        self.owners: set[str] = set()  # clients, by id
         self.began_to_count = STATISTICS not in scheduler.plugins
 
     def remove_client(self, scheduler: Any, client: str) -> None:
@@ -148,9 +148,9 @@ class PageOwners(SchedulerPlugin):
                 forget_statistics(scheduler)
 
 
-def partitions_page(client: Client, stay: bool = True) -> str:
+def partitions_page(client: Client) -> str:
     """Add the page to the dashboard of the client's cluster, see `Pool.page`; returns its URL."""
-    on_scheduler(client, _open, owner=client.id, stay=stay)
+    on_scheduler(client, _open, owner=client.id)
     link: str | None
     try:
         link = client.dashboard_link
@@ -169,8 +169,8 @@ def leave_page(client: Client) -> None:
     on_scheduler(client, _leave, owner=client.id)
 
 
-async def _open(owner: str, stay: bool, dask_scheduler: Any = None) -> None:
-    if not stay and owner not in dask_scheduler.clients:  # killed, and already removed
+async def _open(owner: str, dask_scheduler: Any = None) -> None:
+    if owner not in dask_scheduler.clients:  # killed, and already removed
         return
     if NAME not in dask_scheduler.plugins:
         dask_scheduler.add_plugin(PageOwners(dask_scheduler))
@@ -178,7 +178,7 @@ async def _open(owner: str, stay: bool, dask_scheduler: Any = None) -> None:
         handlers = [(r"(?:/.*)?/" + PATH, _Handler, {"scheduler": dask_scheduler})]
         serve(dask_scheduler, PageApplication(handlers))
         link_from_dashboard(dask_scheduler, PATH, True)
-    dask_scheduler.plugins[NAME].owners.add(None if stay else owner)
+    dask_scheduler.plugins[NAME].owners.add(owner)
     statistics_of(dask_scheduler)
 
 

@@ -259,27 +259,23 @@ class Pool:
         made, remainder = self._divide({name: rule}, {name: replace(rule, minimum=needed)})
         return made[name], remainder
 
-    def page(self, *, stay: bool = True) -> str:
+    def page(self) -> str:
         """Add a page to Dask's dashboard: partitions, stages, workers and pipes; returns its URL.
 
         All users of the cluster can see it, and it is read-only. It needs no bokeh, and is as
-        public as the dashboard: on a shared network, whoever reaches one can see the other.
-
-        Parameters
-        ----------
-        stay
-            Keep it until all partitions are dissolved or the scheduler ends; else until this
-            client closes, or `leave_page`.
+        public as the dashboard: on a shared network, whoever reaches one can see the other. It
+        stays until the last client that wanted it closes or leaves it (`leave_page`), or all
+        partitions are dissolved.
 
         Raises
         ------
         PoolError
             If the scheduler lacks this package, or runs no HTTP server.
         """
-        return partitions_page(self.client, stay)
+        return partitions_page(self.client)
 
     def leave_page(self) -> None:
-        """Remove a page that does not stay, unless other clients want it."""
+        """Remove the page, unless other clients want it."""
         leave_page(self.client)
 
     def dissolve(self, timeout_s: float = 30.0) -> list[str]:

@@ -119,11 +119,11 @@ def test_what_it_tells(client, wait_until):
     pool.dissolve()
 
 
-def test_one_that_does_not_stay_goes_with_whoever_wanted_it(client, wait_until):
+def test_it_goes_with_the_last_client_that_wanted_it(client, wait_until):
     plugins = set(client.cluster.scheduler.plugins)
     with Client(client.cluster.scheduler_address, set_as_default=False) as other:
-        url = Pool.from_client(other).page(stay=False)
-        Pool.from_client(client).page(stay=False)
+        url = Pool.from_client(other).page()
+        Pool.from_client(client).page()
         Pool.from_client(client).leave_page()
         assert get(url)[0] == 200
     wait_until(lambda: get(url)[0] == 404)

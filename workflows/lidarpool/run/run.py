@@ -119,7 +119,7 @@ class Run:
         Does nothing if the scheduler serves no pages.
         """
         with suppress(PoolError):
-            self._tell(f"partitions page: {self._pool.page(stay=False)}")
+            self._tell(f"partitions page: {self._pool.page()}")
         try:
             yield
         finally:
