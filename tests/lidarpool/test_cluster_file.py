@@ -54,6 +54,7 @@ WRONG = {
         "not a partition of a survey.*mean 'GPU'",
     ),
     "workers": (GOOD.replace("workers: 5", "workers: many"), "partitions.OTHER.workers is 'many'"),
+    "many": (GOOD.replace("workers: 5", "workers: 999999999"), "less than or equal to 10000"),
     "no host": (GOOD.replace("[a, b], slots: 2", "[]"), "partitions.GPU.hosts is"),
     "no such package": (
         GOOD.replace("distributed.", "dask_jobqueues."),

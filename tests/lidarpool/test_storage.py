@@ -86,3 +86,9 @@ def test_a_storage_whose_library_is_missing_says_so(url, monkeypatch):
     for use in (Storage.prepare, Storage.sizes, lambda s: s.read("a"), lambda s: s.write("a", b"")):
         with pytest.raises(LidarpoolError, match=f"{url} cannot be opened: .*[^.][.]$"):
             use(Storage.at(url))
+
+
+@pytest.mark.parametrize("url", ["s3://", "file:///"])
+def test_a_scheme_alone_is_no_folder(url):
+    with pytest.raises(LidarpoolError, match="names no folder: give one"):
+        Storage.at(url)

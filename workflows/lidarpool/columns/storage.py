@@ -49,7 +49,8 @@ class Storage:
         Raises
         ------
         LidarpoolError
-            If the URL holds a password, which would get into databases and reports.
+            If the URL holds a password, which would get into databases and reports, or only a
+            scheme.
         """
         text = str(place)
         if not is_url(text):
@@ -59,6 +60,9 @@ class Storage:
                 f"A URL for {text.partition(':')[0]} has a password: leave it out, and give "
                 "it in the environment or the configuration of that storage's library."
             )
+        # Else `s3://$BUCKET`, with no such variable, would be a local folder.
+        if not is_url(text.rstrip("/")):
+            raise LidarpoolError(f"{text} names no folder: give one, such as {text}bucket/run.")
         return cls(text.rstrip("/"), durable)
 
     def __str__(self) -> str:

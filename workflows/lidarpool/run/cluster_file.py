@@ -32,8 +32,8 @@ class Workers(BaseModel):
 
     model_config = ConfigDict(extra="allow", frozen=True, strict=True)
 
-    workers: int = Field(1, ge=0)
-    slots: int = Field(1, ge=1)
+    workers: int = Field(1, ge=0, le=10_000)
+    slots: int = Field(1, ge=1, le=10_000)
     hosts: list[str] | None = Field(None, min_length=1)
 
 
