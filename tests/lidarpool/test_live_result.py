@@ -251,6 +251,11 @@ def test_of_an_object_that_is_looked_at_alone_all_else_is_hidden(cloud, page):
             assert cart.visible == moving
             assert ("Cart" in shown._labels._places) == moving
             assert page.scene.get_handle_by_name("/rays").visible == (name is None)
+    shown._scene_colour.value = HIDDEN
+    shown.cloud.set_filter(Filter())
+    view.draw()
+    assert not scenes(view)
+    assert not cart.visible
 
 
 def test_a_drive_under_a_wide_roof_is_cut_below_the_roof(cloud, page):

@@ -290,7 +290,8 @@ class View:
     def _place(self, time_ns: float) -> None:
         time_ns = min(time_ns, self._ends_ns)  # the slider ends at a round number
         only = self.cloud.filter.of("object")
-        if not self._changed("time", time_ns, only):
+        hidden = self._scene is not None and self._scene_colour.value == HIDDEN
+        if not self._changed("time", time_ns, only, hidden):
             return
         scene = self._page.scene
         for number, way in enumerate(self._sensors[len(self._markers) :], len(self._markers)):
@@ -313,9 +314,10 @@ class View:
                 body.position = positions[0]
                 if rotations is not None:
                     body.wxyz = np.roll(quaternions_of(rotations)[0], 1)
-                body.visible = bool(within(self._first_actor + number, only))
+                wanted = bool(within(self._first_actor + number, only))
+                body.visible = wanted and not hidden
                 top = positions[0] + [0.0, 0.0, float(actor.mesh.vertices[:, 2].max())]
-                self._labels.put(actor.name, top if body.visible else None)
+                self._labels.put(actor.name, top if wanted else None)
 
     def _follow_carrier(self, time_ns: float) -> None:
         """Move all cameras as the carrier has moved."""
