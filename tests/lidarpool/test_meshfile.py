@@ -162,6 +162,8 @@ def test_a_binary_stl_with_a_few_bytes_more_or_a_wrong_number(tmp_path):
         (gzip.compress(b"v 0 0 0\n", mtime=0), "is packed"),
         (b"\n<!DOCTYPE html>", "is a web page"),
         (b"version https://git-lfs.github.com/spec/v1\n", "git lfs pull"),
+        (b"ply\nformat ascii 1.0\n", "begins like a .ply file: give it that ending"),
+        ("v 0 0 0\nf 1 1 1\n".encode("utf-16"), "text in UTF-16: save it as UTF-8"),
     ],
 )
 def test_what_is_no_mesh_is_recognised(tmp_path, content, message):

@@ -96,7 +96,10 @@ def load_meshes(
     with np.errstate(
         all="ignore"
     ):  # of broken numbers in files; infinite and NaN values are refused
-        content = _read_whole(path, data)
+        try:
+            content = _read_whole(path, data)
+        except LidarpoolError as error:
+            raise LidarpoolError(f"{error}{_other_format(path, data)}") from error
         unit_m = UNITS_M[unit] if unit else content.unit_m or 1.0
         upright = Transform(UP_AXES[up_axis or content.up_axis or "z"] * unit_m, np.zeros(3))
         try:
@@ -199,6 +202,26 @@ _FOREIGN = (
         "is a Git LFS pointer: get the mesh with git lfs pull",
     ),
 )
+
+
+# Beginnings by which a file of the wrong ending is recognised.
+_BEGINNINGS = {
+    ".glb": b"glTF",
+    ".ply": b"ply",
+    ".off": b"OFF",
+    ".stl": b"solid ",
+    ".3mf": b"PK\x03\x04",
+}
+
+
+def _other_format(path: Path, data: bytes) -> str:
+    """Name the format by which a refused file begins, in a sentence, if it is another."""
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return " It begins like text in UTF-16: save it as UTF-8."
+    for suffix, begins in _BEGINNINGS.items():
+        if data.startswith(begins) and suffix != path.suffix.lower():
+            return f" It begins like a {suffix} file: give it that ending."
+    return ""
 
 
 def _placed(mesh: Mesh, stem: str, upright: Transform, transform: Transform | None) -> Mesh:
