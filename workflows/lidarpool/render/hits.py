@@ -1,20 +1,24 @@
-"""Hits per square metre on a grid, which divides large triangles with many hits."""
+"""Colours of a scene's surfaces by hits per square metre."""
 
 from __future__ import annotations
 
 import itertools
+import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..scene.scene import Scene
 from .colouring import TURBO
-from .intensity import density_colours, density_range, hit_density
+from .theme import UNSEEN, rgb
 
 Floats = NDArray[np.float64]
 
 _LEVELS = 24  # of a grid whose cells are half as wide each time
-_ENOUGH = 12  # points in a cell of the grid
+_ENOUGH = 12  # hits from which a density is estimated; points in a cell of the grid
+_MOST_ROUNDS = 12
+_WIDEST_RANGE = 300.0  # densest to sparsest colour
 
 
 def hit_colours(
@@ -59,7 +63,7 @@ def hit_colours(
     if found[read].any():
         each = (density * areas)[read].sum() / (found * areas)[read].sum()
         density[read] = each * found[read]
-    limits = density_range(density, areas)
+    limits = _density_range(density, areas)
     density = np.repeat(density[:, None], 3, axis=1)
     if read.any():
         # The mean of all pieces around a corner, for smooth transitions.
@@ -69,8 +73,85 @@ def hit_colours(
         means = np.bincount(corner, room * density[read].ravel()) / np.bincount(corner, room)
         density[read] = means[corner].reshape(-1, 3)
     # Where points were counted, none are grey; elsewhere the hits are known.
-    colours = density_colours(density, (~read & (hits[owner] > 0))[:, None], limits, TURBO)
+    colours = _density_colours(density, (~read & (hits[owner] > 0))[:, None], limits, TURBO)
     return pieces, owner, colours, limits
+
+
+def hit_density(scene: Scene, hit_counts: NDArray[Any]) -> Floats:
+    """Hits per square metre at each triangle, (f,).
+
+    If triangles are so small that most have one hit or none, hits are shared with neighbours:
+    each triangle gives a third to each of its corners, each corner returns them by area, until a
+    density is estimated from a dozen hits. The total stays the same.
+
+    Parameters
+    ----------
+    hit_counts
+        (f,) hits of each triangle.
+    """
+    hits = hit_counts.astype(np.float64)
+    a, b, c = (scene.vertices[scene.faces[:, k]] for k in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    for _ in range(_rounds(hits)):
+        hits = _share(scene.faces, hits, area, len(scene.vertices))
+    return np.divide(hits, area, out=np.zeros_like(hits), where=area > 0)
+
+
+def _rounds(hits: Floats) -> int:
+    """Choose how many times to share hits with the neighbours."""
+    hit = hits[hits > 0]
+    if not len(hit):
+        return 0
+    # Counts of one do not show how many triangles were missed: assume three times as many as
+    # were hit, so that the rings of a sparse scan merge.
+    typical = hit.mean() if hit.mean() > 3 else hit.mean() / 3
+    return min(_MOST_ROUNDS, math.floor(_ENOUGH / typical / 2))
+
+
+def _share(faces: NDArray[np.int32], hits: Floats, area: Floats, vertices: int) -> Floats:
+    """Spread hits (f,) over the triangles that share a corner, in proportion to area (f,)."""
+    given, room = np.zeros(vertices), np.zeros(vertices)
+    for corner in faces.T:
+        given += np.bincount(corner, weights=hits / 3, minlength=vertices)
+        room += np.bincount(corner, weights=area, minlength=vertices)
+    density = np.divide(given, room, out=np.zeros_like(given), where=room > 0)
+    shared = area * density[faces].sum(axis=1)
+    # Triangles without area have no density; they keep their hits.
+    return np.where(area > 0, shared, hits)
+
+
+def _density_range(density: Floats, areas: Floats) -> tuple[float, float]:
+    """Choose the ends of a logarithmic scale over densities on areas (f,).
+
+    Few hits are on surfaces with less, and little area has more.
+    """
+    low, high = 1.0, 10.0
+    if (density * areas).any():
+        low, high = (
+            np.percentile(density, end, weights=weights, method="inverted_cdf")
+            for end, weights in ((2, density * areas), (99.5, areas * (density > 0)))
+        )
+    low = max(low, high / _WIDEST_RANGE)
+    return float(low), float(max(high, 2 * low))
+
+
+def _density_colours(
+    density: Floats, hit: NDArray[np.bool_], limits: tuple[float, float], table: Floats
+) -> Floats:
+    """Colours (..., 3) by density and whether there were hits, both (...,).
+
+    Shared hits fade out to grey; triangles that were hit themselves are never grey.
+
+    Parameters
+    ----------
+    limits, table
+        Ends of the logarithmic scale, and its colours (256, 3).
+    """
+    low, high = limits
+    share = np.log(np.maximum(density, low) / low) / np.log(high / low)
+    colours = table[np.clip(share * 255, 0, 255).astype(np.int64)]
+    seen = np.where(hit, 1.0, np.clip(density / low / 0.6 - 0.3, 0, 1))[..., None]
+    return np.asarray(rgb(UNSEEN) * (1 - seen) + colours * seen)
 
 
 def _divided(

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidarpool.render.intensity import hit_density
+from lidarpool.render.hits import hit_density
 from lidarpool.scene.mesh import Mesh
 from lidarpool.scene.scene import Scene
 

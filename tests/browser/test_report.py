@@ -1,0 +1,37 @@
+"""The pictures of a report, looked at in a browser that prefers light or dark pages."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
+
+SCENARIO = "sensor: {rays_per_revolution: 100, layers: 8}\n"
+PLACE = """(() => {
+  const figure = document.querySelector('figure'); figure.scrollIntoView();
+  const box = figure.querySelector('svg').getBoundingClientRect();
+  return [box.left, box.top, box.width, box.height].map(Math.round);
+})()"""
+
+
+def test_pictures_are_dark_where_the_browser_is(new_tab, tmp_path):
+    (tmp_path / "small.yaml").write_text(SCENARIO)
+    run = [sys.executable, "-m", "lidarpool", "run", "small.yaml", "--no-plan"]
+    subprocess.run(run, cwd=tmp_path, check=True, timeout=180, capture_output=True)
+    tab = new_tab((tmp_path / "lidarpool-out" / "report.html").as_uri())
+    tab.wait_for(lambda text: "Sensor and scene" in text)
+    spread = {}
+    for scheme in ("light", "dark"):
+        feature = {"name": "prefers-color-scheme", "value": scheme}
+        tab.call("Emulation.setEmulatedMedia", features=[feature])
+        left, top, width, height = tab.value(PLACE)
+        page = tab.picture(tmp_path / f"{scheme}.png")
+        picture = page[top : top + height, left : left + width].mean(axis=2)
+        spread[scheme] = np.percentile(picture, [0, 50, 100])
+    low, middle, high = spread["light"]
+    assert low < 60 and middle > 235 and high > 250, "dark letters on a light page"
+    low, middle, high = spread["dark"]
+    assert low < 40 and middle < 60 and high > 190, "light letters on a dark page"
+    assert tab.errors == []
