@@ -21,7 +21,6 @@ import open3d  # noqa: F401 - counted among the libraries
 from lidarpool.columns.parts import PartColumns, StoredCloud, pack
 from lidarpool.columns.storage import Storage
 from lidarpool.columns.table import ALWAYS
-from lidarpool.export.ply import save_cloud
 
 PER_SCAN = 20_000
 PER_PART = 10  # scans
@@ -53,7 +52,9 @@ def make_parts(storage: Storage, points: int) -> StoredCloud:
         names.append(f"{number:08d}.npz")
         storage.write(names[-1], pack(part))
     cells = np.array([[0, 0, 0], [90_000] * 3], np.int64)
-    return StoredCloud(storage, names, [rows] * len(names), ALWAYS, cells, 0.01, np.zeros(3))
+    firsts = range(0, PER_PART * len(names), PER_PART)
+    rows_each = [rows] * len(names)
+    return StoredCloud(storage, names, firsts, rows_each, ALWAYS, cells, 0.01, np.zeros(3))
 
 
 def main() -> None:
@@ -67,8 +68,10 @@ def main() -> None:
         cloud = make_parts(Storage.at(Path(folder) / "parts"), given.points)
         limit_memory(given.mebibytes << 20)
         began = time.perf_counter()
-        size = save_cloud(Path(folder) / "cloud.ply", cloud)
+        path = Path(folder) / "cloud.ply"
+        cloud.save(path, precision_m=0.01)
         seconds = time.perf_counter() - began
+        size = path.stat().st_size
     print(
         f"{len(cloud):,} points, {size / 1e9:.2f} GB of PLY, in {seconds:.1f} s with at most "
         f"{given.mebibytes} MiB besides the libraries"

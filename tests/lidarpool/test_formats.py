@@ -6,7 +6,6 @@ import sys
 import threading
 import types
 from dataclasses import replace
-from pathlib import Path
 
 import laspy
 import numpy as np
@@ -31,8 +30,9 @@ from lidarpool import (
 )
 from lidarpool.base.open3d_module import load_open3d
 from lidarpool.base.vocabulary import FORMATS
+from lidarpool.columns.storage import Storage
 from lidarpool.columns.table import TABLE
-from lidarpool.export import threads
+from lidarpool.export import pieces
 from lidarpool.export.boxes import Boxes
 from lidarpool.export.cloud_file import CloudFile
 from lidarpool.export.formats import Format
@@ -334,9 +334,9 @@ def test_what_cannot_be_written_is_one_line_and_leaves_nothing(
     assert (tmp_path / "cloud.laz").read_text() == "mine"
     Format("laz").write(tmp_path / "cloud.laz", cloud, sweeps, overwrite=True)
     assert len(laspy.read(tmp_path / "cloud.laz")) == len(cloud)
-    with pytest.raises(LidarpoolError, match="cannot be written: No such file"):
+    with pytest.raises(LidarpoolError, match="gone does not exist: make it first"):
         Format("pcd").write(tmp_path / "gone/pcd", cloud, sweeps)
-    with pytest.raises(LidarpoolError, match="There is no format 'xyz': use las, laz"):
+    with pytest.raises(LidarpoolError, match="There is no format 'xyz': use ply, las"):
         Format("xyz")
     monkeypatch.setattr("lidarpool.export.formats.find_spec", lambda name: None)
     with pytest.raises(LidarpoolError, match=r'laspy and lazrs: pip install "lidarpool\[las\]"'):
@@ -539,7 +539,7 @@ def test_a_cloud_is_saved_in_the_format_of_its_ending(cloud, sweeps, tmp_path):
         ("is a folder", "result", {"format": "laz"}),
         ("precision_m is -1; it must be a length in metres", "x.las", {"precision_m": -1}),
         ("layout is 3; it must be text", "x.mcap", {"layout": 3}),
-        ("cannot be written: No such file", "gone/x.laz", {}),
+        ("gone does not exist: make it first", "gone/x.laz", {}),
     ):
         with pytest.raises(LidarpoolError, match=told):
             known.save(tmp_path / path, **more)
@@ -564,15 +564,19 @@ def test_a_format_is_named_as_in_a_scenario():
 
 
 def test_an_error_in_a_thread_ends_the_writing(sweeps, cloud, tmp_path, monkeypatch):
-    """The first one: no more files are begun, and what is there goes."""
+    """The first one: no more ranges are begun, and what is there goes."""
     begun = []
 
-    def full(path, data):
-        begun.append(path)
-        raise OSError(28, "No space left on device")
+    def full(storage, name, data):
+        if name.endswith(".bin"):
+            begun.append(name)
+            raise OSError(28, "No space left on device")
+        write(storage, name, data)
 
-    monkeypatch.setattr("pathlib.Path.write_bytes", full)
-    monkeypatch.setattr(threads, "THREADS", 2)
+    write = Storage.write
+    monkeypatch.setattr(Storage, "write", full)
+    monkeypatch.setattr(pieces, "THREADS", 2)
+    monkeypatch.setattr(pieces, "RANGE_PIECES", 1)
     with pytest.raises(LidarpoolError, match="kitti cannot be written: No space left on device"):
         Format("kitti").write(tmp_path / "kitti", cloud, sweeps)
     assert len(begun) <= 3
@@ -580,14 +584,14 @@ def test_an_error_in_a_thread_ends_the_writing(sweeps, cloud, tmp_path, monkeypa
 
 
 def test_an_interrupt_leaves_nothing_of_what_threads_write(sweeps, cloud, tmp_path, monkeypatch):
-    write, main, once = Path.write_bytes, threading.main_thread().ident, threading.Lock()
+    write, main, once = Storage.write, threading.main_thread().ident, threading.Lock()
 
-    def interrupted(path, data):
-        if once.acquire(blocking=False):
+    def interrupted(storage, name, data):
+        if name.endswith(".bin") and once.acquire(blocking=False):
             signal.pthread_kill(main, signal.SIGINT)
-        return write(path, data)
+        write(storage, name, data)
 
-    monkeypatch.setattr("pathlib.Path.write_bytes", interrupted)
+    monkeypatch.setattr(Storage, "write", interrupted)
     with pytest.raises(KeyboardInterrupt):
         Format("kitti").write(tmp_path / "kitti", cloud, sweeps)
     assert not list(tmp_path.iterdir())

@@ -166,7 +166,8 @@ def stored_cloud(storage, counts):
         cells = np.stack([table[:, 0].min(axis=0), table[:, 1].max(axis=0)])
     names = [f"{number}{SUFFIX}" for number in range(len(parts))]
     rows = [len(part) for part in parts]
-    cloud = StoredCloud(storage, names, rows, COLUMNS, cells, PRECISION_M, ORIGIN)
+    firsts = [part.first for part in parts]
+    cloud = StoredCloud(storage, names, firsts, rows, COLUMNS, cells, PRECISION_M, ORIGIN)
     return cloud, parts
 
 

@@ -16,7 +16,6 @@ from lidarpool.cli.commands import cli
 from lidarpool.columns.storage import Storage
 from lidarpool.columns.table import Column
 from lidarpool.export.cloud_file import CloudFile
-from lidarpool.export.ply import save_cloud
 from lidarpool.plan import best
 from lidarpool.plan.trial import run_trial
 from lidarpool.render.page import Page
@@ -69,7 +68,7 @@ def make(folder: Path, shown: Pictured) -> Path:
     """Write the folder of a result."""
     folder.mkdir()
     positions = shown.scene.vertices[::2]
-    save_cloud(folder / "cloud.ply", cloud_at(positions))
+    cloud_at(positions).save(folder / "cloud.ply")
     shown.save(folder / PICTURE_FILE)
     return folder
 
@@ -152,7 +151,7 @@ def test_some_of_the_points_are_of_every_channel(tmp_path):
     path = tmp_path / "cloud.ply"
     layers, rays = 40, 500  # a ray's points follow those of the ray beside it, channel by channel
     ring = np.tile(np.arange(layers), rays).astype(np.int32)
-    save_cloud(path, cloud_at(np.stack([ring] * 3, axis=1).astype(float)))
+    cloud_at(np.stack([ring] * 3, axis=1).astype(float)).save(path)
     chosen, _ = CloudFile(path).choose(len(ring) // 20)  # every 20th would be of two rings
     assert len(np.unique(chosen.positions[:, 2])) == layers
 
@@ -173,7 +172,7 @@ def test_the_cloud_is_coloured_by_any_of_its_columns(unplanned, tmp_path, monkey
     zeros = np.zeros(len(positions), np.int32)
     wetness = np.linspace(0, 100, len(positions))
     columns = {"scan": zeros, "channel": zeros, "object": zeros + 1, "wetness": wetness}
-    save_cloud(result / "cloud.ply", Cloud(positions, columns, [wet]))
+    Cloud(positions, columns, [wet]).save(result / "cloud.ply")
     figures = []
     monkeypatch.setattr(Page, "save", lambda page, path: figures.append(page.figure))
     for name in ("z", "wetness", "object", "ring"):

@@ -13,7 +13,7 @@ from lidarpool.base.open3d_module import load_open3d
 from lidarpool.columns.cloud import Cloud
 from lidarpool.columns.table import Column
 from lidarpool.export import ply
-from lidarpool.export.ply import read_cloud, save_cloud
+from lidarpool.export.ply import read_cloud
 
 
 def sample(count, *, offset=0.0, seed=1):
@@ -29,9 +29,8 @@ def sample(count, *, offset=0.0, seed=1):
 @pytest.mark.parametrize("count", [0, 1, 1000])
 def test_round_trip(tmp_path, count):
     given = sample(count)
-    size = save_cloud(tmp_path / "c.ply", given)
+    given.save(tmp_path / "c.ply")
     cloud = read_cloud(tmp_path / "c.ply")
-    assert size == (tmp_path / "c.ply").stat().st_size
     assert len(cloud) == count
     assert cloud.positions.dtype == np.float32
     np.testing.assert_array_equal(cloud.positions, given.positions.astype(np.float32))
@@ -52,7 +51,7 @@ def test_round_trip(tmp_path, count):
 )
 def test_positions_err_by_less_than_a_twentieth_of_the_precision(tmp_path_factory, points, step):
     path = tmp_path_factory.mktemp("h") / "c.ply"
-    save_cloud(path, Cloud(points, {}), precision_m=step)
+    Cloud(points, {}).save(path, precision_m=step)
     back = read_cloud(path).positions
     assert np.abs(back - points).max() <= step / 20
     if back.dtype == np.float64:
@@ -61,18 +60,18 @@ def test_positions_err_by_less_than_a_twentieth_of_the_precision(tmp_path_factor
 
 def test_georeferenced_points_are_kept_in_double_precision(tmp_path):
     given = sample(50, offset=[512_345.0, 5_403_210.0, 400.0])
-    save_cloud(tmp_path / "c.ply", given)
+    given.save(tmp_path / "c.ply")
     np.testing.assert_array_equal(read_cloud(tmp_path / "c.ply").positions, given.positions)
 
 
 def test_open3d_reads_it_and_an_empty_one_has_the_same_properties(tmp_path):
     open3d = load_open3d()
     given = sample(7)
-    save_cloud(tmp_path / "c.ply", given)
+    given.save(tmp_path / "c.ply")
     cloud = open3d.t.io.read_point_cloud(str(tmp_path / "c.ply"))
     assert set(cloud.point) == {"positions", "scan", "ring", "object"}
     np.testing.assert_array_equal(cloud.point["ring"].numpy()[:, 0], given.channel)
-    save_cloud(tmp_path / "e.ply", sample(0))
+    sample(0).save(tmp_path / "e.ply")
     head = (tmp_path / "c.ply").read_bytes().partition(b"end_header")[0]
     empty = (tmp_path / "e.ply").read_bytes().partition(b"end_header")[0]
     assert empty == head.replace(b"vertex 7", b"vertex 0")
@@ -85,7 +84,7 @@ def test_columns_of_every_type_come_back(tmp_path):
     columns = {c.name: np.array([0, 1, 100], c.dtype) for c in own}
     columns["of_i8"] = np.array([-(2**53), 0, 2**53])
     table = {"time": np.array([0, 1, 2**53]), "class": np.array([0, 1, 255])}
-    save_cloud(tmp_path / "c.ply", Cloud(np.eye(3), columns | table, own))
+    Cloud(np.eye(3), columns | table, own).save(tmp_path / "c.ply")
     back = read_cloud(tmp_path / "c.ply")
     for name, values in (columns | table).items():
         np.testing.assert_array_equal(back[name], values, err_msg=name)
@@ -95,7 +94,7 @@ def test_columns_of_every_type_come_back(tmp_path):
 def test_a_number_that_a_file_cannot_hold_is_refused(tmp_path):
     cloud = Cloud(np.zeros((1, 3)), {"time": np.array([2**53 + 1])})
     with pytest.raises(LidarpoolError, match="'time' holds 9007199254740993, and a PLY file holds"):
-        save_cloud(tmp_path / "c.ply", cloud)
+        cloud.save(tmp_path / "c.ply")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -106,18 +105,17 @@ def test_bad_targets(tmp_path):
         (tmp_path / "no" / "c.ply", "does not exist"),
         (tmp_path / "file" / "c.ply", "does not exist"),
         (tmp_path / "d.ply", "is a folder"),
-        (tmp_path / "c.las", "must end in .ply"),
         (tmp_path / ("x" * 300 + ".ply"), "cannot be written: File name too long"),
     ]:
         with pytest.raises(LidarpoolError, match=message):
-            save_cloud(path, sample(5))
+            sample(5).save(path)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["d.ply", "file"]
 
 
 @pytest.mark.parametrize("fault", ["cut", "fewer", "interrupted", "no space"])
 def test_a_faulty_write_leaves_the_earlier_result(tmp_path, monkeypatch, fault):
     path = tmp_path / "c.ply"
-    save_cloud(path, sample(3))
+    sample(3).save(path)
     before = path.read_bytes()
     write = ply._write_open3d
 
@@ -143,7 +141,7 @@ def test_a_faulty_write_leaves_the_earlier_result(tmp_path, monkeypatch, fault):
     }
     kind, message = expected[fault]
     with pytest.raises(kind, match=message):
-        save_cloud(path, sample(1000))
+        sample(1000).save(path)
     assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
 
 
@@ -151,7 +149,7 @@ def test_permissions_follow_the_umask(tmp_path):
     path = tmp_path / "c.ply"
     before = os.umask(0o027)
     try:
-        save_cloud(path, sample(3))
+        sample(3).save(path)
     finally:
         os.umask(before)
     assert path.stat().st_mode & 0o777 == 0o640
@@ -159,7 +157,7 @@ def test_permissions_follow_the_umask(tmp_path):
 
 def test_reading_what_is_not_a_cloud(tmp_path):
     good = tmp_path / "good.ply"
-    save_cloud(good, sample(20))
+    sample(20).save(good)
     data = good.read_bytes()
     cases = {
         "cut": (data[:-1], "bytes there"),

@@ -68,7 +68,7 @@ def drive(point, times):
     trace_to(strike)
     before(RunDatabase, "commit", "COMMIT")
     before(RunDatabase, "__init__", "OPEN")
-    before(lidarpool.report.output, "save_cloud", "SAVE")
+    before(lidarpool.report.output.Format, "write", "SAVE")
     before(lidarpool.cli.run_command, "remove_run", "REMOVE")
     before(lidarpool.cli.run_command.RunStore, "remove", "REMOVE")
     sys.argv = ["lidarpool", *json.loads(sys.argv[1])]

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING
 from ..base.arguments import checked
 from ..base.notebook import cell_display
 from ..base.words import counted
-from ..export.ply import save_cloud
 from ..run.result import RunResult
 
 if TYPE_CHECKING:
@@ -69,19 +68,16 @@ class Result(RunResult):
             If a file cannot be written, the folder holds the result of another survey, or a
             format lacks a package or column.
         """
-        from ..columns.storage import Storage
         from ..export.folder import output_place, result_folder
         from ..export.formats import Format
-        from ..report.output import refuse_to_replace, upload, write_result
+        from ..report.output import refuse_to_replace, write_result
 
         place = output_place(folder)
         wanted = [Format.of(entry) for entry in formats if entry != "ply"]
         with result_folder(place) as local:
             if not overwrite:
                 refuse_to_replace(place, lambda: self.identity)
-            report = write_result(local, self, only_cloud=only_cloud, formats=wanted)
-            if isinstance(place, Storage):
-                upload(local, place, report["files"])
+            write_result(local, place, self, only_cloud=only_cloud, formats=wanted)
 
     @checked
     def pictures(
@@ -154,7 +150,7 @@ class Result(RunResult):
         folder = mkdtemp(prefix="lidarpool-")
         weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
         path = Path(folder) / "cloud.ply"
-        save_cloud(path, self.points, precision_m=self.survey.precision_m)
+        self.points.save(path)
         return path
 
     def __repr__(self) -> str:

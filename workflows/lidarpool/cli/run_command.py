@@ -13,23 +13,24 @@ from typing import TYPE_CHECKING, Any
 import click
 from distributed import Client
 
-from ..base.interrupts import deferred_interrupts
 from ..base.open3d_module import load_open3d
 from ..base.vocabulary import PATIENCE_S, WAIT_S
 from ..base.words import counted
 from ..columns.storage import Storage
 from ..export.folder import local_result, result_folder
 from ..export.formats import Format
-from ..report.output import CLOUD, refuse_to_replace, upload, write_result
+from ..report.output import CLOUD, refuse_to_replace, write_result
 from ..report.report import summary
 from ..run.checks import TooFewWorkersError, check_backend_here, slots_needed
 from ..run.cluster_file import ClusterFile
 from ..run.connection import TlsFiles, connected, local_client, started_client
 from ..run.identity import identity_of
 from ..run.job import Job, make_job
+from ..run.ranges import LidarWorkers
 from ..run.result import RunResult
 from ..run.run import Run, make_result
 from ..run.store import RUN_FOLDER, RunStore, remove_run
+from ..scan import LIDAR
 from ..scan.database import FILE
 from ..scenario.scenario import Scenario
 from .logs import set_logs
@@ -141,27 +142,31 @@ def _simulate(
         with store.kept_on_error():
             if live is not None:
                 live.follow(store)
-            result = (
-                make_result(store) if store.complete else _drive(scenario, store, options, live)
-            )
-            if live is not None:
-                live.finish(result)
-            only_cloud = options.only == "cloud"
-            what = "the cloud" if only_cloud else "the cloud, the pictures and the report"
-            with shown_status(f"writing {what}", options.quiet):
-                report = write_result(
-                    folder,
-                    result,
-                    scenario,
-                    (lambda: None) if isinstance(out, Storage) else in_place,
-                    only_cloud=only_cloud,
-                    formats=formats,
+            # Workers write formats of many files; else they are not kept longer than the survey.
+            keep = any(one.in_pieces for one in formats)
+            with ExitStack() as cluster:
+                result, workers = (
+                    (make_result(store), None)
+                    if store.complete
+                    else _drive(scenario, store, options, live, cluster)
                 )
-            if isinstance(out, Storage):
-                with shown_status(f"copying it to {out}", options.quiet):
-                    upload(folder, out, report["files"])
-                with deferred_interrupts():
-                    in_place()
+                if not keep:
+                    cluster.close()
+                if live is not None:
+                    live.finish(result)
+                only_cloud = options.only == "cloud"
+                what = "the cloud" if only_cloud else "the cloud, the pictures and the report"
+                with shown_status(f"writing {what}", options.quiet):
+                    report = write_result(
+                        folder,
+                        out,
+                        result,
+                        scenario,
+                        in_place,
+                        only_cloud=only_cloud,
+                        formats=formats,
+                        workers=workers if keep else None,
+                    )
     return result, report
 
 
@@ -206,9 +211,13 @@ def _store(job: Job, options: RunOptions) -> RunStore:
 
 
 def _drive(
-    scenario: Scenario, store: RunStore, options: RunOptions, live: LiveRun | None
-) -> RunResult:
-    """Run on a cluster, a local one if none is given."""
+    scenario: Scenario,
+    store: RunStore,
+    options: RunOptions,
+    live: LiveRun | None,
+    stack: ExitStack,
+) -> tuple[RunResult, LidarWorkers]:
+    """Run on a cluster, a local one if none is given, which lasts as long as the stack."""
     if options.cluster is not None:
         cluster = _started_client(options.cluster, options)
     elif options.scheduler is not None:
@@ -216,13 +225,17 @@ def _drive(
     else:
         check_backend_here(store.backend or store.job.backend, store.advice)
         cluster = _local_client(scenario, options, store.job.planning is not None)
-    with cluster as client, shown_progress(options.quiet) as show:
+    client = stack.enter_context(cluster)
+    with shown_progress(options.quiet) as show:
         run = Run(client, store, _teller(options))
         # The cluster of one run has no dashboard.
         with nullcontext() if options.here else run.partitions_page():
-            if live is None:
-                return run.drive(None, show)
-            return run.drive(live.on_frame, live.with_progress(show, run.partitions))
+            on_frame = None if live is None else live.on_frame
+            shown = show if live is None else live.with_progress(show, run.partitions)
+            result = run.drive(on_frame, shown)
+    return result, LidarWorkers(
+        client, run.partitions[LIDAR], store.job.patience_s, _teller(options)
+    )
 
 
 @contextmanager

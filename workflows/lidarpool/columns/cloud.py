@@ -32,8 +32,11 @@ class CloudLike(Protocol):
     def table(self) -> tuple[Column, ...]:
         """The columns beside the positions, in the order of files."""
 
-    def chunks(self, points: int = CHUNK_POINTS) -> Iterator[Cloud]:
-        """Yield the points in order, at most so many at a time."""
+    def chunks(self, points: int = CHUNK_POINTS, first: int = 0) -> Iterator[Cloud]:
+        """Yield the points in order, from row `first` on, at most so many at a time."""
+
+    def row_of(self, scan: int) -> int:
+        """Row of the first point of a scan, if the points are in the order of scans."""
 
 
 class Savable:
@@ -196,10 +199,14 @@ class Cloud(Savable):
         columns = {name: array[rows] for name, array in self.columns.items()}
         return Cloud(self.positions[rows], columns, self.own, self.sweeps)
 
-    def chunks(self, points: int = CHUNK_POINTS) -> Iterator[Cloud]:
-        """Yield the points in order, at most so many at a time, as views."""
-        for first in range(0, len(self), points):
-            yield self.part(slice(first, first + points))
+    def chunks(self, points: int = CHUNK_POINTS, first: int = 0) -> Iterator[Cloud]:
+        """Yield the points in order, from row `first` on, at most so many at a time, as views."""
+        for start in range(first, len(self), points):
+            yield self.part(slice(start, start + points))
+
+    def row_of(self, scan: int) -> int:
+        """Row of the first point of a scan, if the points are in the order of scans."""
+        return int(np.searchsorted(self["scan"], scan))
 
     @classmethod
     def joined(cls, parts: list[Cloud]) -> Cloud:

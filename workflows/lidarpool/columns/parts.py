@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import io
 import zipfile
+from bisect import bisect_right
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -189,8 +190,8 @@ class StoredCloud(Savable):
     ----------
     storage
         Place of the parts.
-    names, rows
-        Names of the parts in scan order, and their numbers of points.
+    names, firsts, rows
+        Names of the parts in scan order, their first scans, and their numbers of points.
     columns
         Columns of a part.
     cells
@@ -209,6 +210,7 @@ class StoredCloud(Savable):
         self,
         storage: Storage,
         names: Sequence[str],
+        firsts: Sequence[int],
         rows: Sequence[int],
         columns: Sequence[Column],
         cells: NDArray[np.int64] | None,
@@ -217,10 +219,14 @@ class StoredCloud(Savable):
         keeper: Any = None,
         sweeps: Callable[[], Any] | None = None,
     ) -> None:
-        self.storage, self.names, self.rows = storage, tuple(names), tuple(rows)
+        self.storage, self.names = storage, tuple(names)
+        self.firsts, self.rows = tuple(firsts), tuple(rows)
         self._columns = tuple(columns)
         self._cells, self._precision_m, self._origin = cells, precision_m, origin
         self._keeper, self.sweeps = keeper, sweeps
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_keeper": None, "sweeps": None}  # both hold the scene
 
     def __repr__(self) -> str:
         return described(self)
@@ -257,8 +263,8 @@ class StoredCloud(Savable):
             self.sweeps,
         )
 
-    def chunks(self, points: int = CHUNK_POINTS) -> Iterator[Cloud]:
-        """Read the cloud in order, so many points at a time.
+    def chunks(self, points: int = CHUNK_POINTS, first: int = 0) -> Iterator[Cloud]:
+        """Read the cloud in order, from row `first` on, so many points at a time.
 
         Raises
         ------
@@ -268,9 +274,10 @@ class StoredCloud(Savable):
         held: list[Cloud] = []
         count = 0
         for name, rows in zip(self.names, self.rows, strict=True):
-            if not rows:
+            if rows <= first:
+                first -= rows
                 continue
-            cloud = self.cloud_of(self.part(name))
+            cloud, first = self.cloud_of(self.part(name), slice(first, None)), 0
             while count + len(cloud) >= points:
                 cut = points - count
                 yield Cloud.joined([*held, cloud.part(slice(0, cut))])
@@ -280,6 +287,14 @@ class StoredCloud(Savable):
                 count += len(cloud)
         if held:
             yield Cloud.joined(held)
+
+    def row_of(self, scan: int) -> int:
+        """Row of the first point of a scan."""
+        at = bisect_right(self.firsts, scan) - 1
+        row = sum(self.rows[: max(0, at)])
+        if at < 0 or scan == self.firsts[at]:
+            return row
+        return row + int(self.part(self.names[at]).counts[: scan - self.firsts[at]].sum())
 
     def sample(self, most: int, parts: int) -> Cloud:
         """Read at most so many evenly spaced points, of at most so many parts."""
@@ -302,7 +317,7 @@ class StoredCloud(Savable):
         import dask.dataframe as dd
 
         bare = StoredCloud(
-            self.storage, (), (), self._columns, None, self._precision_m, self._origin
+            self.storage, (), (), (), self._columns, None, self._precision_m, self._origin
         )
         filled = [name for name, rows in zip(self.names, self.rows, strict=True) if rows]
         empty = bare.load().to_dataframe()

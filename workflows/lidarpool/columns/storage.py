@@ -163,8 +163,8 @@ class Storage:
             system.pipe_file(f"{folder}/{name}", b"".join(bytes(piece) for piece in pieces))
 
     def _write_file(self, name: str, pieces: list[Any]) -> None:
-        folder = Path(self.url)
-        temporary = folder / f"{_TEMPORARY}{name}-{secrets.token_hex(4)}"
+        target = Path(self.url, name)
+        temporary = target.with_name(f"{_TEMPORARY}{target.name}-{secrets.token_hex(4)}")
         try:
             with temporary.open("xb", buffering=0) as file:
                 for piece in pieces:
@@ -173,13 +173,13 @@ class Storage:
                         view = view[file.write(view) :]
                 if self.durable:
                     os.fsync(file.fileno())
-            temporary.replace(folder / name)
+            temporary.replace(target)
         except BaseException:
             with suppress(OSError):
                 temporary.unlink(missing_ok=True)
             raise
         if self.durable:
-            flush(folder)
+            flush(target.parent)
 
     def read(self, name: str) -> bytes:
         """Read a file.
@@ -276,6 +276,11 @@ class Storage:
         with suppress(FileNotFoundError), _as_os_error():
             system, folder = self._remote
             system.rm(f"{folder}/{name}", recursive=True)
+
+    def tidy(self) -> None:
+        """Remove what killed writers have left of files in a folder of this machine."""
+        for left in Path(self.url).rglob(f"{_TEMPORARY}*") if self.is_local else ():
+            left.unlink(missing_ok=True)
 
     def remove_folder(self) -> None:
         """Remove the folder if it is empty."""

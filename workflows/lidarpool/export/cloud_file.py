@@ -61,10 +61,10 @@ class CloudFile:
         lows, highs = zip(*each, strict=True)
         return np.stack([np.min(lows, axis=0), np.max(highs, axis=0)])
 
-    def chunks(self, points: int = CHUNK_POINTS) -> Iterator[Cloud]:
-        """Yield the points in order, at most so many at a time."""
-        for first in range(0, len(self), points):
-            rows = self._rows[first : first + points]
+    def chunks(self, points: int = CHUNK_POINTS, first: int = 0) -> Iterator[Cloud]:
+        """Yield the points in order, from row `first` on, at most so many at a time."""
+        for start in range(first, len(self), points):
+            rows = self._rows[start : start + points]
             positions = np.stack([rows[axis] for axis in AXES], axis=1)
             columns = {column.name: rows[column.in_files] for column in self.table}
             yield Cloud(positions, columns, self.table)
@@ -81,6 +81,10 @@ class CloudFile:
         """
         low, high = (0, len(self)) if scans is None else self.rows_of(scans)
         return self._cloud(self._rows[low + one_of_each_part(high - low, most)]), high - low
+
+    def row_of(self, scan: int) -> int:
+        """Row of the first point of a scan, if the points are in the order of scans."""
+        return bisect_left(self._rows["scan"], scan)
 
     def rows_of(self, scans: tuple[float, float]) -> tuple[int, int]:
         """First row of these scans and the first after them; all rows if not in scan order."""

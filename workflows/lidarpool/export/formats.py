@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
@@ -16,13 +17,14 @@ from ..base.errors import LidarpoolError
 from ..base.vocabulary import FORMATS, LAYOUTS, columns_needed
 from ..columns.cloud import Cloud, CloudLike
 from ..columns.parts import StoredCloud
-from ..columns.storage import flush
+from ..columns.storage import Storage, flush
 from .folder import staging
-from .ply import save_cloud
+from .pieces import RangeWriter, Workers
 from .sweeps import Sweeps
 
 # The module that writes each format, and the packages that it needs.
 _MODULES = {
+    "ply": ("ply", ""),
     "las": ("las", "las"),
     "laz": ("las", "las"),
     "parquet": ("parquet", "parquet"),
@@ -40,7 +42,10 @@ _PACKAGES = {
     "e57": ("pye57",),
     "ros": ("rosbags",),
 }
-_ENDINGS = {Path(file).suffix: name for name, (file, _) in FORMATS.items() if "." in file}
+_IN_PIECES = ("parquet", "pcd", "kitti", "nuscenes")  # their modules have a class `Pieces`
+_ENDINGS = {".ply": "ply"} | {
+    Path(file).suffix: name for name, (file, _) in FORMATS.items() if "." in file
+}
 # Columns that a format can hold, unless it holds all.
 _HELD = {
     "e57": {"intensity"},
@@ -59,7 +64,7 @@ class Format:
     Parameters
     ----------
     name
-        One of `lidarpool.base.vocabulary.FORMATS`.
+        ply, or one of `lidarpool.base.vocabulary.FORMATS`.
     layout
         Layout of points in mcap and rosbag2: velodyne, autoware or ouster.
 
@@ -74,7 +79,7 @@ class Format:
 
     def __post_init__(self) -> None:
         for what, given, known in (
-            ("format", self.name, FORMATS),
+            ("format", self.name, _MODULES),
             ("layout", self.layout, LAYOUTS),
         ):
             if given not in known:
@@ -97,6 +102,11 @@ class Format:
         return FORMATS[self.name][0]
 
     @property
+    def in_pieces(self) -> bool:
+        """Whether it has many files, which workers can write."""
+        return self.name in _IN_PIECES
+
+    @property
     def _laid_out(self) -> bool:
         """Whether it has layouts."""
         return _MODULES[self.name][0] == "ros"
@@ -104,7 +114,7 @@ class Format:
     @property
     def needs(self) -> tuple[str, ...]:
         """Names of the columns that a cloud must have."""
-        return columns_needed(self.name, self.layout)
+        return columns_needed(self.name, self.layout) if self.name in FORMATS else ()
 
     def left_out(self, cloud: CloudLike) -> list[str]:
         """Names of the cloud's columns that it cannot hold."""
@@ -130,6 +140,8 @@ class Format:
     def check(self, path: Path, cloud: CloudLike, *, overwrite: bool = False) -> None:
         """Check the needs of `write` before anything is written, or raise LidarpoolError."""
         self.check_installed()
+        if not path.parent.is_dir():
+            raise LidarpoolError(f"The folder {path.parent} does not exist: make it first.")
         if path.exists() and not overwrite:
             raise LidarpoolError(f"{path} exists: give another place with --out, or --overwrite.")
         there = {column.name for column in cloud.table}
@@ -142,7 +154,13 @@ class Format:
             )
 
     def write(
-        self, path: Path, cloud: CloudLike, sweeps: Sweeps, *, overwrite: bool = False
+        self,
+        path: Path,
+        cloud: CloudLike,
+        sweeps: Sweeps,
+        *,
+        overwrite: bool = False,
+        workers: Workers | None = None,
     ) -> None:
         """Write a cloud completely, or not at all.
 
@@ -156,52 +174,75 @@ class Format:
             When and where its sweeps began.
         overwrite
             Whether existing files may be replaced.
+        workers
+            Write a format of many files, as far as they see its folder.
 
         Raises
         ------
         LidarpoolError
             If a package or column is missing, if something is there, or if it cannot be written.
         """
-        self.check(path, cloud, overwrite=overwrite)
-        writers = import_module(f".{_MODULES[self.name][0]}", __package__)
+        module = _MODULES[self.name][0]
         more: dict[str, Any] = {"layout": self.layout} if self._laid_out else {}
         beside = staging(path.parent)
         staged = beside / path.name  # bags contain the name of their file
-        try:
+        with _explained(path):
+            self.check(path, cloud, overwrite=overwrite)
             try:
                 beside.mkdir()
-                getattr(writers, f"write_{self.name}")(staged, cloud, sweeps, **more)
+                if self.in_pieces:
+                    place = Storage(str(staged), durable=False)
+                    RangeWriter(module, cloud, sweeps, place).write(workers)
+                else:
+                    writers = import_module(f".{module}", __package__)
+                    getattr(writers, f"write_{self.name}")(staged, cloud, sweeps, **more)
                 flush(staged)
                 if path.is_dir() or staged.is_dir():  # files replace files atomically
                     remove(path)
                 staged.replace(path)
                 flush(path.parent)
+            except LidarpoolError as error:  # names the file, without its temporary folder
+                raise LidarpoolError(str(error).replace(str(beside), str(path.parent))) from error
             finally:
                 shutil.rmtree(beside, ignore_errors=True)
-        except OSError as error:
-            raise LidarpoolError(f"{path} cannot be written: {error.strerror or error}.") from error
+
+    def put(
+        self, storage: Storage, cloud: CloudLike, sweeps: Sweeps, workers: Workers | None
+    ) -> None:
+        """Have workers write a format of many files into a storage where it is not yet.
+
+        Raises
+        ------
+        LidarpoolError
+            If that fails: none of them is left.
+        """
+        place = Storage(storage.path(self.file))
+        with _explained(place):
+            try:
+                RangeWriter(_MODULES[self.name][0], cloud, sweeps, place).write(workers)
+            except BaseException:
+                with suppress(OSError):
+                    storage.discard(self.file)
+                raise
 
 
 def save(
     path: Path, cloud: Cloud | StoredCloud, name: str | None, layout: str, precision_m: float | None
 ) -> list[str]:
     """Write a cloud by itself, and name the columns that are left out; see `Cloud.save`."""
-    if name is None:
-        name = "ply" if path.suffix == ".ply" else _ENDINGS.get(path.suffix)
+    name = name or _ENDINGS.get(path.suffix)
     if name is None:
         raise LidarpoolError(
-            f"{path}: its ending has no format: use .ply, {', '.join(_ENDINGS)}, or give a format."
+            f"{path}: its ending has no format: use {', '.join(_ENDINGS)}, or give a format."
         )
     if precision_m is not None and not 0 < precision_m < np.inf:
         raise LidarpoolError(f"precision_m is {precision_m}; it must be a length in metres.")
-    one = None if name == "ply" else Format(name, layout)
+    one = Format(name, layout)
     sweeps = Sweeps.unknown() if cloud.sweeps is None else cloud.sweeps()
     sweeps = replace(sweeps, precision_m=precision_m or sweeps.precision_m)
-    if one is None:
-        save_cloud(path, cloud, precision_m=sweeps.precision_m)
-        return []
-    if path.is_dir():
-        raise LidarpoolError(f"{path} is a folder: remove it, or give another path.")
+    with _explained(path):
+        if path.is_dir():
+            raise LidarpoolError(f"{path} is a folder: remove it, or give another path.")
     if cloud.sweeps is None and "scan" in one.needs:
         raise LidarpoolError(
             f"{name} stores single sweeps, but this cloud has none: save the cloud of a "
@@ -209,6 +250,15 @@ def save(
         )
     one.write(path, cloud, sweeps, overwrite=True)
     return one.left_out(cloud)
+
+
+@contextmanager
+def _explained(place: object) -> Iterator[None]:
+    """Turn an OSError into one line on a place."""
+    try:
+        yield
+    except OSError as error:
+        raise LidarpoolError(f"{place} cannot be written: {error.strerror or error}.") from error
 
 
 def remove(path: Path) -> None:

@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+import io
+from collections.abc import Sequence
 
 import numpy as np
 
 from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud, CloudLike
 from ..sensor.trajectory import matrices
+from . import pieces
 from .boxes import Boxes, type_of
 from .sweeps import Floats, Sweeps
-from .threads import write_each
 
 INSTANCES_MOST = 65_535
 # From the sensor's axes to KITTI's of a camera: x to the right, y down, z ahead.
 _CAMERA = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 
 
-def write_kitti(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
-    """Write a sequence for each sensor: `sequences/00`, `01`, ...
+class Pieces(pieces.Pieces):
+    """A sequence for each sensor: `sequences/00`, `01`, ...
 
     In each are `velodyne/000000.bin` (float32 x, y, z in the sensor's axes when the sweep began,
     intensity), `labels/000000.label` (uint32: instance << 16 | class; the instance is the object's
@@ -30,40 +31,54 @@ def write_kitti(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
 
     Behley et al., SemanticKITTI, 2019; Geiger et al., 2012.
     """
-    if len(sweeps.objects) + len(sweeps.actors) > INSTANCES_MOST:
-        raise LidarpoolError(f"KITTI labels hold {INSTANCES_MOST:,} objects at most.")
-    folders = [path / "sequences" / f"{sensor:02}" for sensor in range(len(sweeps.sensors))]
-    for folder in folders:
-        for name in ("velodyne", "labels", *(["label_2"] if sweeps.actors else [])):
-            (folder / name).mkdir(parents=True)
 
-    def write(sweep: int, points: Cloud) -> None:
-        folder, name = folders[sweeps.sensor[sweep]], f"{sweeps.numbers[sweep]:06}"
-        inside = sweeps.in_sensor(sweep, points.positions)
+    def __init__(self, cloud: CloudLike, sweeps: Sweeps) -> None:
+        if len(sweeps.objects) + len(sweeps.actors) > INSTANCES_MOST:
+            raise LidarpoolError(f"KITTI labels hold {INSTANCES_MOST:,} objects at most.")
+        super().__init__(cloud, sweeps)
+        self.sequences = [f"sequences/{sensor:02}" for sensor in range(len(sweeps.sensors))]
+        kinds = ("velodyne", "labels", *(["label_2"] if sweeps.actors else []))
+        self.folders = [f"{folder}/{kind}" for folder in self.sequences for kind in kinds]
+
+    def files(self, number: int, points: Cloud) -> tuple[dict[str, bytes], None]:
+        """Return the files of a sweep."""
+        sweeps = self.sweeps
+        folder, name = self.sequences[sweeps.sensor[number]], f"{sweeps.numbers[number]:06}"
+        inside = sweeps.in_sensor(number, points.positions)
         rows = np.column_stack([inside, points["intensity"]]).astype("<f4")
-        (folder / "velodyne" / f"{name}.bin").write_bytes(rows.tobytes())
         labels = (points["object"].astype("<u4") + 1) << 16 | points["class"]
-        (folder / "labels" / f"{name}.label").write_bytes(labels.tobytes())
+        files = {
+            f"{folder}/velodyne/{name}.bin": rows.tobytes(),
+            f"{folder}/labels/{name}.label": labels.tobytes(),
+        }
         if sweeps.actors:
-            lines = _labels(sweeps, sweep, Boxes.of(sweeps, sweep, points))
-            (folder / "label_2" / f"{name}.txt").write_text(lines)
+            lines = _labels(sweeps, number, Boxes.of(sweeps, number, points))
+            files[f"{folder}/label_2/{name}.txt"] = lines.encode()
+        return files, None
 
-    write_each(write, sweeps.points(cloud))
-    (path / "poses").mkdir()
-    for sensor, folder in enumerate(folders):
-        own = sweeps.sensor == sensor
-        turns, places = matrices(sweeps.pose.quaternions[own]), sweeps.pose.positions[own]
-        first = _CAMERA @ turns[0].T
-        rows = np.concatenate(
-            [first @ turns @ _CAMERA.T, ((places - places[0]) @ first.T)[..., None]], axis=2
-        )
-        for file in (folder / "poses.txt", path / "poses" / f"{sensor:02}.txt"):
-            np.savetxt(file, rows.reshape(-1, 12), "%.9e")
-        np.savetxt(folder / "times.txt", sweeps.begins_ns[own] / 1e9, "%.9e")
-        (folder / "calib.txt").write_text(
-            "".join(f"P{camera}: {_row(np.eye(3))}\n" for camera in range(4))
-            + f"Tr: {_row(_CAMERA)}\n"
-        )
+    def others(self, made: Sequence[None]) -> dict[str, bytes]:
+        """Return poses, times and calibrations."""
+        sweeps = self.sweeps
+        files: dict[str, bytes] = {}
+        for sensor, folder in enumerate(self.sequences):
+            own = sweeps.sensor == sensor
+            turns, places = matrices(sweeps.pose.quaternions[own]), sweeps.pose.positions[own]
+            first = _CAMERA @ turns[0].T
+            rows = np.concatenate(
+                [first @ turns @ _CAMERA.T, ((places - places[0]) @ first.T)[..., None]], axis=2
+            )
+            poses = _table(rows.reshape(-1, 12))
+            files |= {f"{folder}/poses.txt": poses, f"poses/{sensor:02}.txt": poses}
+            files[f"{folder}/times.txt"] = _table(sweeps.begins_ns[own] / 1e9)
+            lines = [f"P{camera}: {_row(np.eye(3))}\n" for camera in range(4)]
+            files[f"{folder}/calib.txt"] = "".join([*lines, f"Tr: {_row(_CAMERA)}\n"]).encode()
+        return files
+
+
+def _table(rows: Floats) -> bytes:
+    memory = io.BytesIO()
+    np.savetxt(memory, rows, "%.9e")
+    return memory.getvalue()
 
 
 def _row(turn: Floats) -> str:

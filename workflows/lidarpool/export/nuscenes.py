@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import json
+from collections.abc import Sequence
 from hashlib import md5
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,9 @@ from PIL import Image
 
 from ..base.fingerprint import fingerprint
 from ..columns.cloud import Cloud, CloudLike
+from . import pieces
 from .boxes import Boxes, type_of
 from .sweeps import Sweeps, plain_names
-from .threads import write_each
 
 VERSION = "v1.0-lidarpool"
 _SCENE, _LOG = "scene-0001", "survey"
@@ -22,8 +23,8 @@ _DATE = "1980-01-06"  # surveys begin at time 0 of no date
 _MAP = "maps/none.png"
 
 
-def write_nuscenes(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
-    """Write a data set: `NuScenes("v1.0-lidarpool", path)` of nuscenes-devkit opens it.
+class Pieces(pieces.Pieces):
+    """A data set: `NuScenes("v1.0-lidarpool", path)` of nuscenes-devkit opens it.
 
     Each sweep is `samples/NAME/000000.pcd.bin`: float32 x, y, z in the sensor's axes when it
     began, intensity (0 to 255), ring. NAME is that of the sensor, LIDAR_TOP where it has none. The
@@ -33,36 +34,42 @@ def write_nuscenes(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
 
     Caesar et al., nuScenes, 2020.
     """
-    channels = plain_names(name or "LIDAR_TOP" for name in sweeps.sensors)
-    begins = sweeps.begins_ns[sweeps.sensor == 0]
-    sample = np.clip(np.searchsorted(begins, sweeps.begins_ns, "right") - 1, 0, None)
-    first = np.diff(sample, prepend=-1).astype(bool) | (sweeps.numbers == 0)
-    names = [
-        f"{'samples' if key else 'sweeps'}/{channels[sensor]}/{number:06}.pcd.bin"
-        for key, sensor, number in zip(first, sweeps.sensor, sweeps.numbers, strict=True)
-    ]
-    for folder in {(path / name).parent for name in names}:
-        folder.mkdir(parents=True)
 
-    def write(sweep: int, points: Cloud) -> Boxes:
-        inside = sweeps.in_sensor(sweep, points.positions)
+    def __init__(self, cloud: CloudLike, sweeps: Sweeps) -> None:
+        super().__init__(cloud, sweeps)
+        self.channels = plain_names(name or "LIDAR_TOP" for name in sweeps.sensors)
+        begins = sweeps.begins_ns[sweeps.sensor == 0]
+        self.sample = np.clip(np.searchsorted(begins, sweeps.begins_ns, "right") - 1, 0, None)
+        self.first = np.diff(self.sample, prepend=-1).astype(bool) | (sweeps.numbers == 0)
+        self.names = [
+            f"{'samples' if key else 'sweeps'}/{self.channels[sensor]}/{number:06}.pcd.bin"
+            for key, sensor, number in zip(self.first, sweeps.sensor, sweeps.numbers, strict=True)
+        ]
+        self.folders = [name.rpartition("/")[0] for name in self.names]
+
+    def files(self, number: int, points: Cloud) -> tuple[dict[str, bytes], Boxes]:
+        """Return the file of a sweep, and its boxes."""
+        inside = self.sweeps.in_sensor(number, points.positions)
         light = np.clip(points["intensity"], 0, 1) * 255
         rows = np.column_stack([inside, light, points["channel"]]).astype("<f4")
-        (path / names[sweep]).write_bytes(rows.tobytes())
-        return Boxes.of(sweeps, sweep, points)
+        return {self.names[number]: rows.tobytes()}, Boxes.of(self.sweeps, number, points)
 
-    boxes = write_each(write, sweeps.points(cloud))
-    tables = _Tables(sweeps)
-    tables.add_frames(channels, sample, names)
-    counts = np.zeros((len(begins), len(sweeps.actors)), np.int64)
-    for sweep in np.flatnonzero(first):
-        counts[sample[sweep]] += boxes[sweep].points
-    tables.add_actors(boxes[: len(begins)], counts)
-    (path / VERSION).mkdir()
-    for name, rows in tables.rows.items():
-        (path / VERSION / f"{name}.json").write_text(json.dumps(rows, indent=1))
-    (path / _MAP).parent.mkdir()
-    Image.new("L", (1, 1)).save(path / _MAP)  # the devkit looks whether there is one
+    def others(self, made: Sequence[Boxes]) -> dict[str, bytes]:
+        """Return the tables of the data set, and its map."""
+        tables = _Tables(self.sweeps)
+        tables.add_frames(self.channels, self.sample, self.names)
+        samples = int((self.sweeps.sensor == 0).sum())
+        counts = np.zeros((samples, len(self.sweeps.actors)), np.int64)
+        for sweep in np.flatnonzero(self.first):
+            counts[self.sample[sweep]] += made[int(sweep)].points
+        tables.add_actors(list(made[:samples]), counts)
+        files = {
+            f"{VERSION}/{name}.json": json.dumps(rows, indent=1).encode()
+            for name, rows in tables.rows.items()
+        }
+        image = io.BytesIO()
+        Image.new("L", (1, 1)).save(image, "png")
+        return files | {_MAP: image.getvalue()}  # the devkit looks whether there is one
 
 
 class _Tables:

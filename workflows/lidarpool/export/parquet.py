@@ -2,41 +2,60 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Iterator, Sequence
+from itertools import islice
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from ..columns.cloud import Cloud, CloudLike
+from ..columns.cloud import CHUNK_POINTS, Cloud, CloudLike
 from ..columns.table import AXES
+from . import pieces
 from .sweeps import Sweeps
-from .threads import write_each
 
 
-def write_parquet(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
-    """Write all columns of a cloud; units and meanings are in the metadata of the fields."""
-    fields = [
-        pa.field(
-            c.in_files, pa.from_numpy_dtype(kind), metadata={"unit": c.unit, "meaning": c.meaning}
-        )
-        for c, kind in (
-            *((axis, np.dtype(np.float64)) for axis in AXES),
-            *((column, np.dtype(column.dtype)) for column in cloud.table),
-        )
-    ]
-    schema = pa.schema(fields, {"coordinates": sweeps.coordinates, "objects": _list(sweeps)})
-    path.mkdir()
+class Pieces(pieces.Pieces):
+    """A file for each million points; units and meanings are in the metadata of the fields."""
 
-    def write(number: int, chunk: Cloud) -> None:
-        arrays = [*chunk.positions.T.astype(np.float64), *(chunk[c.name] for c in cloud.table)]
-        table = pa.Table.from_arrays(
-            [pa.array(np.ascontiguousarray(a)) for a in arrays], schema=schema
-        )
-        pq.write_table(table, path / f"part-{number:05}.parquet")
+    def __init__(self, cloud: CloudLike, sweeps: Sweeps) -> None:
+        super().__init__(cloud, sweeps)
+        fields = [
+            pa.field(
+                c.in_files,
+                pa.from_numpy_dtype(kind),
+                metadata={"unit": c.unit, "meaning": c.meaning},
+            )
+            for c, kind in (
+                *((axis, np.dtype(np.float64)) for axis in AXES),
+                *((column, np.dtype(column.dtype)) for column in cloud.table),
+            )
+        ]
+        words = {"coordinates": sweeps.coordinates, "objects": _list(sweeps)}
+        self.schema = pa.schema(fields, words)
 
-    if not write_each(write, cloud.chunks()):
-        pq.write_table(schema.empty_table(), path / "part-00000.parquet")
+    def __len__(self) -> int:
+        return -(-len(self.cloud) // CHUNK_POINTS)
+
+    def read(self, first: int, stop: int) -> Iterator[Cloud]:
+        """Yield so many million points."""
+        return islice(self.cloud.chunks(first=first * CHUNK_POINTS), stop - first)
+
+    def files(self, number: int, points: Cloud) -> tuple[dict[str, bytes], None]:
+        """Return a file."""
+        table = self.cloud.table
+        arrays = [*points.positions.T.astype(np.float64), *(points[c.name] for c in table)]
+        filled = [pa.array(np.ascontiguousarray(array)) for array in arrays]
+        return self._file(number, pa.Table.from_arrays(filled, schema=self.schema)), None
+
+    def others(self, made: Sequence[None]) -> dict[str, bytes]:
+        """Return a file without rows if there is no other."""
+        return {} if made else self._file(0, self.schema.empty_table())
+
+    def _file(self, number: int, table: pa.Table) -> dict[str, bytes]:
+        memory = pa.BufferOutputStream()
+        pq.write_table(table, memory)
+        return {f"part-{number:05}.parquet": memory.getvalue()}
 
 
 def _list(sweeps: Sweeps) -> str:

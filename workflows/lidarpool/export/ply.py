@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import secrets
 import shutil
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,9 +14,8 @@ from ..base.arguments import checked
 from ..base.errors import LidarpoolError
 from ..base.open3d_module import load_open3d
 from ..columns.cloud import Cloud, CloudLike
-from ..columns.storage import flush
 from ..columns.table import AXES as POSITION
-from ..columns.table import TABLE, Column, check_names
+from ..columns.table import TABLE, check_names
 from .ply_format import AXES, as_held, header, layout, row_type
 from .sweeps import SWEEPS_FILE, Sweeps
 
@@ -27,52 +23,33 @@ from .sweeps import SWEEPS_FILE, Sweeps
 _ROUNDING_SHARE = 0.05
 
 
-@checked
-def save_cloud(path: str | Path, cloud: CloudLike, *, precision_m: float = 0.01) -> int:
+def write_ply(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
     """Write a cloud, in memory or on disk, to a binary PLY file through Open3D.
 
     About a million points are in memory at a time: Open3D writes each such piece to a separate
     file, which is appended to the others below one header. The bytes are the same as if Open3D
-    wrote all points at once.
-
-    The file is written under a temporary name in the same folder, flushed to the disk, and then
-    renamed: there is either the complete new file or the old one. The same points give the same
-    bytes.
-
-    Parameters
-    ----------
-    path
-        The file; its folder must exist.
-    cloud
-        A `Cloud`, or the `points` of a `Result`. float64 positions are stored in single
-        precision if the error is below a twentieth of `precision_m`, else in double.
-    precision_m
-        Step to which the positions were rounded, metres.
-
-    Returns
-    -------
-    Size of the file in bytes.
-
-    Raises
-    ------
-    LidarpoolError
-        If it cannot be written completely; no temporary file is left.
+    wrote all points at once. float64 positions are stored in single precision if the error is
+    below a twentieth of the precision of the sweeps, else in double.
     """
-    path = Path(path)
-    real = real_type(cloud.bounds, precision_m)
-    # Keep the ending, by which Open3D chooses the format.
-    temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.tmp.ply")
-    try:
-        _check_target(path, cloud.table)
-        try:
-            size = _write(temporary, path, cloud, real)
-            temporary.replace(path)
-            flush(path.parent)
-        finally:
-            temporary.unlink(missing_ok=True)
-    except OSError as error:
-        raise LidarpoolError(f"{path} cannot be written: {error.strerror or error}.") from error
-    return size
+    check_names((*POSITION, *cloud.table))
+    real = real_type(cloud.bounds, sweeps.precision_m)
+    piece = path.with_name(f".{path.name}.ply")  # by its ending Open3D chooses the format
+    with path.open("xb") as file:
+        for chunk in cloud.chunks():
+            # Open3D would print a line for each buffer that it cannot write. There is need for
+            # the piece, and for its copy in the file.
+            _check_room(path, 2 * len(chunk) * row_type(real, cloud.table).itemsize)
+            _write_open3d(piece, _as_held(chunk, real))
+            start = _start_of_rows(piece, path, len(chunk))
+            with piece.open("rb") as written:
+                head = written.read(start)
+                if not file.tell():
+                    own = b"element vertex %d\n" % len(chunk)
+                    file.write(head.replace(own, b"element vertex %d\n" % len(cloud)))
+                shutil.copyfileobj(written, file, 1 << 24)
+            piece.unlink()
+        if not file.tell():  # which Open3D refuses to write
+            file.write(header(row_type(real, cloud.table), 0))
 
 
 @checked
@@ -118,42 +95,6 @@ def real_type(bounds: NDArray[np.floating], precision_m: float) -> np.dtype[np.f
     farthest = np.float32(np.abs(bounds).max(initial=0.0))
     enough = np.isfinite(farthest) and np.spacing(farthest) / 2 < _ROUNDING_SHARE * precision_m
     return np.dtype(np.float32 if enough else np.float64)
-
-
-def _check_target(path: Path, table: Sequence[Column]) -> None:
-    check_names((*POSITION, *table))
-    if path.is_dir():
-        raise LidarpoolError(f"{path} is a folder: give the name of a .ply file.")
-    if path.suffix.lower() != ".ply":
-        raise LidarpoolError(f"{path} must end in .ply.")
-    if not path.parent.is_dir():
-        raise LidarpoolError(f"The folder {path.parent} does not exist: make it first.")
-
-
-def _write(temporary: Path, path: Path, cloud: CloudLike, real: np.dtype[np.floating]) -> int:
-    """Write all pieces to `temporary`; returns its size."""
-    piece = temporary.with_name(temporary.name.replace(".tmp.", ".piece."))
-    with temporary.open("xb") as file:
-        try:
-            for chunk in cloud.chunks():
-                # Open3D would print a line for each buffer that it cannot write. There is need for
-                # the piece, and for its copy in the file.
-                _check_room(path, 2 * len(chunk) * row_type(real, cloud.table).itemsize)
-                _write_open3d(piece, _as_held(chunk, real))
-                start = _start_of_rows(piece, path, len(chunk))
-                with piece.open("rb") as written:
-                    head = written.read(start)
-                    if not file.tell():
-                        own = b"element vertex %d\n" % len(chunk)
-                        file.write(head.replace(own, b"element vertex %d\n" % len(cloud)))
-                    shutil.copyfileobj(written, file, 1 << 24)
-        finally:
-            piece.unlink(missing_ok=True)
-        if not file.tell():  # which Open3D refuses to write
-            file.write(header(row_type(real, cloud.table), 0))
-        file.flush()
-        os.fsync(file.fileno())
-        return file.tell()
 
 
 def _check_room(path: Path, needed: int) -> None:

@@ -23,6 +23,11 @@ from ..sensor.trajectory import matrices, quaternions_of
 
 Floats = NDArray[np.float64]
 SWEEPS_FILE = "sweeps.npz"
+MIXED_UP = (
+    "The points are not in the order of their scans, or of another survey than the sweeps "
+    f"({SWEEPS_FILE}): give both of one run, and keep the order."
+)
+_PIECE = 250_000  # points that are read at a time: several threads or tasks have so many
 _FORMAT = 1
 
 
@@ -150,8 +155,8 @@ class Sweeps:
             survey.precision_m,
         )
 
-    def points(self, cloud: CloudLike) -> Iterator[Cloud]:
-        """Yield the points of each sweep in order, also of empty ones.
+    def points(self, cloud: CloudLike, first: int = 0, stop: int | None = None) -> Iterator[Cloud]:
+        """Yield the points of each sweep from `first` to `stop` in order, also of empty ones.
 
         Raises
         ------
@@ -160,20 +165,21 @@ class Sweeps:
         """
         held: list[Cloud] = []
         empty = Cloud(np.empty((0, 3)), {c.name: np.empty(0, c.dtype) for c in cloud.table})
-        current = 0
-        for chunk in cloud.chunks():
+        current, stop = first, len(self) if stop is None else stop
+        for chunk in cloud.chunks(_PIECE, cloud.row_of(int(self.scans[first])) if first else 0):
             sweep = np.searchsorted(self.scans, chunk["scan"], "right") - 1
             if sweep[0] < current or sweep[-1] >= len(self) or (np.diff(sweep) < 0).any():
-                raise LidarpoolError(
-                    "The points are not in the order of their scans, or of another survey than "
-                    f"the sweeps ({SWEEPS_FILE}): give both of one run, and keep the order."
-                )
-            for first, end in pairwise([0, *(np.flatnonzero(np.diff(sweep)) + 1), len(sweep)]):
-                while current < sweep[first]:
+                raise LidarpoolError(MIXED_UP)
+            end = int(np.searchsorted(sweep, stop))
+            starts = np.flatnonzero(np.diff(sweep[:end], prepend=-1))
+            for start, after in pairwise([*starts, end]):
+                while current < sweep[start]:
                     yield Cloud.joined(held) if held else empty
                     held, current = [], current + 1
-                held.append(chunk.part(slice(first, end)))
-        while current < len(self):
+                held.append(chunk.part(slice(start, after)))
+            if end < len(sweep):
+                break
+        while current < stop:
             yield Cloud.joined(held) if held else empty
             held, current = [], current + 1
 

@@ -37,13 +37,14 @@ class CountedCloud:
         self.limits: dict[str, tuple[float, float]] = {}
         self.bounds: NDArray[np.float64] = np.asarray(cloud.bounds, dtype=np.float64)
         self.table: tuple[Column, ...] = cloud.table
+        self.row_of = cloud.row_of
 
     def __len__(self) -> int:
         return len(self._cloud)
 
-    def chunks(self, points: int = CHUNK_POINTS) -> Iterator[Cloud]:
+    def chunks(self, points: int = CHUNK_POINTS, first: int = 0) -> Iterator[Cloud]:
         """Yield the points in order, and update the statistics."""
-        for chunk in self._cloud.chunks(points):
+        for chunk in self._cloud.chunks(points, first):
             self.by_object += np.bincount(chunk["object"], minlength=len(self.by_object))
             for name, values in chunk.columns.items():
                 low, high = self.limits.get(name, (np.inf, -np.inf))

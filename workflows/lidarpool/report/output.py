@@ -15,9 +15,9 @@ from ..base.vocabulary import FORMATS, PICTURES
 from ..columns.storage import Storage, flush
 from ..export.folder import LAST_FILE, staging
 from ..export.formats import Format, remove
-from ..export.ply import save_cloud
 from ..export.sweeps import SWEEPS_FILE, Sweeps
 from ..run.picture_file import PICTURE_FILE, Pictured
+from ..run.ranges import LidarWorkers
 from ..run.result import RunResult
 from ..scenario.scenario import Scenario
 from .cloud_numbers import CountedCloud
@@ -69,11 +69,13 @@ def refuse_to_replace(place: Path | Storage, identity: Callable[[], Mapping[str,
 
 def write_result(
     folder: Path,
+    place: Path | Storage,
     result: RunResult,
     scenario: Scenario | None = None,
     then: Callable[[], object] = lambda: None,
     only_cloud: bool = False,
     formats: Sequence[Format] = (),
+    workers: LidarWorkers | None = None,
 ) -> dict[str, Any]:
     """Write cloud, pictures and report, and return the report.
 
@@ -81,7 +83,10 @@ def write_result(
     disk, so that an earlier result stays whole if one cannot be written. Pictures of an earlier
     run that this one does not make are removed. `then` is called when all are in place, before
     a pending interrupt is raised. `only_cloud` leaves out pictures and page; `formats` are
-    written as well.
+    written as well, those of many files by `workers`, if there are any.
+
+    Where `place` is a storage, all is put into it, report.json last; `folder` is a temporary one
+    then. Files of workers go there directly, and an earlier result is removed before.
 
     Raises
     ------
@@ -106,6 +111,8 @@ def write_result(
     exported = [one.file for one in formats]
     pictures = [] if only_cloud else [*(f"{name}.png" for name in makers), PICTURE_FILE]
     files = [CLOUD, *exported, *pictures, SWEEPS_FILE, *([] if only_cloud else [PAGE]), REPORT]
+    storage = place if isinstance(place, Storage) else None
+    direct = [one for one in formats if one.in_pieces] if storage and workers else []
 
     def draw(name: str) -> str:
         page = makers[name]()
@@ -115,11 +122,18 @@ def write_result(
     try:
         staged.mkdir()
         drawn |= {name: beside.submit(draw, name) for name in makers if name not in _OF_CLOUD}
-        save_cloud(staged / CLOUD, counted, precision_m=survey.precision_m)
         sweeps = Sweeps.of(survey, scene)
         sweeps.save(staged / SWEEPS_FILE)
+        Format("ply").write(staged / CLOUD, counted, sweeps)
         for one in formats:
-            one.write(staged / one.file, result.points, sweeps)
+            if one not in direct:
+                one.write(staged / one.file, result.points, sweeps, workers=workers)
+        if storage:
+            _remove_earlier(storage, files)
+            for one in direct:
+                one.put(storage, result.points, sweeps, workers)
+        if workers:
+            result = workers.recorded(result)
         report = make_report(result, files, counted)
         report["notes"] += [note for one in formats for note in one.notes(result.points)]
         if not only_cloud:
@@ -129,16 +143,23 @@ def write_result(
             write_page(staged / PAGE, report, result, counted, images, scenario)
         text = json.dumps(report, indent=1, allow_nan=False) + "\n"
         (staged / REPORT).write_text(text, encoding="utf-8")
+        if storage:
+            for name in (*EXPORTS, *FILES):
+                if (staged / name).exists():
+                    storage.put(staged / name, name)
+            with deferred_interrupts():
+                then()
+            return report
         for name in files:
             flush(staged / name)
         with deferred_interrupts():
             _publish(staged, folder, files)
             then()
     except LidarpoolError as error:  # names the file, without its temporary folder
-        raise LidarpoolError(str(error).replace(str(staged), str(folder))) from error
+        raise LidarpoolError(str(error).replace(str(staged), str(place))) from error
     except OSError as error:
         raise LidarpoolError(
-            f"The result cannot be written to {folder} ({error.strerror or error}): make room or "
+            f"The result cannot be written to {place} ({error.strerror or error}): make room or "
             "give another folder with --out."
         ) from error
     finally:
@@ -165,22 +186,8 @@ def _publish(staged: Path, folder: Path, files: Collection[str]) -> None:
     flush(folder)
 
 
-def upload(folder: Path, storage: Storage, files: Collection[str]) -> None:
-    """Put a whole result into storage, in the order of `_publish`.
-
-    Raises
-    ------
-    LidarpoolError
-        If that fails.
-    """
-    try:
-        for name in (REPORT, PAGE, *EXPORTS, *FILES):
-            if name in (REPORT, PAGE) or name in EXPORTS or name not in files:
-                storage.discard(name)
-        for name in (*EXPORTS, *FILES):
-            if name in files:
-                storage.put(folder / name, name)
-    except OSError as error:
-        raise LidarpoolError(
-            f"The result cannot be written to {storage.url} ({error.strerror or error})."
-        ) from error
+def _remove_earlier(storage: Storage, files: Collection[str]) -> None:
+    """Remove what an earlier result has in a storage and this one would not replace."""
+    for name in (REPORT, PAGE, *EXPORTS, *FILES):
+        if name in (REPORT, PAGE, *EXPORTS) or name not in files:
+            storage.discard(name)

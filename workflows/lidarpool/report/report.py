@@ -17,13 +17,13 @@ from ..base.task_book import StageTotals, union
 from ..columns.storage import Storage
 from ..run.result import RunResult
 from ..run.trials import TRIAL
-from ..scan import COLLECT, GENERATE, INTERSECT, SORT
+from ..scan import COLLECT, EXPORT, GENERATE, INTERSECT, SORT
 from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
 from .cloud_numbers import CountedCloud
 
 ELEVATION_RAYS = 20_000  # whose elevations are examined
-_ORDER = (GENERATE, INTERSECT, SORT, COLLECT, TRIAL)  # in which stages are listed
+_ORDER = (GENERATE, INTERSECT, SORT, COLLECT, EXPORT, TRIAL)  # in which stages are listed
 
 _PACKAGES = (
     "numpy", "dask", "distributed", "trimesh", "embreex", "open3d-cpu", "open3d", "matplotlib",

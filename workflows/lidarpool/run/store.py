@@ -241,6 +241,7 @@ class RunStore:
         return StoredCloud(
             self.storage,
             [part.name for part in parts],
+            [part.first for part in parts],
             [part.rows for part in parts],
             survey.stored_columns,
             self.db.cells,

@@ -2,12 +2,13 @@
 
 from .driver import SurveyDriver
 from .messages import Frame, Receipt
-from .names import COLLECT, GENERATE, GPU, INTERSECT, LIDAR, OTHER, SORT
+from .names import COLLECT, EXPORT, GENERATE, GPU, INTERSECT, LIDAR, OTHER, SORT
 from .rig import RigPlan
 from .watch import Watch
 
 __all__ = [
     "COLLECT",
+    "EXPORT",
     "GENERATE",
     "GPU",
     "INTERSECT",

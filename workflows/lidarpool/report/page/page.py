@@ -17,7 +17,7 @@ from ...base.words import counted
 from ...render.page import shortened, without_common_prefix
 from ...run.result import RunResult
 from ...run.trials import TRIAL
-from ...scan import COLLECT, GENERATE, INTERSECT, SORT
+from ...scan import COLLECT, EXPORT, GENERATE, INTERSECT, SORT
 from ...scenario.scenario import Scenario
 from ..cloud_numbers import CountedCloud
 from . import words
@@ -34,6 +34,7 @@ STAGES = {
     INTERSECT: "intersect",
     SORT: "sort frames",
     COLLECT: "collect points",
+    EXPORT: "export cloud",
     TRIAL: "plan path",
 }
 

@@ -1,0 +1,157 @@
+"""Formats of many files: ranges of their files are written by threads here, or by workers."""
+
+from __future__ import annotations
+
+import os
+import secrets
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from ..base.errors import LidarpoolError
+from ..columns.cloud import Cloud, CloudLike
+from ..columns.storage import Storage
+from .sweeps import MIXED_UP, Sweeps
+
+# NumPy, pyarrow and system calls for the disk hold Python's lock at most 6 % of the time.
+THREADS = min(4, os.cpu_count() or 1)
+RANGE_POINTS, RANGE_PIECES = 1_000_000, 100  # of a range at most: what a killed worker costs
+_MARK = ".writing"  # a file in the folder while ranges are written
+
+
+class Pieces:
+    """A cloud in a format of many files: those of each piece, which is a sweep, and others.
+
+    Parameters
+    ----------
+    cloud, sweeps
+        Its points, and when and where its sweeps began.
+
+    Attributes
+    ----------
+    folders
+        Folders of the files of the pieces.
+    """
+
+    folders: Sequence[str] = ()
+
+    def __init__(self, cloud: CloudLike, sweeps: Sweeps) -> None:
+        self.cloud, self.sweeps = cloud, sweeps
+
+    def __len__(self) -> int:
+        return len(self.sweeps)
+
+    def read(self, first: int, stop: int) -> Iterator[Cloud]:
+        """Yield the points of some pieces."""
+        return self.sweeps.points(self.cloud, first, stop)
+
+    def files(self, number: int, points: Cloud) -> tuple[dict[str, bytes], Any]:
+        """Return the files of a piece, and what `others` needs of it."""
+        raise NotImplementedError
+
+    def others(self, made: Sequence[Any]) -> Mapping[str, bytes]:
+        """Return the files that are not of one piece."""
+        return {}
+
+
+Written = tuple[int, list[Any]]  # points of a range, and what `Pieces.others` needs of its pieces
+
+
+@dataclass(frozen=True)
+class RangeWriter:
+    """Writes ranges of the pieces of a cloud, in any process that sees the folder.
+
+    Parameters
+    ----------
+    module
+        That of the format in this room; its class `Pieces` says what is in which file.
+    cloud, sweeps
+        The cloud.
+    place
+        The folder.
+    """
+
+    module: str
+    cloud: CloudLike
+    sweeps: Sweeps
+    place: Storage
+    _mark: bytes = field(default_factory=lambda: secrets.token_hex(8).encode())
+
+    def __call__(self, span: tuple[int, int]) -> Written | None:
+        """Write the files of the pieces from the first to before the second.
+
+        Returns
+        -------
+        None if this process does not see the folder, lacks the format's package, or after `stop`.
+
+        Raises
+        ------
+        OSError
+            If a file cannot be written.
+        """
+        try:
+            pieces = self._pieces()
+        except ImportError:
+            return None
+        if not self.place.sees(_MARK, self._mark):
+            return None
+        count, made = 0, []
+        for number, points in enumerate(pieces.read(*span), span[0]):
+            files, more = pieces.files(number, points)
+            for name, data in files.items():
+                self.place.write(name, data)
+            count += len(points)
+            made.append(more)
+        return count, made
+
+    def stop(self) -> None:
+        """Let no further range be written."""
+        self.place.remove([_MARK])
+
+    def write(self, workers: Workers | None = None) -> None:
+        """Write all files, in threads where workers do not.
+
+        Raises
+        ------
+        OSError
+            If a file cannot be written.
+        LidarpoolError
+            If the cloud is not in the order of scans, or of another survey; or what `workers`
+            raises.
+        """
+        pieces = self._pieces()
+        self.place.prepare()
+        self._make_folders(pieces.folders)
+        count = len(pieces)
+        size = max(1, min(RANGE_PIECES, RANGE_POINTS * count // max(1, len(self.cloud))))
+        spans = [(first, min(first + size, count)) for first in range(0, count, size)]
+        self.place.write(_MARK, self._mark)
+        made = workers(self, spans) if workers else {}
+        left = [span for span in spans if span not in made]
+        with ThreadPoolExecutor(THREADS, "write") as pool:  # ends when all its threads have
+            made |= {span: it for span, it in zip(left, pool.map(self, left), strict=True) if it}
+        self.stop()
+        if sum(rows for rows, _ in made.values()) != len(self.cloud):
+            raise LidarpoolError(MIXED_UP)
+        others = pieces.others([more for span in spans for more in made[span][1]])
+        self._make_folders([str(Path(name).parent) for name in others])
+        for name, data in others.items():
+            self.place.write(name, data)
+        self.place.tidy()
+
+    def _pieces(self) -> Pieces:
+        module = import_module(f".{self.module}", __package__)
+        pieces: Pieces = module.Pieces(self.cloud, self.sweeps)
+        return pieces
+
+    def _make_folders(self, names: Sequence[str]) -> None:
+        for name in dict.fromkeys(names) if self.place.is_local else ():
+            Path(self.place.url, name).mkdir(parents=True, exist_ok=True)
+
+
+Span = tuple[int, int]
+# Writes ranges on workers; returns what was written of those whose workers see the folder.
+Workers = Callable[[RangeWriter, Sequence[Span]], dict[Span, Written]]

@@ -1,0 +1,109 @@
+"""LIDAR workers that write formats of many files, once the survey is done."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from distributed import Client, Future
+
+from poolpart import Partition, Recorder, TaskRecord, fetch_available
+
+from ..base.errors import LidarpoolError
+from ..base.task_book import TaskBook
+from ..export.pieces import RangeWriter, Span, Written
+from ..scan import EXPORT, LIDAR, Watch
+from ..scan.failures import raise_if_failed
+from .result import RunResult
+
+LOOK_EVERY_S = 0.01
+ENDS_S = 10.0  # for ranges that are being written when the others are stopped
+
+
+class LidarWorkers:
+    """Has the workers of LIDAR write ranges of files; see `lidarpool.export.pieces`.
+
+    Parameters
+    ----------
+    client, partition
+        The cluster, and its partition LIDAR.
+    patience_s, tell
+        As of `Watch`.
+    """
+
+    def __init__(
+        self, client: Client, partition: Partition, patience_s: float, tell: Callable[[str], None]
+    ) -> None:
+        self._client, self._partition = client, partition
+        self._patience_s, self._tell = patience_s, tell
+        self._book = TaskBook()
+
+    def __call__(self, writer: RangeWriter, spans: Sequence[Span]) -> dict[Span, Written]:
+        """Write ranges; returns what was written of those whose workers see the folder.
+
+        The range of a worker that dies is written by another.
+
+        Raises
+        ------
+        LidarpoolError
+            If a worker cannot write, several die of a range, or there is none for too long.
+        """
+        waiting, most = deque(spans), 2 * self._partition.slots
+        running: dict[Future, Span] = {}
+        written: dict[Span, Written] = {}
+        watch = Watch(self._client, [LIDAR], patience_s=self._patience_s, tell=self._tell)
+        with warnings.catch_warnings():
+            # Of many sweeps; it is made once, and then fetched from worker to worker.
+            warnings.filterwarnings("ignore", message="Sending large graph")
+            shared = self._partition.submit(_same, writer)
+        try:
+            while waiting or running:
+                while waiting and len(running) < most:
+                    span = waiting.popleft()
+                    running[self._partition.submit(_write_range, shared, span)] = span
+                for future in running:
+                    raise_if_failed(future, f"Writing {writer.place}")
+                ended = {future.key: future for future in running if future.status == "finished"}
+                for key, (made, record) in fetch_available(self._client, [*ended]).items():
+                    span = running.pop(ended[key])
+                    self._book.add(record)
+                    if made is not None:
+                        written[span] = made
+                watch.look(time.monotonic())
+                if not ended:
+                    time.sleep(LOOK_EVERY_S)
+        finally:
+            if running:
+                writer.stop()
+                until = time.monotonic() + ENDS_S
+                while any(f.status == "pending" for f in running) and time.monotonic() < until:
+                    time.sleep(LOOK_EVERY_S)
+        return written
+
+    def recorded(self, result: RunResult) -> RunResult:
+        """Return a result with the tasks that wrote ranges."""
+        book = self._book
+        return replace(
+            result,
+            records=(*result.records, *book.records),
+            stages=(*result.stages, *book.stages.values()),
+        )
+
+
+def _same(writer: RangeWriter) -> RangeWriter:
+    return writer
+
+
+def _write_range(writer: RangeWriter, span: Span) -> tuple[Written | None, TaskRecord]:
+    """Write a range on a worker."""
+    recorder = Recorder(EXPORT, LIDAR)
+    try:
+        made = writer(span)
+    except OSError as error:
+        raise LidarpoolError(
+            f"the worker {recorder.done().worker} cannot write there: {error.strerror or error}."
+        ) from None
+    return made, recorder.done(span[1] - span[0])
