@@ -1,6 +1,7 @@
 """Clouds in other formats, read back by the libraries of those formats."""
 
 import json
+import pickle
 import signal
 import sys
 import threading
@@ -32,7 +33,7 @@ from lidarpool.base.open3d_module import load_open3d
 from lidarpool.base.vocabulary import FORMATS
 from lidarpool.columns.storage import Storage
 from lidarpool.columns.table import TABLE
-from lidarpool.export import pieces
+from lidarpool.export import parquet, pieces
 from lidarpool.export.boxes import Boxes
 from lidarpool.export.cloud_file import CloudFile
 from lidarpool.export.formats import Format
@@ -581,6 +582,32 @@ def test_an_error_in_a_thread_ends_the_writing(sweeps, cloud, tmp_path, monkeypa
         Format("kitti").write(tmp_path / "kitti", cloud, sweeps)
     assert len(begun) <= 3
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["kitti", "nuscenes", "parquet", "pcd"])
+def test_workers_and_threads_write_the_same_files(sweeps, cloud, tmp_path, name, monkeypatch):
+    """What workers do not see is written here."""
+    monkeypatch.setattr(parquet, "CHUNK_POINTS", 1000)
+    Format(name).write(tmp_path / "threads", cloud, sweeps)
+    monkeypatch.setattr(pieces, "RANGE_PIECES", 1)
+    ranges, sent = [], []
+
+    def workers(writer, spans):
+        ranges.extend(spans)
+        sent.append(pickle.dumps(writer))
+        made = {span: pickle.loads(sent[0])(span) for span in spans[::2]}
+        assert all(made.values())
+        return made
+
+    Format(name).write(tmp_path / "workers", cloud, sweeps, workers=workers)
+    assert len(ranges) == (3 if name == "parquet" else 10)
+    one, two = (
+        {path.relative_to(tmp_path / folder): path.read_bytes() for path in files if path.is_file()}
+        for folder in ("threads", "workers")
+        for files in [(tmp_path / folder).rglob("*")]
+    )
+    assert one == two
+    assert pickle.loads(sent[0])(ranges[0]) is None  # the folder is gone
 
 
 def test_an_interrupt_leaves_nothing_of_what_threads_write(sweeps, cloud, tmp_path, monkeypatch):

@@ -1,11 +1,16 @@
 """Clouds in other formats, by scenarios and by the command."""
 
+import errno
 import json
+import os
 
 import laspy
 import numpy as np
+import pytest
 
 from lidarpool import Cloud, Scene, Survey, read_cloud
+from lidarpool.columns.storage import Storage
+from lidarpool.export import pieces
 from lidarpool.export.folder import result_folder
 from lidarpool.export.formats import Format
 from lidarpool.export.sweeps import Sweeps
@@ -36,6 +41,8 @@ def test_a_run_writes_what_its_scenario_asks_for_and_a_result_is_exported(
     left = [note for note in report["notes"] if "does not hold" in note]
     assert [note.split()[0] for note in left] == ["mcap", "kitti"]
     assert left[1] in done.out and "channel" in left[1]
+    assert report["stages"]["export"]["items"] == 6  # sweeps, written by workers
+    assert report["tasks"]["LIDAR"]["export"] == 1 and report["placement_violations"] == 0
     cloud = read_cloud(out / "cloud.ply")
     assert {"intensity", "time", "range", "class", "reflectivity"} <= set(cloud.columns)
     np.testing.assert_allclose(laspy.read(out / "cloud.laz").xyz, cloud.positions, atol=1e-5)
@@ -105,3 +112,74 @@ def test_an_interrupt_says_which_formats_are_written(lidarpool, tmp_path, monkey
     told = lidarpool("export", tmp_path, "-f", "las", "-f", "nuscenes")
     assert told.code == 130
     assert f"everything was stopped. Written before: {tmp_path}/cloud.las." in told.err
+
+
+def many_files(lidarpool, tmp_path, address):
+    """Run a survey that exports to KITTI, with a range for each sweep."""
+    (tmp_path / "s.yaml").write_text(SCENARIO.replace("laz, {format: mcap, layout: ouster}, ", ""))
+    run = ("run", tmp_path / "s.yaml", "--out", tmp_path / "out", "--only", "cloud", "-q")
+    return lambda *more: lidarpool(*run, "--scheduler", address, *more)
+
+
+def test_a_worker_that_cannot_write_is_one_line_and_nothing_is_lost(
+    cluster, lidarpool, tmp_path, monkeypatch
+):
+    def full(storage, name, data):
+        if name.endswith("4.bin"):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        write(storage, name, data)
+
+    monkeypatch.setattr(pieces, "RANGE_PIECES", 1)
+    run, write, out = many_files(lidarpool, tmp_path, cluster), Storage.write, tmp_path / "out"
+    (tmp_path / "s.yaml").write_text((tmp_path / "s.yaml").read_text().replace("0.3", "0.5"))
+    with monkeypatch.context() as patch:
+        patch.setattr(Storage, "write", full)
+        failed = run()
+    assert failed.code == 2 and failed.err.count("\n") == 1
+    assert f"Writing {out}/kitti failed: the worker" in failed.err
+    assert "cannot write there: No space left on device. " in failed.err
+    assert "are kept in" in failed.err
+    assert {path.name for path in out.iterdir()} == {"run"}
+    assert run("--resume").code == 0
+    assert len(list((out / "kitti").rglob("*.bin"))) == 10
+    assert not list(out.rglob(".*"))
+
+
+# Ends its worker at its first file of points, and never again.
+DIES = """
+import os, pathlib, signal
+from lidarpool.columns.storage import Storage
+armed = pathlib.Path(os.environ["ARMED"])
+def write_and_die(storage, name, data, write=Storage.write):  # a preload may run twice
+    write(storage, name, data)
+    if name.endswith(".bin") and armed.exists():
+        armed.unlink()
+        os.kill(os.getpid(), signal.SIGKILL)
+Storage.write = write_and_die
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_another_worker_writes_the_range_of_one_that_dies(
+    cluster, outside, lidarpool, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(pieces, "RANGE_PIECES", 1)
+    armed = tmp_path / "armed"
+    armed.touch()
+    own = outside()
+    own.add(("GPU", 1))
+    for _ in range(2):
+        own.add(("LIDAR", 4), preload=DIES, ARMED=str(armed))
+    own.wait()
+    done = many_files(lidarpool, tmp_path, own.address)()
+    assert (done.code, done.err, armed.exists()) == (0, "", False)
+    report = json.loads((tmp_path / "out/report.json").read_text())
+    assert report["stages"]["export"]["items"] == 6
+    assert len(report["stages"]["export"]["workers"]) in (1, 2)
+    written = tmp_path / "out/kitti"
+    files = {path.relative_to(written): path.read_bytes() for path in written.rglob("*.*")}
+    (tmp_path / "out").rename(tmp_path / "first")
+    assert many_files(lidarpool, tmp_path, cluster)().code == 0
+    again = {path.relative_to(written): path.read_bytes() for path in written.rglob("*.*")}
+    assert files == again

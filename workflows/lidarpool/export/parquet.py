@@ -39,7 +39,7 @@ class Pieces(pieces.Pieces):
 
     def read(self, first: int, stop: int) -> Iterator[Cloud]:
         """Yield so many million points."""
-        return islice(self.cloud.chunks(first=first * CHUNK_POINTS), stop - first)
+        return islice(self.cloud.chunks(CHUNK_POINTS, first * CHUNK_POINTS), stop - first)
 
     def files(self, number: int, points: Cloud) -> tuple[dict[str, bytes], None]:
         """Return a file."""

@@ -7,10 +7,11 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import lru_cache
 
 from distributed import Client, Future
 
-from poolpart import Partition, Recorder, TaskRecord, fetch_available
+from poolpart import Partition, Recorder, TaskRecord, fetch_available, own_client
 
 from ..base.errors import LidarpoolError
 from ..base.task_book import TaskBook
@@ -20,6 +21,7 @@ from ..scan.failures import raise_if_failed
 from .result import RunResult
 
 LOOK_EVERY_S = 0.01
+FETCH_S = 60.0
 ENDS_S = 10.0  # for ranges that are being written when the others are stopped
 
 
@@ -56,15 +58,16 @@ class LidarWorkers:
         written: dict[Span, Written] = {}
         watch = Watch(self._client, [LIDAR], patience_s=self._patience_s, tell=self._tell)
         with warnings.catch_warnings():
-            # Of many sweeps; it is made once, and then fetched from worker to worker.
+            # Of many sweeps. Workers fetch it from the one that has it: as an argument of the
+            # tasks it would make Dask send them all to that worker.
             warnings.filterwarnings("ignore", message="Sending large graph")
             shared = self._partition.submit(_same, writer)
         try:
             while waiting or running:
                 while waiting and len(running) < most:
                     span = waiting.popleft()
-                    running[self._partition.submit(_write_range, shared, span)] = span
-                for future in running:
+                    running[self._partition.submit(_write_range, shared.key, span)] = span
+                for future in (shared, *running):
                     raise_if_failed(future, f"Writing {writer.place}")
                 ended = {future.key: future for future in running if future.status == "finished"}
                 for key, (made, record) in fetch_available(self._client, [*ended]).items():
@@ -97,11 +100,23 @@ def _same(writer: RangeWriter) -> RangeWriter:
     return writer
 
 
-def _write_range(writer: RangeWriter, span: Span) -> tuple[Written | None, TaskRecord]:
+@lru_cache(maxsize=1)
+def _fetched(key: str) -> RangeWriter:
+    """Fetch the writer once for all ranges; it is made again if its worker has died."""
+    until = time.monotonic() + FETCH_S
+    while not (found := fetch_available(own_client(), [key])):
+        if time.monotonic() > until:
+            raise LidarpoolError(f"nobody has told it what to write for {FETCH_S:.0f} s.")
+        time.sleep(LOOK_EVERY_S)
+    writer: RangeWriter = found[key]
+    return writer
+
+
+def _write_range(key: str, span: Span) -> tuple[Written | None, TaskRecord]:
     """Write a range on a worker."""
     recorder = Recorder(EXPORT, LIDAR)
     try:
-        made = writer(span)
+        made = _fetched(key)(span)
     except OSError as error:
         raise LidarpoolError(
             f"the worker {recorder.done().worker} cannot write there: {error.strerror or error}."
