@@ -209,13 +209,7 @@ class Format:
     def put(
         self, storage: Storage, cloud: CloudLike, sweeps: Sweeps, workers: Workers | None
     ) -> None:
-        """Have workers write a format of many files into a storage where it is not yet.
-
-        Raises
-        ------
-        LidarpoolError
-            If that fails: none of them is left.
-        """
+        """Have workers write a format of many files into a storage; LidarpoolError leaves none."""
         place = Storage(storage.path(self.file))
         with _explained(place):
             try:

@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ..columns.cloud import CHUNK_POINTS, Cloud, CloudLike
-from ..columns.table import AXES
+from ..columns.table import AXES, Column
 from . import pieces
 from .sweeps import Sweeps
 
@@ -21,11 +21,7 @@ class Pieces(pieces.Pieces):
     def __init__(self, cloud: CloudLike, sweeps: Sweeps) -> None:
         super().__init__(cloud, sweeps)
         fields = [
-            pa.field(
-                c.in_files,
-                pa.from_numpy_dtype(kind),
-                metadata={"unit": c.unit, "meaning": c.meaning},
-            )
+            pa.field(c.in_files, pa.from_numpy_dtype(kind), True, _words(c))
             for c, kind in (
                 *((axis, np.dtype(np.float64)) for axis in AXES),
                 *((column, np.dtype(column.dtype)) for column in cloud.table),
@@ -56,6 +52,10 @@ class Pieces(pieces.Pieces):
         memory = pa.BufferOutputStream()
         pq.write_table(table, memory)
         return {f"part-{number:05}.parquet": memory.getvalue()}
+
+
+def _words(column: Column) -> dict[str, str]:
+    return {"unit": column.unit, "meaning": column.meaning}
 
 
 def _list(sweeps: Sweeps) -> str:

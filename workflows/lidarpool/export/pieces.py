@@ -23,17 +23,9 @@ _MARK = ".writing"  # a file in the folder while ranges are written
 
 
 class Pieces:
-    """A cloud in a format of many files: those of each piece, which is a sweep, and others.
+    """The files of a cloud in a format of many: those of each piece, a sweep or other, and more.
 
-    Parameters
-    ----------
-    cloud, sweeps
-        Its points, and when and where its sweeps began.
-
-    Attributes
-    ----------
-    folders
-        Folders of the files of the pieces.
+    `folders` are those of the files of the pieces.
     """
 
     folders: Sequence[str] = ()
@@ -57,21 +49,15 @@ class Pieces:
         return {}
 
 
+Span = tuple[int, int]  # a range of pieces
 Written = tuple[int, list[Any]]  # points of a range, and what `Pieces.others` needs of its pieces
 
 
 @dataclass(frozen=True)
 class RangeWriter:
-    """Writes ranges of the pieces of a cloud, in any process that sees the folder.
+    """Writes ranges of the pieces of a cloud, in any process that sees the folder `place`.
 
-    Parameters
-    ----------
-    module
-        That of the format in this room; its class `Pieces` says what is in which file.
-    cloud, sweeps
-        The cloud.
-    place
-        The folder.
+    `module` is that of the format, whose class `Pieces` says what is in which file.
     """
 
     module: str
@@ -80,17 +66,12 @@ class RangeWriter:
     place: Storage
     _mark: bytes = field(default_factory=lambda: secrets.token_hex(8).encode())
 
-    def __call__(self, span: tuple[int, int]) -> Written | None:
-        """Write the files of the pieces from the first to before the second.
+    def __call__(self, span: Span) -> Written | None:
+        """Write the files of a range; OSError if that fails.
 
         Returns
         -------
         None if this process does not see the folder, lacks the format's package, or after `stop`.
-
-        Raises
-        ------
-        OSError
-            If a file cannot be written.
         """
         try:
             pieces = self._pieces()
@@ -112,15 +93,12 @@ class RangeWriter:
         self.place.remove([_MARK])
 
     def write(self, workers: Workers | None = None) -> None:
-        """Write all files, in threads where workers do not.
+        """Write all files, in threads those that workers do not; OSError if that fails.
 
         Raises
         ------
-        OSError
-            If a file cannot be written.
         LidarpoolError
-            If the cloud is not in the order of scans, or of another survey; or what `workers`
-            raises.
+            If the cloud is not of these sweeps, or not in order; or as `workers`.
         """
         pieces = self._pieces()
         self.place.prepare()
@@ -152,6 +130,5 @@ class RangeWriter:
             Path(self.place.url, name).mkdir(parents=True, exist_ok=True)
 
 
-Span = tuple[int, int]
 # Writes ranges on workers; returns what was written of those whose workers see the folder.
 Workers = Callable[[RangeWriter, Sequence[Span]], dict[Span, Written]]

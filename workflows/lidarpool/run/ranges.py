@@ -26,15 +26,7 @@ ENDS_S = 10.0  # for ranges that are being written when the others are stopped
 
 
 class LidarWorkers:
-    """Has the workers of LIDAR write ranges of files; see `lidarpool.export.pieces`.
-
-    Parameters
-    ----------
-    client, partition
-        The cluster, and its partition LIDAR.
-    patience_s, tell
-        As of `Watch`.
-    """
+    """Has the workers of LIDAR write ranges of files; `patience_s` and `tell` as of `Watch`."""
 
     def __init__(
         self, client: Client, partition: Partition, patience_s: float, tell: Callable[[str], None]
@@ -46,12 +38,8 @@ class LidarWorkers:
     def __call__(self, writer: RangeWriter, spans: Sequence[Span]) -> dict[Span, Written]:
         """Write ranges; returns what was written of those whose workers see the folder.
 
-        The range of a worker that dies is written by another.
-
-        Raises
-        ------
-        LidarpoolError
-            If a worker cannot write, several die of a range, or there is none for too long.
+        The range of a worker that dies is written by another. LidarpoolError if one cannot write,
+        several die of a range, or there is none for too long.
         """
         waiting, most = deque(spans), 2 * self._partition.slots
         running: dict[Future, Span] = {}
