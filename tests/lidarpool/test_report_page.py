@@ -200,7 +200,7 @@ def test_points_by_object_are_all_accounted_for(write):
 class Chunks(Cloud):
     """A cloud that gives itself out in small parts."""
 
-    def chunks(self, points: int = 0) -> Iterator[Cloud]:
+    def chunks(self, points: int = 0, first: int = 0) -> Iterator[Cloud]:
         return super().chunks(97)
 
 

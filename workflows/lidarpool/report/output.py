@@ -128,7 +128,7 @@ def write_result(
         for one in formats:
             if one not in direct:
                 one.write(staged / one.file, result.points, sweeps, workers=workers)
-        if storage:
+        if storage and direct:
             _remove_earlier(storage, files)
             for one in direct:
                 one.put(storage, result.points, sweeps, workers)
@@ -144,6 +144,8 @@ def write_result(
         text = json.dumps(report, indent=1, allow_nan=False) + "\n"
         (staged / REPORT).write_text(text, encoding="utf-8")
         if storage:
+            if not direct:
+                _remove_earlier(storage, files)
             for name in (*EXPORTS, *FILES):
                 if (staged / name).exists():
                     storage.put(staged / name, name)

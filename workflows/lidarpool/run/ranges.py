@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 
-from distributed import Client, Future
+from distributed import Client, Future, Reschedule
 
 from poolpart import Partition, Recorder, TaskRecord, fetch_available, own_client
 
@@ -21,7 +21,7 @@ from ..scan.failures import raise_if_failed
 from .result import RunResult
 
 LOOK_EVERY_S = 0.01
-FETCH_S = 60.0
+FETCH_S = 1.0
 ENDS_S = 10.0  # for ranges that are being written when the others are stopped
 
 
@@ -49,7 +49,7 @@ class LidarWorkers:
             # Of many sweeps. Workers fetch it from the one that has it: as an argument of the
             # tasks it would make Dask send them all to that worker.
             warnings.filterwarnings("ignore", message="Sending large graph")
-            shared = self._partition.submit(_same, writer)
+            shared = self._partition.submit(_same, writer, priority=10)
         try:
             while waiting or running:
                 while waiting and len(running) < most:
@@ -66,6 +66,8 @@ class LidarWorkers:
                 watch.look(time.monotonic())
                 if not ended:
                     time.sleep(LOOK_EVERY_S)
+        except OSError as error:
+            raise LidarpoolError(f"The cluster was lost while it wrote {writer.place}.") from error
         finally:
             if running:
                 writer.stop()
@@ -94,7 +96,7 @@ def _fetched(key: str) -> RangeWriter:
     until = time.monotonic() + FETCH_S
     while not (found := fetch_available(own_client(), [key])):
         if time.monotonic() > until:
-            raise LidarpoolError(f"nobody has told it what to write for {FETCH_S:.0f} s.")
+            raise Reschedule  # what makes it again needs a slot
         time.sleep(LOOK_EVERY_S)
     writer: RangeWriter = found[key]
     return writer
