@@ -288,6 +288,7 @@ class Absent:
 
 sys.meta_path.insert(0, Absent())
 """
+ANOTHER_PYTHON = "import platform; platform.python_version = lambda: '3.99.1'"
 ANOTHER_VERSION = "import lidarpool._version as v; v.__version__ = '99.0'"
 
 
@@ -296,6 +297,7 @@ def test_workers_whose_lidarpool_is_not_ours(outside, place, refused):
     for preload, says in (
         (WITHOUT_LIDARPOOL, "does not have lidarpool: install lidarpool"),
         (ANOTHER_VERSION, "has lidarpool 99.0, here it is"),
+        (ANOTHER_PYTHON, "has Python 3.99.1, here it is"),
     ):
         worker = cluster.add(("GPU", 1), preload=preload)
         cluster.wait()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import platform
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -144,7 +145,14 @@ def _survey_pool(client: Client, needed: Mapping[str, int]) -> Pool:
 
 
 def _check_versions(client: Client, workers: Sequence[str]) -> None:
-    """Check that the workers at these addresses have this version of lidarpool."""
+    """Check that the workers at these addresses have this version of Python and of lidarpool."""
+    here = platform.python_version()
+    for address, python in ask_workers(client, platform.python_version, workers).items():
+        if str(python).split(".")[:2] != here.split(".")[:2]:  # code is sent to it by value
+            raise LidarpoolError(
+                f"The worker at {address} has Python {python}, here it is {here}: install the same "
+                "one on both sides."
+            )
 
     # Nested, so that it is sent by value: a worker without the package can still run it.
     def version() -> str:
