@@ -59,7 +59,7 @@ class Refiner:
         x += z
         with np.errstate(divide="ignore", invalid="ignore"):
             t = np.divide(offset, x, out=offset)
-        far = np.flatnonzero(~(np.abs(t - rough) <= _TRUST) & (rough < np.inf))
+            far = np.flatnonzero(~(np.abs(t - rough) <= _TRUST) & (rough < np.inf))
         if len(far):
             # A grazing ray may meet the plane anywhere, but not the triangle.
             at = origins if len(origins) == 1 else origins[far]
