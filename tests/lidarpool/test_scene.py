@@ -36,6 +36,11 @@ def test_world_coordinates_come_back(centre, offsets):
         assert not scene.origin.any()
 
 
+def test_a_scene_is_shown_in_one_line():
+    scene = Scene.from_meshes([triangle()])
+    assert repr(scene) == "<Scene: 1 object, 1 triangle, 1.00 x 1.00 x 0.00 m>"
+
+
 def test_georeferenced_coordinates_lose_no_digit():
     given = triangle(at=(512_345.678_9, 5_403_210.123_4, 431.5))
     scene = Scene.from_meshes([given])

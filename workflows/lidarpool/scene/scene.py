@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..base.arguments import as_array, checked, checked_fields, shown
 from ..base.errors import LidarpoolError
+from ..base.words import counted
 from .actors import Actor
 from .mesh import Mesh, points_array
 from .meshfile import load_meshes
@@ -58,6 +59,11 @@ class Scene:
     names: tuple[str, ...]
     origin: NDArray[np.float64]
     actors: tuple[Actor, ...] = ()
+
+    def __repr__(self) -> str:
+        sides = " x ".join(f"{side:,.2f}" for side in np.ptp(self.bounds, axis=0))
+        objects = counted(len(self.all_names), "object")
+        return f"<Scene: {objects}, {counted(self.triangles, 'triangle')}, {sides} m>"
 
     def __post_init__(self) -> None:
         vertices = points_array("the scene", self.vertices)
