@@ -60,7 +60,8 @@ def check(
 
     file = None if cluster is None else ClusterFile.load(cluster)
     read = Scenario.load(scenario)
-    job = make_job(read, backend, no_plan)
+    with shown_status("reading the scene", as_json):
+        job = make_job(read, backend, no_plan)
     running = nullcontext() if scheduler is None else connected(scheduler, files)
     with running as client, shown_status("casting some rays", as_json):
         found = forecast(job, read.pool, out, client, formats_of(read), file)

@@ -90,13 +90,14 @@ def run_scenario(scenario: Scenario, options: RunOptions) -> None:
     set_logs(options.verbose)
     if options.here:  # before reading the scene, which may take long
         check_backend_here(options.backend or scenario.pool.backend)
-    job = make_job(
-        scenario,
-        options.backend,
-        options.no_plan,
-        wait_s=options.wait_s,
-        patience_s=options.patience_s,
-    )
+    with shown_status("reading the scene", options.quiet):
+        job = make_job(
+            scenario,
+            options.backend,
+            options.no_plan,
+            wait_s=options.wait_s,
+            patience_s=options.patience_s,
+        )
     if options.cluster is not None:
         options.cluster.require(slots_needed(job.collectors, job.planning is not None))
     if not options.quiet:
