@@ -39,7 +39,7 @@ from ..scan.rig import Rig, RigPlan
 from ..scenario.sections import PoolSection
 from ..scene.scene import Scene
 from ..sensor import Survey
-from .run_command import NO_HITS
+from .run_command import no_hits
 
 # Measured on Linux: a process of ours with Dask loaded, and the most that a triangle takes while a
 # caster is built (Embree 300, NumPy 350, CUDA 360).
@@ -135,7 +135,7 @@ def forecast(
     if _worker_bytes(job) <= MEMORY_LIMIT:
         sample = sample_survey(job.scene, job.survey)
         if not sample.hits:
-            notes.append(NO_HITS)
+            notes.append(no_hits(job))
     # Without a sample every ray may hit.
     points = sample.points if sample else job.survey.ray_count // job.survey.keep_every
     needed = _worker_bytes(job) if client or file else _machine_bytes(job, points, slots)

@@ -40,8 +40,6 @@ from .worker_logs import WorkerLogs
 if TYPE_CHECKING:
     from ..live.run_page import LiveRun
 
-NO_HITS = "no ray hit anything: check poses, ranges and units"
-
 
 @dataclass(frozen=True)
 class RunOptions:
@@ -171,6 +169,13 @@ def _simulate(
     return result, report
 
 
+def no_hits(job: Job) -> str:
+    """Return advice for a survey without hits."""
+    (x, y, z) = job.survey.pose(0).position + job.scene.origin
+    where = f"the sensor begins at ({x:,.3f}, {y:,.3f}, {z:,.3f})"
+    return f"no ray hit anything: check poses, ranges and units; {where}"
+
+
 def formats_of(scenario: Scenario) -> list[Format]:
     """List the formats that a scenario exports the cloud to."""
     return [Format(one.format, one.layout) for one in scenario.output.write if one.format != "ply"]
@@ -284,7 +289,7 @@ def _tell(out: Path | Storage, result: RunResult, job: Job, report: dict[str, An
     for note in report["notes"]:
         click.echo(f"note: {note}")
     if not result.hits:
-        click.echo(f"note: {NO_HITS}")
+        click.echo(f"note: {no_hits(job)}")
     click.echo(
         f"{job.survey.scan_count:,} scans, {result.rays:,} rays, {result.hits:,} hits on "
         f"{counted(len(job.scene.all_names), 'object')}, {len(result.points):,} points in the "
