@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import logging
 import os
@@ -145,8 +144,7 @@ def test_the_page_tells_what_the_report_does(demo):
     page, report = (out / "report.html").read_text(), json.loads((out / "report.json").read_text())
     for name, count in report["points_by_object"].items():
         assert re.search(rf">{name}</th>.*?<td>{count:,}</td>", page) or not count
-    for name in FILES[1:5]:
-        assert base64.b64encode((out / name).read_bytes()).decode() in page
+    assert len(re.findall(r"<figure[^>]*>\s*<svg", page)) == len(FILES[1:5])
     assert f"<dd>{report['planning']['best_length']:.2f} m</dd>" in page
     assert len(page) < 4_000_000 and "http" not in re.sub(r"base64,[\w+/=]+|http-equiv", "", page)
 
