@@ -187,6 +187,36 @@ def test_a_result_goes_to_the_bucket(cluster, lidarpool, tmp_path, environment):
         assert half.code == 2 and f"{url} has no complete result" in half.err
 
 
+@pytest.mark.slow
+def test_workers_put_files_of_sweeps_there(cluster, lidarpool, tmp_path, environment, monkeypatch):
+    (tmp_path / "s.yaml").write_text(SCENARIO + "output: {write: [nuscenes]}\n")
+    url, here = f"{BUCKET}/results/sweeps", tmp_path / "here"
+    Storage.at(f"{url}/nuscenes").write("map.json", b"of an earlier result")
+    run = ["run", tmp_path / "s.yaml", "--scheduler", cluster, "--only", "cloud", "-q", "--out"]
+    for place in (here, url):
+        assert lidarpool(*run, place).code == 0
+    report = json.loads(Storage.at(url).read("report.json"))
+    assert report["tasks"]["LIDAR"]["export"] == 1
+    system, folder = fsspec.url_to_fs(f"{url}/nuscenes")
+    found = {name.removeprefix(f"{folder}/"): system.cat(name) for name in system.find(folder)}
+    made = [path for path in (here / "nuscenes").rglob("*") if path.is_file()]
+    assert found == {str(path.relative_to(here / "nuscenes")): path.read_bytes() for path in made}
+
+    write = Storage.write
+
+    def full(storage, name, data):
+        if name.endswith(".bin"):
+            raise OSError("Access Denied")
+        write(storage, name, data)
+
+    monkeypatch.setattr(Storage, "write", full)
+    failed = lidarpool(*run, url, "--overwrite")
+    assert failed.code == 2 and failed.err.count("\n") == 1
+    assert f"Writing {url}/nuscenes failed: the worker" in failed.err
+    assert "Access Denied" in failed.err and "--resume" in failed.err
+    assert not Storage.at(url).has("nuscenes") and not Storage.at(url).has("report.json")
+
+
 @pytest.mark.parametrize(
     ("url", "words"),
     [
