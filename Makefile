@@ -33,7 +33,7 @@ slow: dev  ## the tests that take minutes, which `test` leaves out
 sample: dev  ## of the slow tests, one of each kind
 	$(BIN)/python -m pytest -m sample -n 2 --dist loadfile  # a browser draws with the processor
 
-compat:  ## the tests with the oldest and the newest versions allowed, and with Dask's main
+compat:  ## the tests with the oldest and the newest versions allowed, on three Pythons
 	@sh .ci/compat
 
 chaos: dev  ## 200 faults, every kind at every point of a survey; SEED=n plays them again
