@@ -90,6 +90,20 @@ def room():
     return [*shell, box("Crate", (1.5, 1.5, 1.5), (2, -4, 1.05))]
 
 
+def test_triangles_that_share_no_vertices_do_not_come_apart():
+    """A block as .stl files have it, turned inside out: no ray of the camera gets into it."""
+    block = box("Block", (12, 20, 4), (0, 0, 2))
+    block = Mesh("Block", block.vertices, block.faces[:, ::-1])
+    corners = block.vertices[block.faces].reshape(-1, 3)
+    loose = Mesh("Block", corners, np.arange(len(corners)).reshape(-1, 3))
+    depths = [
+        take_shot(Scene.from_meshes([one]), [], size=SIZE, backend="numpy").depth
+        for one in (block, loose)
+    ]
+    inside = np.isfinite(depths[0])
+    assert np.allclose(depths[0][inside], depths[1][inside], rtol=1e-4)
+
+
 def test_the_inside_of_a_closed_hall_is_shown():
     scene = Scene.from_meshes(room())
     poses = np.array([[0, 0.5, 1.5], [1, 6, 1.5]])

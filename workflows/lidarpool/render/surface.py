@@ -74,13 +74,14 @@ def apart(scene: Scene, objects: NDArray[np.integer[Any]], step: float) -> Scene
     Wüthrich, 1998), so that the sides of a box all move by `step` metres, or up to three times as
     far: neighbours in the list of objects (f,) differ, as walls that cross have sides in one plane.
     """
-    vertices, count = scene.vertices, len(scene.vertices)
+    vertices = scene.vertices
     a, b, c = (vertices[scene.faces[:, k]] for k in range(3))
     normals = unit(np.cross(b - a, c - a))
+    place = _places(scene, objects)
+    count = int(place.max(initial=-1)) + 1
     mean, whole, inwards = np.zeros((count, 3)), np.full(count, 1e-30), np.zeros(count)
-    for here, left, right, corner in zip(
-        (a, b, c), (b, c, a), (c, a, b), scene.faces.T, strict=True
-    ):
+    around = zip((a, b, c), (b, c, a), (c, a, b), place[scene.faces].T, strict=True)
+    for here, left, right, corner in around:
         angle = np.arccos(np.clip(dot(unit(left - here), unit(right - here)), -1, 1))
         whole += np.bincount(corner, angle, count)
         for k in range(3):
@@ -88,7 +89,20 @@ def apart(scene: Scene, objects: NDArray[np.integer[Any]], step: float) -> Scene
         inwards[corner] = step * (1 + objects % _DEPTHS / 2)
     mean /= whole[:, None]
     inwards /= np.maximum(dot(mean, mean), _SHARPEST)
-    return replace(scene, vertices=vertices - inwards[:, None] * mean)
+    return replace(scene, vertices=vertices - (inwards[:, None] * mean)[place])
+
+
+def _places(scene: Scene, objects: NDArray[np.integer[Any]]) -> Ints:
+    """Return a number (v,) for each vertex, the same for those of one object at one place.
+
+    Files such as .stl have three vertices for each triangle, which must not come apart.
+    """
+    key = np.zeros(len(scene.vertices), np.uint64)
+    key[scene.faces] = objects[:, None]
+    for bits in (scene.vertices + 0.0).view(np.uint64).T:  # a hash; 0.0 makes -0.0 positive
+        key = (key ^ bits) * np.uint64(0x9E3779B97F4A7C15)
+        key ^= key >> np.uint64(29)
+    return np.unique(key, return_inverse=True)[1]
 
 
 def dot(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.floating]:
