@@ -231,7 +231,7 @@ def test_nuscenes_has_a_folder_for_each_sensor(written, cloud):
 @pytest.mark.parametrize(("layout", "step"), [("velodyne", 22), ("autoware", 32), ("ouster", 48)])
 def test_bags_have_points_frames_and_a_clock(written, cloud, sweeps, name, layout, step):
     store = get_typestore(Stores.ROS2_HUMBLE)
-    clouds, frames, boxes, clocks = {}, {}, {}, []
+    clouds, frames, boxes, clocks = {}, {}, [], []
     with AnyReader([written(name, layout)], default_typestore=store) as bag:
         for connection, when, data in bag.messages():
             message = bag.deserialize(data, connection.msgtype)
@@ -242,13 +242,15 @@ def test_bags_have_points_frames_and_a_clock(written, cloud, sweeps, name, layou
                     frames[transform.child_frame_id, when] = transform
             elif connection.topic == "/actors":
                 (box,) = message.markers
-                boxes[box.ns, when] = box
+                boxes.append((when, box))
             else:
                 clocks.append(when)
     assert {topic for topic, _ in clouds} == {"/front/points", "/rear/points"}
     assert {frame for frame, _ in frames} == {"front", "rear", "Car"}
     assert len(clouds) == len(clocks) == len(boxes) == 10
-    box = boxes["front", 300_000_000]  # of the sweep without points: where it begins
+    # One box, however many sensors see it. The first of this time is of a sweep without points.
+    assert {(box.ns, box.id) for _, box in boxes} == {("actors", 0)}
+    box = next(box for when, box in boxes if when == 300_000_000)
     assert (box.header.frame_id, box.text, box.type) == ("map", "Car", box.CUBE)
     place = box.pose.position
     np.testing.assert_allclose([place.x, place.y, place.z], [5.6, 5, 0.75], atol=1e-12)

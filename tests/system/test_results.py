@@ -24,7 +24,9 @@ def scene() -> Scene:
 @pytest.fixture(scope="module")
 def result(cluster_client, scene) -> Result:
     planning = Planning((25, 25), (-30, -20), trials=1, particles=10, iterations=2)
-    return simulate(scene, Survey(SENSOR, [(0, 0, 1)], 36), planning, client=cluster_client)
+    return simulate(
+        scene, Survey(SENSOR, [(0, 0, 1)], 36, keep_every=5), planning, client=cluster_client
+    )
 
 
 @pytest.fixture

@@ -60,7 +60,7 @@ def check(
 
     file = None if cluster is None else ClusterFile.load(cluster)
     read = Scenario.load(scenario)
-    with shown_status("reading the scene", as_json):
+    with shown_status("reading the scene", as_json, logged=False):
         job = make_job(read, backend, no_plan)
     running = nullcontext() if scheduler is None else connected(scheduler, files)
     with running as client, shown_status("casting some rays", as_json):

@@ -88,7 +88,7 @@ def run_scenario(scenario: Scenario, options: RunOptions) -> None:
     set_logs(options.verbose)
     if options.here:  # before reading the scene, which may take long
         check_backend_here(options.backend or scenario.pool.backend)
-    with shown_status("reading the scene", options.quiet):
+    with shown_status("reading the scene", options.quiet, logged=False):
         job = make_job(
             scenario,
             options.backend,

@@ -36,15 +36,16 @@ def shown_progress(quiet: bool = False) -> Iterator[Show]:
 
 
 @contextmanager
-def shown_status(text: str, quiet: bool = False) -> Iterator[None]:
-    """Show a status on stderr while the body runs."""
+def shown_status(text: str, quiet: bool = False, logged: bool = True) -> Iterator[None]:
+    """Show a status on stderr while the body runs; in a log, too, if it is `logged`."""
     if quiet or sys.stderr is None:
         yield
     elif (console := _terminal()) is not None:
         with console.status(text):
             yield
     else:
-        _tell(_Unheard(sys.stderr), text)
+        if logged:
+            _tell(_Unheard(sys.stderr), text)
         yield
 
 

@@ -105,7 +105,7 @@ def _messages(
         yield topic, message, time_ns
         if actors:
             boxes = Boxes.of(sweeps, sweep, points)
-            yield "/actors", make.markers(boxes, frame, actors, time_ns), time_ns
+            yield "/actors", make.markers(boxes, actors, time_ns), time_ns
 
 
 def _rows(row: np.dtype[np.void], points: Cloud, sweeps: Sweeps, sweep: int) -> NDArray[np.void]:
@@ -169,8 +169,8 @@ class _Messages:
             for name, placed in frames
         ])  # fmt: skip
 
-    def markers(self, boxes: Boxes, sensor: str, actors: list[str], time_ns: int) -> Any:
-        """Boxes of actors as a sensor saw them."""
+    def markers(self, boxes: Boxes, actors: list[str], time_ns: int) -> Any:
+        """Boxes of actors as a sensor saw them, in place of those that another saw before."""
         kind, types = "geometry_msgs/msg/", self._types
         point, turn, pose, vector = (
             types[f"{kind}{name}"] for name in ("Point", "Quaternion", "Pose", "Vector3")
@@ -183,7 +183,7 @@ class _Messages:
         always = types["builtin_interfaces/msg/Duration"](0, 0)
         return types["visualization_msgs/msg/MarkerArray"]([
             marker(
-                header, sensor, number, marker.CUBE, marker.ADD,
+                header, "actors", number, marker.CUBE, marker.ADD,
                 pose(point(*boxes.centres[number].tolist()),
                      turn(*boxes.quaternions[number].tolist())),
                 vector(*boxes.sizes[number].tolist()), orange, always, False, [], [], "",

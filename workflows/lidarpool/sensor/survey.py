@@ -141,7 +141,7 @@ class Survey:
     sensor: Sensor = field(default_factory=Sensor.grid)
     poses: Sequence[Any] = ()
     steps: int | None = None
-    keep_every: int = 5
+    keep_every: int = 1
     precision_m: float = None  # type: ignore[assignment]  # filled in below
     columns: Sequence[str | Column] = ()
     trajectory: Trajectory | None = None
