@@ -167,7 +167,10 @@ def test_reading_what_is_not_a_cloud(tmp_path):
         "no z": (data.replace(b"float z", b"float w"), "lacks z"),
         "mesh": (data.replace(b"end_header", b"element face 0\nend_header"), "more than points"),
         "huge": (data.replace(b"vertex 20", b"vertex " + b"9" * 30), "bytes announced"),
-        "5000 digits": (data.replace(b"vertex 20", b"vertex " + b"9" * 5000), "Exceeds the limit"),
+        "5000 digits": (
+            data.replace(b"vertex 20", b"vertex " + b"9" * 5000),
+            "bytes announced|Exceeds",
+        ),
         "below 0": (data.replace(b"vertex 20", b"vertex -1"), "no points"),
         "list": (data.replace(b"uint16 ring", b"list uchar int ring"), "list properties"),
     }
