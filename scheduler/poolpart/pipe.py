@@ -90,7 +90,7 @@ class Pipe:
     Examples
     --------
     >>> from distributed import Client
-    >>> client = Client(processes=False, dashboard_address="127.0.0.1:0")
+    >>> client = Client(processes=False, dashboard_address=None)
     >>> pipe = Pipe("numbers-1f3a", capacity=3, client=client).create()
     >>> pipe.put((1, 2)); pipe.put("three"); pipe.close()
     >>> list(pipe)
