@@ -260,7 +260,6 @@ def test_without_credentials_or_rights(lidarpool, environment, monkeypatch, tmp_
 
 
 @pytest.mark.slow
-@pytest.mark.sample
 def test_drivers_are_killed_and_the_next_has_nothing_but_the_bucket(
     cluster, environment, lidarpool, tmp_path
 ):
