@@ -210,7 +210,8 @@ def test_an_encrypted_cluster_of_jobs(empty_queue, tmp_path, monkeypatch, certif
         file["arguments"] |= {"security": True, "shared_temp_directory": str(tmp_path)}
     run = Command(tmp_path, file)
     run.assert_default_result()
-    assert "The cluster at tls://" in run.said
+    logs = [log.read_text() for log in tmp_path.glob("gpu-*.err")]
+    assert logs and all("tls://" in log and "tcp://" not in log for log in logs)
     assert empty_queue.jobs() == {}
 
 
