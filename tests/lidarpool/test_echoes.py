@@ -366,7 +366,7 @@ def test_batches_and_chunks_leave_no_trace(options, path, per_turn, monkeypatch)
 def test_returns_are_thinned_out_scan_by_scan():
     scene = seed_objects(rings=8, segments=12)
     sensor = Sensor(BEAMS, Spin(90, step_deg=360))
-    beam = Returns("all", subrays=7, divergence_mrad=50, pulse_ns=1)
+    beam = Returns("all", subrays=7, divergence_mrad=150, pulse_ns=1)
     every, third = (cast(scene, sensor, returns=beam, keep_every=n) for n in (1, 3))
     assert every["returns"].max() > 1
     for name in COLUMNS:

@@ -6,6 +6,7 @@ ray and return, so the batches do not matter.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -16,7 +17,8 @@ from raybeam import Pattern, ScanReturns
 
 from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
-from ..sensor.optics import Mode, hexagon, spread
+from ..sensor.disc import disc, neighbours
+from ..sensor.optics import Mode, spread
 from .motion import Clock, Poses
 from .surfaces import Surfaces
 from .world import World
@@ -25,6 +27,7 @@ PATTERN_RAYS = 20_000_000  # sub-rays of a head's period that are kept; 24 bytes
 CHUNK_RAYS = 1 << 18  # sub-rays that are cast at a time
 BLOCK_RAYS = 1 << 14  # rays whose sub-rays are made at a time, to fit a cache
 PASSES_MOST = 16  # surfaces that light passes before it is dropped
+SLOPE = 0.5  # of the distance between neighbouring hits: what the slopes of one surface may miss
 
 Whole = NDArray[np.int64]
 Rays = NDArray[np.integer[Any]]
@@ -42,6 +45,11 @@ class Hits(NamedTuple):
     def take(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Hits:
         """Select some of them."""
         return Hits(self.ray[rows], self.distance[rows], self.triangle[rows], self.energy[rows])
+
+
+# Normals of the surfaces of some hits, by row, as they are seen in mirrors, and directions of their
+# rays: (n, 3) each.
+Planes = Callable[[NDArray[np.intp]], tuple[Real, Real]]
 
 
 def joined(parts: list[Hits]) -> Hits:
@@ -128,7 +136,7 @@ class EchoCaster:
 
     def _beam(self, sensor: Sensor) -> Real:
         divergence, _ = self._survey.returns.of(sensor.optics)
-        return hexagon(self._survey.returns.subrays, divergence)
+        return disc(self._survey.returns.subrays, divergence)
 
     def scan(
         self,
@@ -173,9 +181,10 @@ class EchoCaster:
                 else:
                     beams = divided
                 window = (row, row + (stop - start) * len(beam))
-                hits = self._hits(sensor, beams, poses.part(start, stop, len(beam)), window)
-                ray, energy = start + hits.ray // len(beam), hits.energy / len(beam)
-                returns = separated(hits._replace(ray=ray, energy=energy), gap_m)
+                here = poses.part(start, stop, len(beam))
+                hits, planes = self._hits(sensor, beams, here, window)
+                returns = separated(hits, gap_m, len(beam), planes)
+                returns = returns._replace(ray=start + returns.ray)
                 chunks.append(self._reported(returns, keys))
             found = self._kept(joined(chunks), groups)
         if noise.range_m or noise.range_per_m:
@@ -229,7 +238,9 @@ class EchoCaster:
         extinction = self._survey.extinction(sensor)
         return self._surfaces.energy(triangle, cosine, distance, extinction)
 
-    def _hits(self, sensor: Sensor, beams: Pattern, poses: Poses, window: tuple[int, int]) -> Hits:
+    def _hits(
+        self, sensor: Sensor, beams: Pattern, poses: Poses, window: tuple[int, int]
+    ) -> tuple[Hits, Planes]:
         """Cast sub-rays, and follow the light through glass and off mirrors."""
         surfaces, materials = self._surfaces, self._surfaces.materials
         farthest = sensor.max_range_m
@@ -245,12 +256,17 @@ class EchoCaster:
         origins = np.broadcast_to(origins, directions.shape)
         times = poses.times(ray)
         share, before = np.ones(len(ray)), np.zeros(len(ray))
+        # What mirrors did to the directions so far: (n, 3, 3), if there are any.
+        turns = np.broadcast_to(np.eye(3), (len(ray), 3, 3)) if materials.mirrors.any() else None
         parts: list[Hits] = []
+        seen: list[Real] = []  # normals as the sensor sees them
         for _ in range(PASSES_MOST):
-            along = surfaces.along_normal(triangle, directions, times)
+            normals = surfaces.normals(triangle, times)
+            along = _products(normals, directions)
             distance = before + step
             energy = share * self._energy(sensor, triangle, np.abs(along), distance)
             parts.append(Hits(ray, distance, triangle, energy))
+            seen.append(normals if turns is None else np.einsum("nji,nj->ni", turns, normals))
             rows = surfaces.objects(triangle)
             on = np.flatnonzero(materials.passes[rows] | materials.mirrors[rows])
             if not len(on):
@@ -258,8 +274,12 @@ class EchoCaster:
             rows, along, distance, ahead = rows[on], along[on], distance[on], directions[on]
             share = share[on] * materials.goes_on(rows, np.abs(along)) ** 2  # and back again
             ends = origins[on] + step[on, None] * ahead
-            folded = 2 * materials.mirrors[rows] * along
-            ahead = ahead - folded[:, None] * surfaces.normals(triangle[on], times[on])
+            mirrored = 2 * materials.mirrors[rows, None] * normals[on]
+            ahead = ahead - along[:, None] * mirrored
+            if turns is not None:
+                turns = turns[on]
+                along_turns = np.einsum("ni,nij->nj", normals[on], turns)
+                turns = turns - mirrored[:, :, None] * along_turns[:, None]
             away = self._clear_m / np.maximum(np.abs(along), 1e-3)
             light = Pattern(ahead, ends + away[:, None] * ahead)
             # Light takes no time: it travels 300 m in a microsecond.
@@ -270,12 +290,18 @@ class EchoCaster:
             which, step, triangle = found.ray[near], found.distance[near], found.triangle[near]
             ray, share, before = ray[on][which], share[which], before[which]
             times = times[on][which]
+            turns = None if turns is None else turns[which]
             directions = light.directions[which]
             origins = light.origins[which]  # type: ignore[index]  # it has some
-        hits = joined(parts)
+        hits, normals = joined(parts), seen[0]
         if parts[1:]:
-            hits = hits.take(np.argsort(hits.ray, kind="stable"))
-        return hits
+            order = np.argsort(hits.ray, kind="stable")
+            hits, normals = hits.take(order), np.concatenate(seen)[order]
+
+        def planes(rows: NDArray[np.intp]) -> tuple[Real, Real]:
+            return normals[rows], poses.rays(beams, hits.ray[rows], window[0])[1]
+
+        return hits, planes
 
     def _reported(self, returns: Hits, keys: Keys) -> Hits:
         """Select detected returns, and among them those that the mode reports."""
@@ -323,11 +349,22 @@ def _runs(ray: Whole) -> tuple[Whole, Whole]:
     return begins, np.diff(begins, append=len(ray))
 
 
-def separated(hits: Hits, gap_m: float) -> Hits:
-    """Make returns of hits: hits of a ray within a distance of the next are one return.
+def _products(one: Real, other: Real) -> Real:
+    """Scalar products of vectors (n, 3): (n,)."""
+    (x, y, z), (a, b, c) = one.T, other.T
+    product = x * a
+    product += y * b
+    product += z * c
+    return np.asarray(product)
 
-    Its energy is their sum, its distance their mean weighted by energy, its triangle that of the
-    strongest. Hits without energy are dropped.
+
+def separated(hits: Hits, gap_m: float, each: int = 1, planes: Planes | None = None) -> Hits:
+    """Make returns of hits: those of a beam within a distance of the next are one return.
+
+    So are hits of neighbouring sub-rays on one surface, however far apart they are: a beam that
+    grazes a road illuminates all of the road between them. A return's energy is the sum over its
+    hits, its distance their mean weighted by energy, its triangle that of the strongest. Hits
+    without energy are dropped.
 
     Parameters
     ----------
@@ -335,36 +372,96 @@ def separated(hits: Hits, gap_m: float) -> Hits:
         Of all sub-rays, in the order of rays.
     gap_m
         Half of the pulse's length in metres.
+    each
+        Sub-rays of a beam; they follow one another, and have the same share of the beam.
+    planes
+        Of the hits, where there are sub-rays.
 
     Returns
     -------
     Hits
-        In the order of rays and distances.
+        In the order of beams and distances; `ray` is the number of the beam.
     """
+    rows = np.arange(len(hits.ray))
     some = hits.energy > 0
     if not some.all():
-        hits = hits.take(some)
-    if not len(hits.ray):
+        rows, hits = rows[some], hits.take(some)
+    if not len(rows):
         return hits
-    begins, counts = _runs(hits.ray)
+    beam = hits.ray // each
+    begins, counts = _runs(beam)
     width = np.maximum.reduceat(hits.distance, begins) - np.minimum.reduceat(hits.distance, begins)
-    new = np.zeros(len(hits.ray), np.bool_)
+    new = np.zeros(len(rows), np.bool_)
     new[begins] = True
-    # Few beams hit an edge, and only those are sorted.
+    # Few beams hit an edge or graze a surface, and only their hits are sorted.
     wide = np.flatnonzero(np.repeat(width > gap_m, counts))
     if len(wide):
-        order = wide[np.lexsort((hits.distance[wide], hits.ray[wide]))]
-        rows = np.arange(len(hits.ray))
-        rows[wide] = order
-        hits = hits.take(rows)
+        order = np.arange(len(rows))
+        order[wide] = wide[np.lexsort((hits.distance[wide], beam[wide]))]
+        rows, hits = rows[order], hits.take(order)
         new[1:] |= np.diff(hits.distance) > gap_m
+        if planes is not None and each > 1:
+            # Of those, the beams that fall into several returns.
+            begins, counts = _runs(beam[wide])
+            several = np.add.reduceat(new[wide], begins, dtype=np.int64) > 1
+            falls = wide[np.repeat(several, counts)]
+            if len(falls):
+                part, marks = hits.take(falls), new[falls]
+                normal, direction = planes(rows[falls])
+                new[falls] &= ~_continued(part, marks, gap_m, each, normal, direction)
     begins = np.flatnonzero(new)
     which = np.cumsum(new) - 1
     energy = np.bincount(which, hits.energy).astype(np.float64)
     distance = np.bincount(which, hits.energy * hits.distance) / energy
     strongest = np.flatnonzero(hits.energy == np.maximum.reduceat(hits.energy, begins)[which])
     first = strongest[numbers(which[strongest]) == 0]
-    return Hits(hits.ray[begins], distance, hits.triangle[first], energy)
+    return Hits(beam[begins], distance, hits.triangle[first], energy / each)
+
+
+def _continued(
+    hits: Hits, new: NDArray[np.bool_], gap_m: float, each: int, normal: Real, direction: Real
+) -> NDArray[np.bool_]:
+    """Whether a surface continues from before each hit to behind it: no return begins, (n,).
+
+    Two neighbouring sub-rays hit one surface if the planes through the two hits meet half-way
+    between them, within the gap or half of the distance between the hits. The inverse range of a
+    plane is linear in the ray's direction, so two hits on one plane always meet, whatever the
+    angle; half of the distance allows for rough ground.
+
+    Parameters
+    ----------
+    hits, new, gap_m, each
+        As of `separated`; the hits of each beam are sorted by distance. `new` are the returns by
+        distances alone.
+    normal, direction
+        The planes of the hits.
+    """
+    beam = hits.ray // each
+    # The hit of each sub-ray, after so many panes of glass: a row for each beam and number of them.
+    order = np.argsort(hits.ray, kind="stable")
+    panes = np.empty(len(beam), np.int64)
+    panes[order] = numbers(hits.ray[order])
+    most = int(panes.max()) + 1
+    row = (np.cumsum(np.diff(beam, prepend=beam[0]) != 0)) * most + panes
+    table = np.full((int(row.max()) + 1, each), -1)
+    table[row, hits.ray % each] = np.arange(len(beam))
+    one, other = table[:, neighbours(each)].reshape(-1, 2).T
+    number = np.cumsum(new)
+    pair = (one >= 0) & (other >= 0) & (number[one] != number[other])
+    one, other = one[pair], other[pair]
+    near = 1 / hits.distance
+
+    def half_way(this: Whole, that: Whole) -> Real:
+        """Ranges half-way to another hit, on the plane of the first."""
+        slope = _products(normal[this], direction[that]) / _products(normal[this], direction[this])
+        return np.asarray(2 / (near[this] * np.maximum(1 + slope, 1e-9)))
+
+    step = np.abs(half_way(one, other) - half_way(other, one))
+    apart = np.abs(hits.distance[one] - hits.distance[other])
+    meet = step <= np.maximum(gap_m, SLOPE * apart)
+    low, high = np.sort([one[meet], other[meet]], axis=0)
+    begin, end = (np.bincount(hit + 1, minlength=len(beam) + 1) for hit in (low, high))
+    return np.asarray(np.cumsum(begin - end)[:-1] > 0)
 
 
 def chosen(returns: Hits, mode: Mode) -> NDArray[np.bool_]:

@@ -13,8 +13,9 @@ from ..base.vocabulary import BACKENDS, FORMATS, LAYOUTS, columns_needed
 from ..columns.table import COORDINATES, OPTIONAL
 from ..scene.transform import Transform
 from ..sensor import Sensor
+from ..sensor.disc import SUBRAYS
 from ..sensor.models import load_sensor
-from ..sensor.optics import MODES, SUBRAYS
+from ..sensor.optics import MODES
 
 COLUMN_NAMES = tuple(column.in_files for column in OPTIONAL)
 

@@ -11,15 +11,12 @@ from numpy.typing import NDArray
 
 from ..base.arguments import checked_fields
 from ..base.errors import LidarpoolError
+from .disc import SUBRAYS
 
 LIGHT_M_NS = 0.299792458  # in vacuum; in air it is slower by 0.03 %
-SUBRAYS = tuple(3 * ring * (ring + 1) + 1 for ring in range(9))  # 1, 7, 19, 37, … 217
 MODES = ("strongest", "first", "last", "dual", "all")
 
 Mode = Literal["strongest", "first", "last", "dual", "all"]
-
-# The hexagon is rotated, because edges of surfaces are often parallel to the axes.
-_TURNED = 0.19
 
 
 def check_numbers(thing: object, limits: Mapping[str, tuple[float, float]]) -> None:
@@ -69,7 +66,7 @@ class Returns:
         Returns of a pulse to report: the strongest, the first, the last, the strongest and the
         last ("dual"; the two strongest if those are one), or all.
     subrays
-        Rays in a beam, a hexagonal number: 1, 7, 19, 37, 61, … 217.
+        Rays in a beam: 1, 7, 19, 37, 61, 91, 127, 169 or 217.
     divergence_mrad
         Full angle of the beam; None for the sensor's.
     pulse_ns
@@ -108,27 +105,6 @@ class Returns:
             )
         pulse_ns = optics.pulse_ns if self.pulse_ns is None else self.pulse_ns
         return (wide or 0.0) / 1000, LIGHT_M_NS * pulse_ns / 2
-
-
-def hexagon(count: int, divergence: float) -> NDArray[np.float64]:
-    """Places of sub-rays in a beam: (count, 2), radians off its axis, the middle first.
-
-    Each has the same share of the beam, so that the outermost cells end with the cone: an evenly
-    bright beam.
-    """
-    rings = SUBRAYS.index(count)
-    spacing = divergence / 2 / (rings + 0.5)
-    places = [(0.0, 0.0)]
-    for ring in range(1, rings + 1):
-        for side in range(6):
-            begin, end = (np.radians([60 * side, 60 * side + 60]) + _TURNED).tolist()
-            for step in range(ring):
-                share = step / ring
-                places.append((
-                    ring * ((1 - share) * np.cos(begin) + share * np.cos(end)),
-                    ring * ((1 - share) * np.sin(begin) + share * np.sin(end)),
-                ))  # fmt: skip
-    return spacing * np.array(places)
 
 
 def spread(

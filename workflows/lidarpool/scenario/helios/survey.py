@@ -17,7 +17,7 @@ import yaml
 
 from ...base.errors import LidarpoolError
 from ...sensor import Pose
-from ...sensor.optics import SUBRAYS
+from ...sensor.disc import SUBRAYS
 from ...sensor.survey import SENSORS_MOST
 from ..scenario import Scenario
 from .files import Assets, Float, about, clean, number, rotation, vector
