@@ -8,6 +8,11 @@ from lidarpool.columns.parts import PartColumns, pack
 from lidarpool.scan.messages import Receipt, samples_of_scan, summary_type
 
 
+def name_of(mark, first, stop, number=0):
+    """Name of a part whose last digits are given, not random."""
+    return f"{mark}-{first:08d}-{stop:08d}-{number:08x}.npz"
+
+
 def commit(store, first, counts, triangles, hits, number=0):
     """Write a part of scans, with so many points of each, and commit it; whether it was new."""
     rng = np.random.default_rng(first)
@@ -16,7 +21,7 @@ def commit(store, first, counts, triangles, hits, number=0):
         c.name: rng.integers(0, 2, counts.sum()).astype(c.dtype) for c in survey.stored_columns
     }
     part = PartColumns(first, counts, columns, np.int32(triangles), np.int64(hits))
-    data, name = bytes(pack(part)), f"{first}-{number}.npz"
+    data, name = bytes(pack(part)), name_of(store.db.meta["mark"], first, part.stop, number)
     store.storage.prepare()
     store.storage.write(name, data)
     summaries = np.zeros(len(counts), summary_type(samples_of_scan(survey.scan_count)))

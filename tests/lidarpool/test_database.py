@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.lidarpool.committing import name_of
 
 from lidarpool import LidarpoolError
 from lidarpool.plan import Planning, run_trial
@@ -20,10 +21,18 @@ from lidarpool.scan.messages import Receipt
 SCANS = 20
 
 
-def receipt(first, stop, name="", rows=7, cells=(0, 0, 0, 1, 1, 1)):
-    return Receipt(
-        0, first, stop, name or f"{first}.npz", rows, 100 + rows, 3 * rows, cells, b"summary"
-    )
+MARK = "0123456789abcdef"
+
+
+def receipt(first, stop, number=0, rows=7, cells=(0, 0, 0, 1, 1, 1)):
+    name = name_of(MARK, first, stop, number)
+    return Receipt(0, first, stop, name, rows, 100 + rows, 3 * rows, cells, b"summary")
+
+
+@pytest.fixture(autouse=True)
+def mark(monkeypatch):
+    """Give all runs the same mark."""
+    monkeypatch.setattr("lidarpool.scan.database.secrets.token_hex", lambda size: MARK[: 2 * size])
 
 
 @pytest.fixture
@@ -42,10 +51,10 @@ def test_what_is_committed_is_there_once(db):
     one, two = receipt(0, 5), receipt(10, 12, rows=2)
     assert db.commit([two, one]) == [two, one]
     assert db.commit([one]) == []
-    assert db.commit([receipt(0, 5, "again")]) == []
+    assert db.commit([receipt(0, 5, 1)]) == []
     again = reopened(db)
     for found in (db, again):
-        assert [p.name for p in found.ordered] == ["0.npz", "10.npz"]
+        assert [p.name for p in found.ordered] == [one.name, two.name]
         assert (found.scans_done, found.point_count, found.hits) == (7, 9, 27)
         assert found.committed.nonzero()[0].tolist() == [0, 1, 2, 3, 4, 10, 11]
         assert len(found.parts) == 2 and not found.complete
@@ -56,7 +65,7 @@ def test_a_part_that_has_a_committed_scan_is_left_out_whole(db):
     db.commit([receipt(5, 10)])
     given = [
         receipt(4, 6), receipt(9, 12), receipt(0, 20), receipt(6, 7),
-        receipt(0, 5), receipt(3, 5, "overlaps one of the same commit"), receipt(10, 11),
+        receipt(0, 5), receipt(3, 5, 2), receipt(10, 11),
     ]  # fmt: skip
     assert [(p.first, p.stop) for p in db.commit(given)] == [(0, 5), (10, 11)]
     assert db.missing(0, SCANS) == [(11, 20)]
@@ -80,7 +89,7 @@ def test_whatever_comes_each_scan_is_of_one_part_or_missing(tmp_path_factory, co
     for spans in commits:
         given = []
         for first, stop in spans:
-            given.append(receipt(first, stop, f"{number}.npz"))
+            given.append(receipt(first, stop, number))
             number += 1
         for part in db.commit(given):
             for scan in range(part.first, part.stop):
@@ -185,6 +194,15 @@ DAMAGE = {
     "of something else": lambda path: sql(path, "DROP TABLE parts"),
     "cells": lambda path: sql(path, "UPDATE parts SET cells = '{'"),
     "trial of nothing": lambda path: sql(path, "INSERT INTO trials VALUES (0, '{}')"),
+    "place of another run": lambda path: sql(
+        path, "INSERT INTO meta VALUES ('parts', '/data/run-fedcba9876543210')"
+    ),
+    "no mark": lambda path: sql(path, "UPDATE meta SET value = '' WHERE name = 'mark'"),
+    "another mark": lambda path: sql(
+        path, "UPDATE meta SET value = 'fedcba9876543210' WHERE name = 'mark'"
+    ),
+    "path": lambda path: sql(path, "UPDATE parts SET name = '../../' || name"),
+    "name with more": lambda path: sql(path, "UPDATE parts SET name = name || '.bak'"),
     "of another format": lambda path: sql(path, "UPDATE meta SET value = '1' WHERE name='format'"),
 }
 

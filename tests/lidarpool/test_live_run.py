@@ -74,7 +74,7 @@ def test_a_part_that_cannot_be_read_is_left_out_and_the_others_are_shown():
     live = LivePoints(store)
     for scan in range(3):
         commit(store, scan, [5], [7], [25])
-    store.storage.remove(["1-0.npz"])
+    store.storage.remove([store.db.part_of(1).name])
     live.add(store.db.ordered)
     live.gather()
     assert len(live.cloud) == 10

@@ -11,11 +11,15 @@ from hypothesis import strategies as st
 
 from lidarpool import Cloud, LidarpoolError
 from lidarpool.columns.parts import (
-    SUFFIX,
     PartColumns,
     StoredCloud,
+    is_part_of,
+    mark_name,
+    own_files,
     pack,
+    part_name,
     positions,
+    probe_name,
     read_part,
     read_tally,
     unpack,
@@ -65,6 +69,19 @@ def test_numpy_opens_a_part():
         for column in COLUMNS:
             assert archive[column.name].dtype == np.dtype(column.dtype)
             assert np.array_equal(archive[column.name], part.columns[column.name])
+
+
+def test_threads_can_read_parts(monkeypatch):
+    """Python's parser, which NumPy reads headers with, fails now and then in several threads."""
+    data = bytes(pack(SMALL))
+
+    def fail(*_):
+        raise SystemError("AST constructor recursion depth mismatch (before=45, after=42)")
+
+    monkeypatch.setattr("ast.literal_eval", fail)
+    with pytest.raises(SystemError):
+        np.load(io.BytesIO(data))["x"]
+    assert bytes(pack(unpack(data))) == data
 
 
 def test_columns_that_are_not_contiguous_are_packed_as_they_read():
@@ -148,8 +165,32 @@ def test_a_part_that_cannot_be_read_is_named(storage, read):
     with pytest.raises(LidarpoolError, match=r"The part .*none\.npz cannot be"):
         read(storage, "none.npz")
     storage.write("cut.npz", bytes(pack(SMALL))[:-30])
-    with pytest.raises(LidarpoolError, match=r"The part .*cut\.npz cannot be used.*start it anew"):
+    with pytest.raises(
+        LidarpoolError, match=r"The part .*cut\.npz cannot be used.*Resuming .* casts"
+    ):
         read(storage, "cut.npz")
+
+
+def test_a_run_owns_what_has_its_mark_where_the_folder_has_it_too(storage):
+    mark, other = "0123456789abcdef", "fedcba9876543210"
+    part = part_name(mark, 5, 120)
+    assert is_part_of(mark, part) and not is_part_of(other, part)
+    temporary = f".lidarpool-tmp-{part}-0a1b2c3d"
+    own = {part, temporary, probe_name(mark, "0a1b2c3d")}
+    foreign = {
+        "points.npz", f"{part}.bak", f"copy-{part}", f"{mark}.npz", f"{mark}-notes", f".tmp-{part}",
+        f"{temporary}.npz", part_name(other, 0, 5), part.upper(), f"{part}\n",
+    }  # fmt: skip
+    assert not any(is_part_of(mark, name) for name in {*foreign, temporary, f"../{part}"})
+    for name in own | foreign:
+        storage.write(name, b"x")
+    for which in (mark, None):
+        assert own_files(storage, which) == []
+    storage.write(mark_name(mark), b"")
+    for which in (mark, None):
+        found = own_files(storage, which)
+        assert {*found} == {*own, mark_name(mark)} and found[-1] == mark_name(mark)
+    assert own_files(storage, other) == []
 
 
 def stored_cloud(storage, counts):
@@ -157,14 +198,14 @@ def stored_cloud(storage, counts):
     parts, first = [], 0
     for number, of_scans in enumerate(counts):
         parts.append(part_of(first, of_scans))
-        storage.write(f"{number}{SUFFIX}", pack(parts[-1]))
+        storage.write(f"{number}.npz", pack(parts[-1]))
         first = parts[-1].stop
     found = [part.cells for part in parts if part.cells is not None]
     cells = None
     if found:
         table = np.array(found)
         cells = np.stack([table[:, 0].min(axis=0), table[:, 1].max(axis=0)])
-    names = [f"{number}{SUFFIX}" for number in range(len(parts))]
+    names = [f"{number}.npz" for number in range(len(parts))]
     rows = [len(part) for part in parts]
     firsts = [part.first for part in parts]
     cloud = StoredCloud(storage, names, firsts, rows, COLUMNS, cells, PRECISION_M, ORIGIN)

@@ -1,6 +1,8 @@
 """Clouds come back bit by bit, or the file that was there before is untouched."""
 
 import os
+import re
+import shutil
 
 import numpy as np
 import pytest
@@ -143,6 +145,27 @@ def test_a_faulty_write_leaves_the_earlier_result(tmp_path, monkeypatch, fault):
     with pytest.raises(kind, match=message):
         sample(1000).save(path)
     assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("count", [0, 70, 1000])
+def test_a_disk_without_room_is_told_the_size_of_the_file(tmp_path, monkeypatch, count):
+    """Written in pieces of 300 points, the file needs room for itself and one of them."""
+    monkeypatch.setattr(ply, "CHUNK_POINTS", 300)
+    path, free = tmp_path / "c.ply", 0
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=free))
+    with pytest.raises(LidarpoolError, match="could not be written: it takes") as caught:
+        sample(count).save(path)
+    numbers = re.search(r"takes ([\d,]+) bytes, and ([\d,]+) beside it", str(caught.value))
+    size, piece = (int(number.replace(",", "")) for number in numbers.groups())
+    assert piece == min(count, 300) * (3 * 4 + 4 + 2 + 4)
+    free = size + piece - 1
+    with pytest.raises(LidarpoolError, match=f"the disk has {free:,} bytes free"):
+        sample(count).save(path)
+    assert not any(tmp_path.iterdir())
+    free += 1
+    sample(count).save(path)
+    assert path.stat().st_size == size
 
 
 def test_permissions_follow_the_umask(tmp_path):

@@ -7,6 +7,7 @@ from tests.lidarpool.test_store import JOB, OTHERS, add
 
 import lidarpool.run.remote
 from lidarpool import LidarpoolError, remove_run
+from lidarpool.columns.parts import mark_name
 from lidarpool.columns.storage import Storage
 from lidarpool.run.store import RunStore
 
@@ -42,9 +43,10 @@ def test_it_goes_on_from_the_last_copy(unfinished):
     store.db.frames = 6
     store.save(now=True)
     store.tidy()
-    assert left(unfinished) == {"run.db", "run.owner", "0-0.npz", "2-0.npz"}
+    mark = mark_name(store.db.meta["mark"])
+    assert left(unfinished) == {"run.db", "run.owner", mark, *store.points().names}
     again = RunStore(JOB, unfinished, resume=True)
-    assert again.complete and len(again.points().load()) == 18
+    assert again.notes == [] and again.complete and len(again.points().load()) == 18
     again.remove()
     assert left(unfinished) == set()
 
@@ -59,6 +61,39 @@ def test_it_is_refused_or_dropped(unfinished):
     remove_run(unfinished)
     assert left(unfinished) == set()
     assert RunStore(OTHERS["scene"], unfinished).resumed == 0
+
+
+def test_damaged_and_missing_parts_are_made_again(url):
+    store = RunStore(JOB, url)
+    for scan in range(5):
+        add(store, scan, scan + 1)
+    store.save(now=True)
+    storage, names = store.storage, store.points().names
+    data = storage.read(names[1])
+    storage.write(names[1], data[:500] + bytes([data[500] ^ 4]) + data[501:])
+    storage.write(names[2], data[:-1])
+    storage.remove([names[4]])
+    again = RunStore(JOB, url, resume=True)
+    assert again.db.missing(0, 6) == [(1, 3), (4, 6)]
+    assert again.notes == [
+        f"cast again: scan 4; {names[4]} was missing in {url}/parts",
+        f"cast again: scan 1, scan 2; {names[1]}, {names[2]} were damaged in {url}/parts",
+    ]
+
+
+def test_foreign_objects_stay(unfinished):
+    parts = Storage.at(f"{unfinished}/parts")
+    foreign = {"a.npz", "arch.npz.bak", ".tmp-5.npz-1a2b"}
+    for name in foreign:
+        parts.write(name, b"mine")
+    Storage.at(f"{parts}/deeper").write("a.npz", b"mine")
+    with pytest.raises(LidarpoolError, match=rf"{parts} holds .* a\.npz, arch.* and 1 more: move"):
+        remove_run(unfinished)
+    assert left(unfinished) == foreign
+    with pytest.raises(LidarpoolError, match="is not of this run and stays there"):
+        RunStore(JOB, unfinished)
+    assert left(unfinished) == foreign
+    assert Storage.at(f"{parts}/deeper").sizes() == {"a.npz": 4}
 
 
 def test_one_of_another_format(unfinished, monkeypatch):

@@ -80,6 +80,32 @@ def test_a_write_that_fails_leaves_nothing(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
 
 
+def test_only_files_of_killed_writers_are_tidied_away(tmp_path):
+    outside, folder = tmp_path / "outside", tmp_path / "folder"
+    left = ".lidarpool-tmp-a.bin-0a1b2c3d"
+    theirs = [".tmp-a.bin", ".lidarpool-tmp-notes", f"{left}.bak", "a.bin"]
+    for place in (outside, folder / "in"):
+        place.mkdir(parents=True)
+        for name in (left, *theirs):
+            (place / name).write_text("x")
+    (folder / "link").symlink_to(outside)
+    Storage.at(folder).tidy()
+    assert {path.name for path in (folder / "in").iterdir()} == {*theirs}
+    assert {path.name for path in outside.iterdir()} == {left, *theirs}
+
+
+def test_links_and_folders_are_no_files(tmp_path):
+    (tmp_path / "file").write_text("12")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "file")
+    storage = Storage.at(tmp_path)
+    assert storage.sizes() == {"file": 2}
+    assert storage.entries() == {"file": 2, "folder": None, "link": None}
+    (tmp_path / "other").symlink_to(tmp_path / "folder")
+    assert Storage.at(tmp_path / "other").is_link
+    assert not Storage.at(tmp_path / "other" / "below").is_link
+
+
 @pytest.mark.parametrize("url", ["nonsense://a/b", "gs://bucket/folder"])
 def test_a_storage_whose_library_is_missing_says_so(url, monkeypatch):
     monkeypatch.setitem(sys.modules, "gcsfs", None)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import gc
+import sqlite3
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +14,8 @@ from tests.lidarpool.committing import commit
 
 import lidarpool.run.store
 from lidarpool import LidarpoolError, Planning, Scene, Sensor, Survey, remove_run
+from lidarpool.columns.parts import mark_name, part_name, probe_name
+from lidarpool.columns.storage import Storage
 from lidarpool.plan import run_trial
 from lidarpool.run.identity import identity_of
 from lidarpool.run.job import Job
@@ -69,10 +74,12 @@ def test_a_run_from_its_beginning_to_its_end(folder):
     rays = store.sample_rays()
     assert rays.shape[1:] == (2, 3) and set(rays[:, 1, 0]) == {0, 2}
     assert set(map(tuple, rays[:, 0].tolist())) == {(0, 0, 1)}
-    store.storage.write("stray.npz", b"of a collector that died")
+    mark = store.db.meta["mark"]
+    store.storage.write(part_name(mark, 0, 2), b"of a collector that died")
+    store.storage.write(probe_name(mark, "0a1b2c3d"), b"of a driver that died")
     store.tidy()
-    assert store.storage.sizes().keys() == {"0-0.npz", "2-0.npz"}
-    store.remove()
+    assert store.storage.sizes().keys() == {*store.points().names, mark_name(mark)}
+    assert store.remove() == ""
     assert not folder.exists()
 
 
@@ -140,26 +147,92 @@ def test_trials_are_gone_on_with_too(folder):
     assert [trial.trial for trial in again.db.trials] == [1] and not again.complete
 
 
-@pytest.mark.parametrize("damage", ["missing", "cut", "all"])
-def test_parts_that_are_not_whole_are_made_again(damage, unfinished):
-    part = unfinished / "parts" / "3-0.npz"
-    if damage == "cut":
-        part.write_bytes(part.read_bytes()[:-1])
-    else:
-        part.unlink()
-    if damage == "all":
-        (unfinished / "parts" / "0-0.npz").unlink()
-        (unfinished / "parts").rmdir()
+def part_of(folder, first):
+    """File of the part that begins with a scan."""
+    (found,) = (folder / "parts").glob(f"{'?' * 16}-{first:08d}-*.npz")
+    return found
+
+
+def flip(data, place):
+    """Flip a bit at a place."""
+    return data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :]
+
+
+DAMAGES = {
+    "header of the file": lambda data: flip(data, 0),
+    "name of an array": lambda data: flip(data, data.index(b".counts")),
+    "header of an array": lambda data: flip(data, data.index(b"descr")),
+    "data": lambda data: flip(data, data.index(b"x.npy") + 160),
+    "directory": lambda data: flip(data, data.rindex(b".counts")),
+    "end": lambda data: flip(data, len(data) - 12),
+    "cut": lambda data: data[:-1],
+    "empty": lambda data: b"",
+    "longer": lambda data: data + b"x",
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_part_is_made_again(damage, unfinished):
+    part = part_of(unfinished, 3)
+    before = part.read_bytes()
+    part.write_bytes(DAMAGES[damage](before))
+    assert part.read_bytes() != before
     store = RunStore(JOB, unfinished, resume=True)
-    lost = 4 if damage == "all" else 2
-    assert store.resumed == 4 - lost
-    (note,) = store.notes
-    assert note.startswith(f"{lost} scans were made again: their parts were missing or cut short")
-    if lost == 2:
-        assert store.db.missing(0, 6) == [(2, 6)]
+    assert (store.resumed, store.db.missing(0, 6)) == (2, [(2, 6)])
+    assert store.notes == [
+        f"cast again: scans 3 to 4; {part.name} was damaged in {unfinished / 'parts'}"
+    ]
     assert add(store, 3, 5, number=1)
     store.tidy()
-    assert set(store.points().names) == store.storage.sizes().keys()
+    assert {*store.points().names, mark_of(store)} == store.storage.sizes().keys()
+    assert len(store.points().load()) == 12
+    store.db.close()
+    assert RunStore(JOB, unfinished, resume=True).notes == []
+
+
+def test_a_part_with_the_content_of_another_is_made_again(unfinished):
+    other = part_of(unfinished, 0).read_bytes()
+    assert len(other) == part_of(unfinished, 3).stat().st_size
+    part_of(unfinished, 3).write_bytes(other)
+    store = RunStore(JOB, unfinished, resume=True)
+    assert store.resumed == 2 and "scans 3 to 4; " in store.notes[0]
+
+
+def test_parts_that_are_gone_are_made_again(unfinished):
+    for path in (unfinished / "parts").iterdir():
+        path.unlink()
+    (unfinished / "parts").rmdir()
+    store = RunStore(JOB, unfinished, resume=True)
+    assert store.resumed == 0
+    (note,) = store.notes
+    assert note.startswith("cast again: scans 0 to 1, scans 3 to 4; ")
+    assert note.endswith(f".npz were missing in {unfinished / 'parts'}")
+    assert add(store, 0, 6, number=1)
+    store.remove()
+    assert not unfinished.exists()
+
+
+def test_a_message_names_only_the_first_parts(folder):
+    store = RunStore(JOB, folder)
+    for scan in range(6):
+        add(store, scan, scan + 1)
+    store.db.close()
+    for scan in range(1, 6):
+        part_of(folder, scan).unlink()
+    (note,) = RunStore(JOB, folder, resume=True).notes
+    assert note.startswith("cast again: scan 1, scan 2, scan 3 and 2 more; ")
+    assert note.endswith(f".npz and 2 more were missing in {folder / 'parts'}")
+
+
+def test_storage_that_cannot_be_read_is_not_taken_for_damage(unfinished, monkeypatch):
+    def refuse(*_):
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Storage, "read", refuse)
+        with pytest.raises(LidarpoolError, match=r"\.npz cannot be read: Permission denied"):
+            RunStore(JOB, unfinished, resume=True)
+    assert RunStore(JOB, unfinished, resume=True).resumed == 4
 
 
 @pytest.fixture(params=["folder", "memory"])
@@ -214,17 +287,202 @@ def test_an_error_tells_how_to_go_on(folder):
 
 def test_an_error_before_anything_was_kept_leaves_nothing(folder):
     store = RunStore(JOB, folder)
-    store.storage.prepare()
-    store.storage.write("stray.npz", b"")
+    store.storage.write(part_name(store.db.meta["mark"], 0, 2), b"")
     with pytest.raises(ValueError, match="bad") as caught, store.kept_on_error():
         raise ValueError("bad")
     assert not hasattr(caught.value, "__notes__") and not folder.exists()
 
 
-def test_removing_a_run_leaves_what_is_not_its_own(unfinished):
+# -- what is not of the run stays ------------------------------------------------------------------
+
+
+def mark_of(store):
+    return mark_name(store.db.meta["mark"])
+
+
+def new_run(folder):
+    RunStore(OTHERS["scene"], folder).db.close()
+
+
+FOREIGN = {"a.npz", "arch.npz.bak", ".tmp-5.npz-1a2b", "notes.txt"}
+
+
+@pytest.fixture
+def kept_nothing(folder):
+    """A folder with a run that ended before anything was committed."""
+    store = RunStore(JOB, folder)
+    store.storage.write(part_name(store.db.meta["mark"], 0, 2), b"of a collector that died")
+    store.db.close()
+    return folder
+
+
+def put(folder, names=FOREIGN):
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        (folder / name).write_text("mine")
+
+
+def content(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize("how", ["dropped", "new", "of no run"])
+def test_foreign_files_among_the_parts_stay(how, request, folder):
+    if how != "of no run":
+        request.getfixturevalue("unfinished" if how == "dropped" else "kept_nothing")
+    put(folder / "parts")
+    (folder / "parts" / "own").mkdir()
+    with pytest.raises(LidarpoolError) as caught:
+        (remove_run if how == "dropped" else new_run)(folder)
+    assert str(caught.value) == (
+        f"{folder}/parts holds what is not of this run and stays there, .tmp-5.npz-1a2b, a.npz, "
+        "arch.npz.bak and 2 more: move it elsewhere, or give another folder."
+    )
+    assert names(folder) == {f"parts/{name}" for name in FOREIGN}
+    (folder / "parts").rename(folder / "moved")
+    new_run(folder)
+
+
+def test_a_finished_run_says_what_stays(folder):
+    store = RunStore(JOB, folder)
+    add(store, 0, 6)
+    put(folder / "parts", ["arch.npz.bak"])
+    store.tidy()
+    assert "stays there, arch.npz.bak: move it elsewhere" in store.remove()
+    assert names(folder) == {"parts/arch.npz.bak"}
+
+
+def test_files_beside_the_database_stay_without_a_word(unfinished):
     (unfinished / "report.json").write_text("{}")
-    (unfinished / "parts" / "notes.txt").write_text("mine")
-    (unfinished / "parts" / ".tmp-5.npz-1a2b").write_text("half")
+    part = part_of(unfinished, 0)
+    part.with_name(f".lidarpool-tmp-{part.name}-0a1b2c3d").write_text("half")
     remove_run(unfinished)
     remove_run(unfinished)
-    assert names(unfinished) == {"report.json", "parts/notes.txt"}
+    assert names(unfinished) == {"report.json"}
+
+
+def test_nothing_behind_a_link_is_deleted(unfinished, tmp_path):
+    parts, elsewhere = unfinished / "parts", tmp_path / "elsewhere"
+    parts.rename(elsewhere)
+    parts.symlink_to(elsewhere)
+    put(elsewhere)
+    before = content(elsewhere)
+    for use in (
+        remove_run,
+        lambda folder: RunStore(JOB, folder, resume=True),
+        lambda folder: RunStore(JOB, folder),
+    ):
+        with pytest.raises(LidarpoolError, match=f"{parts} is a link, .* deletes nothing behind"):
+            use(unfinished)
+    assert content(elsewhere) == before
+    parts.unlink()
+    elsewhere.rename(parts)
+    assert RunStore(JOB, unfinished, resume=True).resumed == 4
+
+
+@pytest.mark.parametrize("database", ["none", "empty"])
+def test_a_new_run_deletes_nothing_behind_a_link(database, folder, tmp_path):
+    if database == "empty":
+        RunStore(JOB, folder).db.close()
+        remove_tree(folder / "parts")
+    put(tmp_path / "archive")
+    folder.mkdir(exist_ok=True)
+    (folder / "parts").symlink_to(tmp_path / "archive")
+    with pytest.raises(LidarpoolError, match="is a link"):
+        new_run(folder)
+    assert content(tmp_path / "archive").keys() == FOREIGN
+
+
+def test_a_link_with_the_name_of_a_part_is_no_part(unfinished, tmp_path):
+    part, victim = part_of(unfinished, 0), tmp_path / "victim"
+    part.rename(victim)
+    part.symlink_to(victim)
+    store = RunStore(JOB, unfinished, resume=True)
+    assert store.resumed == 2 and "was missing" in store.notes[0]
+    store.db.close()
+    with pytest.raises(LidarpoolError, match=f"stays there, {part.name}: move it"):
+        remove_run(unfinished)
+    assert victim.exists() and part.is_symlink()
+
+
+def remove_tree(folder):
+    for path in folder.iterdir():
+        path.unlink()
+    folder.rmdir()
+
+
+def change(folder, *statements):
+    with closing(sqlite3.connect(folder / "run.db")) as sql, sql:
+        for statement in statements:
+            sql.execute(statement)
+
+
+@pytest.mark.parametrize("where", ["victim", "another run", "another run in a shared place"])
+@pytest.mark.parametrize("kept", ["unfinished", "kept_nothing"])
+def test_a_database_that_points_elsewhere(where, kept, request, tmp_path):
+    folder = request.getfixturevalue(kept)
+    shared = tmp_path / "shared" if where.endswith("place") else None
+    other = RunStore(JOB, tmp_path / "other", shared)
+    add(other, 0, 6)
+    put(tmp_path / "victim")
+    place = tmp_path / "victim" if where == "victim" else other.storage.url
+    change(folder, f"UPDATE meta SET value = '{place}' WHERE name = 'parts'")
+    with pytest.raises(LidarpoolError, match=r"run\.db is damaged .* is not the place of this"):
+        RunStore(JOB, folder, resume=True)
+    remove_run(folder)
+    assert not folder.exists()
+    assert content(tmp_path / "victim").keys() == FOREIGN
+    assert len(other.points().load()) == 18
+
+
+@pytest.mark.parametrize("name", ["../../{}", "/{}", "{}.bak", "../parts/{}"])
+def test_a_database_with_a_hostile_name(name, unfinished, tmp_path):
+    part = part_of(unfinished, 0).name
+    (tmp_path / part).write_text("mine")
+    change(unfinished, f"UPDATE parts SET name = '{name.format(part)}' WHERE first = 0")
+    with pytest.raises(LidarpoolError, match=r"run\.db is damaged .* is not a part of this run"):
+        RunStore(JOB, unfinished, resume=True)
+    remove_run(unfinished)
+    assert not unfinished.exists() and (tmp_path / part).read_text() == "mine"
+
+
+def test_parts_of_another_mark_stay(unfinished, tmp_path):
+    """The folder of the parts was replaced by that of another run."""
+    other = RunStore(JOB, tmp_path / "other")
+    add(other, 0, 6)
+    other.db.close()
+    remove_tree(unfinished / "parts")
+    (tmp_path / "other" / "parts").rename(unfinished / "parts")
+    with pytest.raises(LidarpoolError, match=r"stays there, .*: drop it with --fresh"):
+        remove_run(unfinished)
+    assert len(names(unfinished / "parts")) == 2
+    remove_run(unfinished)  # now that there is no database, the folder tells whose they are
+    assert not unfinished.exists()
+
+
+def test_a_damaged_database_is_dropped_with_the_parts_of_its_folder(unfinished):
+    (unfinished / "run.db").write_bytes(bytes(8192))
+    put(unfinished / "parts", ["a.npz"])
+    with pytest.raises(LidarpoolError, match="drop the run with --fresh"):
+        RunStore(JOB, unfinished)
+    assert len(names(unfinished)) == 5
+    with pytest.raises(LidarpoolError, match=r"stays there, a\.npz: move it"):
+        remove_run(unfinished)
+    assert names(unfinished) == {"parts/a.npz"}
+
+
+def test_a_database_of_another_program_stays(folder):
+    folder.mkdir()
+    change(folder, "CREATE TABLE mine (a)")
+    for use in (remove_run, new_run):
+        with pytest.raises(LidarpoolError, match=r"run\.db (is not the database|is damaged)"):
+            use(folder)
+    assert names(folder) == {"run.db"}
+
+
+def test_a_run_that_is_going_on_is_not_dropped(folder):
+    store = RunStore(JOB, folder)
+    add(store, 0, 6)
+    with pytest.raises(LidarpoolError, match=f"Another run is using {folder}"):
+        remove_run(folder)
+    assert len(store.points().load()) == 18

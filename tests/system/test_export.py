@@ -54,7 +54,7 @@ def test_a_run_writes_what_its_scenario_asks_for_and_a_result_is_exported(
     )
     assert refused.code == 2 and "layout autoware needs azimuth, elevation" in refused.err
     assert not (tmp_path / "no").exists()
-    (out / ".writing-0123").mkdir()  # of an export that was killed
+    (out / ".lidarpool-writing-01234567").mkdir()  # of an export that was killed
     refused = lidarpool("export", out, "-f", "pcd", "-f", "laz")
     assert refused.code == 2 and "cloud.laz exists" in refused.err
     assert not (out / "pcd").exists()
@@ -63,7 +63,7 @@ def test_a_run_writes_what_its_scenario_asks_for_and_a_result_is_exported(
     again = laspy.read(out / "cloud.laz")
     for name in before.point_format.dimension_names:
         np.testing.assert_array_equal(again[name], before[name])
-    assert not (out / ".writing-0123").exists()
+    assert not (out / ".lidarpool-writing-01234567").exists()
     with result_folder(out):
         refused = lidarpool("export", out, "-f", "las")
     assert refused.code == 2 and "Another run or export is using the folder" in refused.err

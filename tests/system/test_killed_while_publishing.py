@@ -26,7 +26,7 @@ from lidarpool.report.output import _publish
 root, files, earlier = Path(sys.argv[1]), json.loads(sys.argv[2]), json.loads(sys.argv[3])
 
 def publish(out, k):
-    whole, left = out / ".writing-01234567", [k]
+    whole, left = out / ".lidarpool-writing-01234567", [k]
     whole.mkdir(parents=True)
     for name in earlier:
         (out / name).write_text("earlier")
@@ -88,5 +88,10 @@ def test_what_looks_finished_is_one_result(killed):
 
 def test_the_next_run_clears_up(killed):
     for out in killed:
+        theirs = [out / ".writing-01234567", out / ".lidarpool-writing-notes"]
+        for folder in theirs:
+            folder.mkdir()
+        link = out / ".lidarpool-writing-89abcdef"
+        link.symlink_to(theirs[0])
         with result_folder(out):
-            assert not list(out.glob(".*"))
+            assert sorted(out.glob(".*")) == sorted([*theirs, link])

@@ -13,10 +13,12 @@ from typing import Any
 import fsspec
 import pytest
 from fsspec.registry import _registry
+from tests.lidarpool.test_store import JOB, add
 from tests.system.default_survey import DEFAULT_CLOUD_SHA256
 from tests.system.test_resume import DRIVERS, SCANS
 from tests.system.test_resume import SCENARIO as RESUMED
 
+from lidarpool import LidarpoolError
 from lidarpool.columns.parts import PartColumns, unpack
 from lidarpool.columns.storage import Storage
 from lidarpool.run.store import RunStore
@@ -69,11 +71,13 @@ def check(tmp_path, monkeypatch) -> Callable[[str], dict[str, Any]]:
     found: dict[str, list[PartColumns]] = {}  # {where: parts, before they went}
     remove = RunStore.remove
 
-    def look(store: RunStore) -> None:
+    def look(store: RunStore) -> str:
         storage = store.storage
-        found[storage.url] = [unpack(storage.read(name)) for name in sorted(storage.sizes())]
-        remove(store)
+        names = sorted(name for name in storage.sizes() if name.endswith(".npz"))
+        found[storage.url] = [unpack(storage.read(name)) for name in names]
+        left = remove(store)
         assert storage.sizes() == {}
+        return left
 
     monkeypatch.setattr(RunStore, "remove", look)
 
@@ -215,6 +219,31 @@ def test_workers_put_files_of_sweeps_there(cluster, lidarpool, tmp_path, environ
     assert f"Writing {url}/nuscenes failed: the worker" in failed.err
     assert "Access Denied" in failed.err and "--resume" in failed.err
     assert not Storage.at(url).has("nuscenes") and not Storage.at(url).has("report.json")
+
+
+def test_damage_is_repaired_and_foreign_objects_stay(environment):
+    url = f"{BUCKET}/results/damaged"
+    store = RunStore(JOB, url)
+    for scan in range(0, 6, 2):
+        add(store, scan, scan + 2)
+    storage, names = store.storage, store.points().names
+    data = storage.read(names[1])
+    storage.write(names[1], data[:500] + bytes([data[500] ^ 4]) + data[501:])
+    foreign = {"a.npz", f"{names[0]}.bak", f".tmp-{names[0]}"}
+    for name in foreign:
+        storage.write(name, b"mine")
+    Storage.at(f"{storage}/deeper").write(names[0], b"mine")
+    store.save(now=True)
+    again = RunStore(JOB, url, resume=True)
+    assert again.notes == [f"cast again: scans 2 to 3; {names[1]} was damaged in {url}/parts"]
+    assert add(again, 2, 4, number=1)
+    again.tidy()
+    assert len(again.points().load()) == 18
+    assert f"{url}/parts holds what is not of this run and stays there" in again.remove()
+    assert storage.sizes().keys() == foreign and Storage.at(url).sizes() == {}
+    with pytest.raises(LidarpoolError, match=r"stays there, .* and 1 more: move it elsewhere"):
+        RunStore(JOB, url)
+    assert Storage.at(f"{storage}/deeper").sizes() == {names[0]: 4}
 
 
 @pytest.mark.parametrize(

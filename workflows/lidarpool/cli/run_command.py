@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from distributed import Client
 
+from ..base.errors import LidarpoolError
 from ..base.open3d_module import load_open3d
 from ..base.vocabulary import PATIENCE_S, WAIT_S
 from ..base.words import counted
@@ -132,11 +133,14 @@ def _simulate(
         goes_on = options.resume and FILE in Storage.at(f"{out}/{RUN_FOLDER}").sizes()
         if not (options.overwrite or goes_on):
             refuse_to_replace(out, lambda: identity_of(job))
-        store = _store(job, options)
+        store = _store(job, options, goes_on)
+
+        left = ""
 
         def in_place() -> None:
+            nonlocal left
             whole.enter_context(_noting_complete(out))
-            store.remove()
+            left = store.remove()
 
         with store.kept_on_error():
             if live is not None:
@@ -166,6 +170,8 @@ def _simulate(
                         formats=formats,
                         workers=workers if keep else None,
                     )
+        if left:
+            report["notes"].append(left.rstrip("."))
     return result, report
 
 
@@ -203,15 +209,21 @@ def _shown_live(job: Job, options: RunOptions) -> Iterator[LiveRun | None]:
         yield live
 
 
-def _store(job: Job, options: RunOptions) -> RunStore:
+def _store(job: Job, options: RunOptions, goes_on: bool) -> RunStore:
     """Store of the run, with what an earlier run has left if it is to be resumed."""
     if not options.resumable:
         return RunStore(job)
     place = f"{options.out}/{RUN_FOLDER}"
+    if Storage.at(place).is_link:
+        raise LidarpoolError(
+            f"{place} is a link, and a run deletes nothing behind a link: remove it, or give "
+            "another folder with --out."
+        )
     if options.fresh:
         remove_run(place)
-    store = RunStore(job, place, options.parts, resume=options.resume)
-    if options.resume and not store.kept:
+    with shown_status("checking the points of the earlier run", options.quiet or not goes_on):
+        store = RunStore(job, place, options.parts, resume=options.resume)
+    if options.resume and not (store.kept or store.notes):
         store.notes.append(f"there was nothing to resume in {options.out}")
     return store
 

@@ -10,6 +10,8 @@ they are rounded only once.
 from __future__ import annotations
 
 import io
+import re
+import secrets
 import zipfile
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,11 +24,76 @@ from numpy.typing import NDArray
 from ..base.choice import one_of_each_part
 from ..base.errors import LidarpoolError
 from .cloud import CHUNK_POINTS, Cloud, Savable, described
-from .storage import Storage
+from .storage import Storage, target_of
 from .table import AXES, SCAN, Column
 
-SUFFIX = ".npz"
+# Files of a run in the folder of its parts: its mark, then what it is.
+_OWN = re.compile(
+    r"([0-9a-f]{16})-(?:mark|probe-[0-9a-f]{8}|\d{8,}-\d{8,}-[0-9a-f]{8}\.npz)", re.ASCII
+)
+_AGAIN = "Resuming the run (--resume, in Python resume=True) casts its scans again."
+# Head of an array: format 1.0 of NumPy, and what it says of one row of numbers.
+_MAGIC = b"\x93NUMPY\x01\x00"
+_HEADER = re.compile(
+    rb"\{'descr': '([<>|][a-z]\d+)', 'fortran_order': False, 'shape': \((\d+),\), \} *\n"
+)
 _DATE = (1980, 1, 1, 0, 0, 0)  # the same columns give the same bytes
+
+
+# A run deletes what it wrote, and nothing else: the names of its files begin with its mark, 16
+# random digits, and an empty file in the folder of the parts says that they are this mark's.
+
+
+def part_name(mark: str, first: int, stop: int) -> str:
+    """Return a name for a new part of these scans."""
+    return f"{mark}-{first:08d}-{stop:08d}-{secrets.token_hex(4)}.npz"
+
+
+def probe_name(mark: str, driver: str) -> str:
+    """Name of the file by which workers of a driver find out whether they see the folder."""
+    return f"{mark}-probe-{driver}"
+
+
+def mark_name(mark: str) -> str:
+    """Name of the file that says whose parts are in a folder."""
+    return f"{mark}-mark"
+
+
+def is_part_of(mark: str, name: str) -> bool:
+    """Whether a name has the form of the parts of a run, which has no path in it."""
+    return _mark_of(name) == mark and name.endswith(".npz")
+
+
+def own_files(storage: Storage, mark: str | None) -> list[str]:
+    """Names of the files that a run may delete, those that killed writers left among them.
+
+    Parameters
+    ----------
+    storage
+        Folder of the parts. Behind a link, or without the mark in it, there are none.
+    mark
+        That of the run; None for each that the folder has.
+
+    Returns
+    -------
+    The names; marks come last, so that what an interrupted removal has left stays known.
+
+    Raises
+    ------
+    OSError
+        If the folder cannot be listed.
+    """
+    names = [] if storage.is_link else [*storage.sizes()]
+    marks = {_mark_of(name) for name in names if name.endswith("-mark")} - {""}
+    marks &= marks if mark is None else {mark}
+    own = [name for name in names if _mark_of(target_of(name)) in marks]
+    return sorted(own, key=lambda name: name.endswith("-mark"))
+
+
+def _mark_of(name: str) -> str:
+    """Mark in the name of a file of a run; empty for any other name."""
+    found = _OWN.fullmatch(name)
+    return found[1] if found else ""
 
 
 @dataclass(frozen=True)
@@ -133,12 +200,20 @@ def unpack(data: bytes) -> PartColumns:
 
 
 def _read_array(archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
-    """Read an array to its end, where its checksum is compared."""
+    """Read an array to its end, where its checksum is compared.
+
+    Parts are read by several threads. NumPy's reader parses headers with `ast`, which failed now
+    and then in threads of Python 3.11: "AST constructor recursion depth mismatch".
+    """
     with archive.open(name) as file:
-        array: NDArray[Any] = np.lib.format.read_array(file, allow_pickle=False)
+        length = int.from_bytes(file.read(len(_MAGIC) + 2)[len(_MAGIC) :], "little")
+        if (header := _HEADER.fullmatch(file.read(length))) is None:
+            raise ValueError(f"{name} is not an array of a part")
+        kind, count = np.dtype(header[1].decode()), int(header[2])
+        data = bytearray(file.read(count * kind.itemsize))
         if file.read(1):
             raise ValueError(f"{name} is longer than its array")
-    return array
+    return np.frombuffer(data, kind, count)
 
 
 def read_part(storage: Storage, name: str) -> PartColumns:
@@ -153,12 +228,11 @@ def read_part(storage: Storage, name: str) -> PartColumns:
         return unpack(storage.read(name))
     except LidarpoolError as error:
         raise LidarpoolError(
-            f"The part {storage.path(name)} cannot be used: {error}. Drop the run, and start it "
-            "anew."
+            f"The part {storage.path(name)} cannot be used: {error}. {_AGAIN}"
         ) from error
     except OSError as error:
         raise LidarpoolError(
-            f"The part {storage.path(name)} cannot be read: {error.strerror or error}."
+            f"The part {storage.path(name)} cannot be read: {error.strerror or error}. {_AGAIN}"
         ) from error
 
 
@@ -178,8 +252,7 @@ def read_tally(storage: Storage, name: str) -> tuple[NDArray[np.int32], NDArray[
             return _read_array(archive, ".triangles.npy"), _read_array(archive, ".hits.npy")
     except Exception as error:  # as above
         raise LidarpoolError(
-            f"The part {storage.path(name)} cannot be used ({error}). Drop the run, and start it "
-            "anew."
+            f"The part {storage.path(name)} cannot be used ({error}). {_AGAIN}"
         ) from error
 
 

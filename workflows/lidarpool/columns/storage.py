@@ -7,6 +7,7 @@ renamed, and an object store shows only complete objects.
 from __future__ import annotations
 
 import os
+import re
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -17,7 +18,14 @@ from typing import Any
 
 from ..base.errors import LidarpoolError
 
-_TEMPORARY = ".tmp-"
+_TEMPORARY = ".lidarpool-tmp-"
+_LEFT = re.compile(rf"{re.escape(_TEMPORARY)}(.+)-[0-9a-f]{{8}}")
+
+
+def target_of(name: str) -> str:
+    """Name of the file that a temporary file was written for; other names are their own."""
+    found = _LEFT.fullmatch(name)
+    return found[1] if found else name
 
 
 def is_url(place: str | Path) -> bool:
@@ -72,6 +80,11 @@ class Storage:
     def is_local(self) -> bool:
         """Whether it is a folder in a local file system."""
         return not is_url(self.url)
+
+    @property
+    def is_link(self) -> bool:
+        """Whether it is a link to a folder elsewhere; the folders above it may be links."""
+        return self.is_local and Path(self.url).is_symlink()
 
     @property
     def _remote(self) -> tuple[Any, str]:
@@ -224,24 +237,31 @@ class Storage:
             return False
 
     def sizes(self) -> dict[str, int]:
-        """All files and their sizes in bytes; none without the folder."""
+        """All plain files and their sizes in bytes; none without the folder."""
+        return {name: size for name, size in self.entries().items() if size is not None}
+
+    def entries(self) -> dict[str, int | None]:
+        """Everything in the folder: {name: bytes of a file, None for a folder or link}.
+
+        Raises
+        ------
+        OSError
+            If the folder cannot be listed; a missing one is empty.
+        """
+        found: dict[str, int | None] = {}
         if self.is_local:
-            sizes: dict[str, int] = {}
             with suppress(FileNotFoundError), os.scandir(self.url) as entries:
                 for entry in entries:
                     with suppress(FileNotFoundError):  # just renamed or removed
-                        if entry.is_file():
-                            sizes[entry.name] = entry.stat().st_size
-            return sizes
-        try:
-            with _as_os_error():
-                system, folder = self._remote
-                entries = system.ls(folder, detail=True)
-        except FileNotFoundError:
-            return {}
-        return {
-            e["name"].rpartition("/")[2]: e["size"] or 0 for e in entries if e["type"] == "file"
-        }
+                        plain = entry.is_file(follow_symlinks=False)
+                        found[entry.name] = entry.stat().st_size if plain else None
+            return found
+        with suppress(FileNotFoundError), _as_os_error():
+            system, folder = self._remote
+            for one in system.ls(folder, detail=True):
+                plain = one["type"] == "file" and not one.get("islink")
+                found[one["name"].rpartition("/")[2]] = (one["size"] or 0) if plain else None
+        return found
 
     def remove(self, names: list[str]) -> None:
         """Remove files; no error for missing ones.
@@ -279,8 +299,10 @@ class Storage:
 
     def tidy(self) -> None:
         """Remove what killed writers have left of files in a folder of this machine."""
-        for left in Path(self.url).rglob(f"{_TEMPORARY}*") if self.is_local else ():
-            left.unlink(missing_ok=True)
+        for folder, _, names in os.walk(self.url) if self.is_local else ():  # follows no links
+            for name in names:
+                if target_of(name) != name:
+                    Path(folder, name).unlink(missing_ok=True)
 
     def remove_folder(self) -> None:
         """Remove the folder if it is empty."""

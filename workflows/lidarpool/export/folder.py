@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
+import re
 import secrets
 import shutil
 import tempfile
@@ -16,9 +17,9 @@ from ..base.errors import LidarpoolError
 from ..columns.storage import Storage, is_url
 
 LAST_FILE = "report.json"  # a result with this file is complete
-_WRITING = (
-    ".writing-"  # folder of unfinished files; the next writer removes one of a killed program
-)
+# Folder of unfinished files; the next writer removes that of a killed program.
+_WRITING = ".lidarpool-writing-"
+_LEFT = re.compile(rf"{re.escape(_WRITING)}[0-9a-f]{{8}}")
 
 
 def output_place(text: str | Path) -> Path | Storage:
@@ -52,8 +53,9 @@ def result_folder(place: Path | Storage) -> Iterator[Path]:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             lock = _lock(folder)
-        for left in folder.glob(f"{_WRITING}*"):
-            shutil.rmtree(left)
+        for left in folder.iterdir():
+            if _LEFT.fullmatch(left.name) and left.is_dir() and not left.is_symlink():
+                shutil.rmtree(left)
     except BlockingIOError as error:
         raise LidarpoolError(
             f"Another run or export is using the folder {folder}: wait for it, or give another "

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..base.arguments import checked
 from ..base.errors import LidarpoolError
 from ..base.open3d_module import load_open3d
-from ..columns.cloud import Cloud, CloudLike
+from ..columns.cloud import CHUNK_POINTS, Cloud, CloudLike
 from ..columns.table import AXES as POSITION
 from ..columns.table import TABLE, check_names
 from .ply_format import AXES, as_held, header, layout, row_type
@@ -34,11 +34,11 @@ def write_ply(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
     check_names((*POSITION, *cloud.table))
     real = real_type(cloud.bounds, sweeps.precision_m)
     piece = path.with_name(f".{path.name}.ply")  # by its ending Open3D chooses the format
+    row = row_type(real, cloud.table)
+    # Open3D would print a line for each buffer that it cannot write.
+    _check_room(path, header(row, len(cloud)), len(cloud), row.itemsize)
     with path.open("xb") as file:
         for chunk in cloud.chunks():
-            # Open3D would print a line for each buffer that it cannot write. There is need for
-            # the piece, and for its copy in the file.
-            _check_room(path, 2 * len(chunk) * row_type(real, cloud.table).itemsize)
             _write_open3d(piece, _as_held(chunk, real))
             start = _start_of_rows(piece, path, len(chunk))
             with piece.open("rb") as written:
@@ -49,7 +49,7 @@ def write_ply(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
                 shutil.copyfileobj(written, file, 1 << 24)
             piece.unlink()
         if not file.tell():  # which Open3D refuses to write
-            file.write(header(row_type(real, cloud.table), 0))
+            file.write(header(row, 0))
 
 
 @checked
@@ -97,12 +97,14 @@ def real_type(bounds: NDArray[np.floating], precision_m: float) -> np.dtype[np.f
     return np.dtype(np.float32 if enough else np.float64)
 
 
-def _check_room(path: Path, needed: int) -> None:
+def _check_room(path: Path, head: bytes, count: int, row_bytes: int) -> None:
+    """Check that the disk has room for a file of so many points, and for a piece beside it."""
+    size, piece = len(head) + count * row_bytes, min(count, CHUNK_POINTS) * row_bytes
     free = shutil.disk_usage(path.parent).free
-    if free < needed:
+    if free < size + piece:
         raise LidarpoolError(
-            f"{path} could not be written, which takes {needed:,} bytes; the disk has "
-            f"{free:,} bytes free. Make room, or write to another folder."
+            f"{path} could not be written: it takes {size:,} bytes, and {piece:,} beside it "
+            f"meanwhile; the disk has {free:,} bytes free. Make room, or write to another folder."
         )
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import json
-import secrets
+import os
 import shutil
 import tempfile
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -18,10 +20,10 @@ from numpy.typing import NDArray
 from ..base.arguments import checked
 from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud
-from ..columns.parts import SUFFIX, StoredCloud, read_part, read_tally
+from ..columns.parts import StoredCloud, mark_name, own_files, read_part, read_tally, unpack
 from ..columns.storage import Storage, is_url
 from ..export.sweeps import Sweeps
-from ..scan.database import FILE, RunDatabase, parts_place
+from ..scan.database import FILE, RunDatabase, parts_folder, read_place
 from ..scan.messages import Receipt, samples_of_scan, summary_type
 from .checks import AUTO_TAKES
 from .identity import difference, identity_of
@@ -32,6 +34,8 @@ from .remote import OWNER, RemoteRun, fetch_database
 PARTS = "parts"  # the folder of the parts, in the run's folder
 RUN_FOLDER = "run"  # the run's folder in the output folder, until the result is complete
 SAMPLE_RAYS = 400  # of the pictures
+CHECKERS = 4  # threads that check parts; each holds one in memory, twice
+NAMED = 3  # parts, scans or files that a message names
 
 # On the command line, and in Python.
 _RESUME = "--resume (in Python resume=True)"
@@ -102,19 +106,18 @@ class RunStore:
         try:
             self.db = self._open(here, parts)
             try:
-                durable = self.lasting
-                self.storage = _storage(self.place, self.db.meta["parts"], durable=durable)
-                sizes = self._sizes()  # also an error if the place cannot be opened
-                if self.kept:
-                    self._go_on(here, resume, sizes)
-                if self._remote:
-                    self._remote.claim(self.db)
+                self._claim(here, resume)
             except BaseException:
                 self.db.close()
+                if made and not self.kept:
+                    with suppress(OSError, LidarpoolError):
+                        _remove(Storage.at(folder), self.storage, self.db.meta["mark"])
+                    (folder / FILE).unlink(missing_ok=True)  # the place of the parts failed
                 raise
         except BaseException:
             if made:
-                shutil.rmtree(folder, ignore_errors=True)
+                with suppress(OSError):
+                    folder.rmdir()
             raise
         self.resumed = self.db.scans_done  # scans whose points are of an earlier run
 
@@ -122,6 +125,7 @@ class RunStore:
         """Open the database, or a new one if nothing is committed in it."""
         path, count = self._folder / FILE, self.job.survey.scan_count
         durable = self.lasting and self._remote is None
+        mark, earlier = "", ""  # of a run that has kept nothing, and the place of its parts
         try:
             if self._remote:
                 fetch_database(self._remote.storage, self._folder)
@@ -130,18 +134,55 @@ class RunStore:
                 if db.scans_done or db.trials:
                     return db
                 db.close()
+                mark, earlier = db.meta["mark"], db.meta.get("parts", "")
         except LidarpoolError as error:  # the copy of a database is nobody's business
             raise LidarpoolError(str(error).replace(str(self._folder), str(self.place))) from error
         except OSError as error:
             raise LidarpoolError(f"The run in {self.place} cannot be read: {error}.") from error
         if self.lasting:
-            remove_run(self.place)
+            with _explained(self.place):
+                left = _remove(Storage.at(self.place), _storage(self.place, earlier), mark)
+            if left:
+                raise LidarpoolError(left)
         path.unlink(missing_ok=True)
         self._folder.mkdir(exist_ok=True)
-        db = RunDatabase(path, count, durable=durable)
-        place = "" if parts is None else f"{Storage.at(parts).url}/run-{secrets.token_hex(4)}"
-        db.set(identity=json.dumps(here), parts=place)
+        shared = None if parts is None else Storage.at(parts)
+        try:
+            db = RunDatabase(path, count, durable=durable)
+            try:
+                place = shared.path(parts_folder(db.meta["mark"])) if shared else ""
+                db.set(identity=json.dumps(here), parts=place)
+            except BaseException:
+                path.unlink()  # while its lock is held
+                db.close()
+                raise
+        except LidarpoolError:
+            if path.exists() and not path.stat().st_size:  # the disk is full
+                path.unlink()
+            raise
         return db
+
+    def _claim(self, here: dict[str, str], resume: bool) -> None:
+        """Find the parts, check them if there are any, and mark their folder as this run's."""
+        self.storage = _storage(self.place, self.db.meta["parts"], durable=self.lasting)
+        if self.storage.is_link:
+            raise LidarpoolError(_behind_link(self.storage))
+        sizes = self._sizes()  # also an error if the place cannot be opened
+        if self.kept:
+            self._go_on(here, resume, sizes)
+        if self._remote:
+            self._remote.claim(self.db)
+        name = mark_name(self.db.meta["mark"])
+        if name not in sizes:
+            try:
+                self.storage.prepare()
+                self.storage.write(name, b"")
+            except OSError as error:
+                raise LidarpoolError(
+                    f"The points cannot be kept in {self.storage.url} "
+                    f"({error.strerror or error}): make room there, or give another place with "
+                    "--parts."
+                ) from error
 
     def _go_on(self, here: dict[str, str], resume: bool, sizes: dict[str, int]) -> None:
         """Check that this run may continue the existing one."""
@@ -160,14 +201,43 @@ class RunStore:
                 f"Backend {self.job.backend!r} is asked for, and the scans in {self.place} were "
                 f"cast with {self.backend!r}: continue with that, or drop them with {_DROP}."
             )
-        absent = [p for p in self.db.ordered if sizes.get(p.name) != p.size]
-        if absent:
-            self.db.drop(absent)
-            count = sum(part.stop - part.first for part in absent)
-            self.notes.append(
-                f"{count} scans were made again: their parts were missing or cut short in "
-                f"{self.storage.url}"
-            )
+        self._drop(sizes)
+
+    def _drop(self, sizes: dict[str, int]) -> None:
+        """Have the scans of missing and damaged parts cast again."""
+        there = [part for part in self.db.ordered if part.name in sizes]
+        missing = [part for part in self.db.ordered if part.name not in sizes]
+        pool = ThreadPoolExecutor(min(CHECKERS, os.cpu_count() or 1), "check")
+        try:
+            whole = pool.map(lambda part: self._is_whole(part, sizes[part.name]), there)
+            damaged = [part for part, fine in zip(there, whole, strict=True) if not fine]
+        finally:
+            pool.shutdown(cancel_futures=True)
+        for what, parts in (("missing", missing), ("damaged", damaged)):
+            if parts:
+                self.db.drop(parts)
+                names, scans = _listed([p.name for p in parts]), _listed([*map(_span, parts)])
+                verb = "was" if len(parts) == 1 else "were"
+                self.notes.append(
+                    f"cast again: {scans}; {names} {verb} {what} in {self.storage.url}"
+                )
+
+    def _is_whole(self, part: Receipt, size: int) -> bool:
+        """Whether a part is what its receipt says, to the checksum of each column."""
+        if size != part.size:
+            return False
+        try:
+            found = unpack(self.storage.read(part.name))
+        except LidarpoolError:
+            return False
+        except OSError as error:
+            if error.errno in (errno.EIO, errno.ENOENT):  # a bad disk; just removed
+                return False
+            raise LidarpoolError(
+                f"The part {self.storage.path(part.name)} cannot be read: "
+                f"{error.strerror or error}."
+            ) from error
+        return (found.first, found.stop, len(found)) == (part.first, part.stop, part.rows)
 
     def _sizes(self) -> dict[str, int]:
         try:
@@ -301,17 +371,25 @@ class RunStore:
 
     def tidy(self) -> None:
         """Remove parts that are not in the result, of dead or superseded collectors."""
-        ours = {part.name for part in self.db.parts.values()}
+        mark = self.db.meta["mark"]
+        ours = {mark_name(mark), *(part.name for part in self.db.parts.values())}
         with suppress(OSError, LidarpoolError):
-            self.storage.remove([n for n in self._sizes() if SUFFIX in n and n not in ours])
+            self.storage.remove([n for n in own_files(self.storage, mark) if n not in ours])
 
-    def remove(self) -> None:
-        """Remove the store: the result is in place."""
+    def remove(self) -> str:
+        """Remove the store: the result is in place.
+
+        Returns
+        -------
+        What is left in the folder of the parts because it is not of this run, and what to do, as
+        a sentence; empty if nothing is.
+        """
         if self._remote:
             self._remote.check()
         self._gone = True
         self.db.close()
-        remove_run(self.place)
+        with _explained(self.place):
+            return _remove(Storage.at(self.place), self.storage, self.db.meta["mark"])
 
     @contextmanager
     def kept_on_error(self) -> Iterator[None]:
@@ -327,8 +405,8 @@ class RunStore:
             if self._remote and self._remote.lost:
                 raise
             if not self.kept:
-                with suppress(LidarpoolError):
-                    remove_run(self.place)
+                with suppress(OSError):
+                    _remove(Storage.at(self.place), self.storage, self.db.meta["mark"])
             elif (self._folder / FILE).exists():
                 error.add_note(f"{self.kept} are kept in {self.place}: continue with {_RESUME}.")
             raise
@@ -343,6 +421,8 @@ def _storage(place: str | Path, parts: str, *, durable: bool = True) -> Storage:
 def remove_run(folder: str | Path) -> None:
     """Remove a stored run and its parts, wherever they are, and nothing else.
 
+    If its database is damaged, its parts are found only in its folder.
+
     Parameters
     ----------
     folder
@@ -351,20 +431,68 @@ def remove_run(folder: str | Path) -> None:
     Raises
     ------
     LidarpoolError
-        If it cannot be removed.
+        If another run uses it, it cannot be removed, or the folder of its parts holds other files
+        or is a link: these stay, and the message names them.
     """
     kept = Storage.at(folder)
+    with _explained(folder), tempfile.TemporaryDirectory(prefix="lidarpool-") as temporary:
+        if not kept.is_local:
+            fetch_database(kept, Path(temporary))
+        try:
+            found = read_place(Path(folder if kept.is_local else temporary) / FILE)
+        except LidarpoolError as error:
+            raise LidarpoolError(str(error).replace(temporary, str(folder))) from error
+        mark, parts = found or (None, "")
+        left = _remove(kept, _storage(folder, parts), mark)
+    if left:
+        raise LidarpoolError(left)
+
+
+def _remove(kept: Storage, parts: Storage, mark: str | None) -> str:
+    """Remove a run and what its mark says is its own; a sentence on what else is there.
+
+    `mark` is None if the database does not say it: then that in the folder of the parts counts.
+    """
+    if parts.is_link:
+        return _behind_link(parts)
+    parts.remove(own_files(parts, mark))
+    parts.remove_folder()
+    kept.remove([FILE, f"{FILE}-journal", OWNER])
+    kept.remove_folder()
+    if not (left := sorted(parts.entries())):
+        return ""
+    of_runs = len(own_files(parts, None)) == len(left)  # whose databases are gone
+    advice = f"drop it with {_DROP}" if of_runs else "move it elsewhere"
+    return (
+        f"{parts.url} holds what is not of this run and stays there, {_listed(left)}: {advice}, "
+        "or give another folder."
+    )
+
+
+def _span(part: Receipt) -> str:
+    """Describe the scans of a part."""
+    last = part.stop - 1
+    return f"scan {last}" if part.first == last else f"scans {part.first} to {last}"
+
+
+def _behind_link(parts: Storage) -> str:
+    return (
+        f"{parts.url} is a link, and a run deletes nothing behind a link: put the folder itself "
+        "there, or remove the link; --parts gives the points another place."
+    )
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Return the first names, and how many more there are."""
+    more = len(names) - NAMED
+    return ", ".join(names[:NAMED]) + (f" and {more:,} more" if more > 0 else "")
+
+
+@contextmanager
+def _explained(place: str | Path) -> Iterator[None]:
     try:
-        with tempfile.TemporaryDirectory(prefix="lidarpool-") as temporary:
-            if not kept.is_local:
-                fetch_database(kept, Path(temporary))
-            parts = parts_place(Path(folder if kept.is_local else temporary) / FILE)
-        storage = _storage(folder, parts)
-        storage.remove([name for name in storage.sizes() if SUFFIX in name])
-        storage.remove_folder()
-        kept.remove([FILE, f"{FILE}-journal", OWNER])
-        kept.remove_folder()
+        yield
     except OSError as error:
         raise LidarpoolError(
-            f"The run in {folder} cannot be removed: {error.strerror or error}."
+            f"The run in {place} cannot be removed: {error.strerror or error}."
         ) from error

@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import bisect
 import json
+import re
+import secrets
 import sqlite3
-from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,10 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import LidarpoolError
+from ..columns.parts import is_part_of
 from ..plan import Trial
 from .messages import Receipt
 
-FORMAT = 4
+FORMAT = 5
 FILE = "run.db"
 
 _TABLES = """
@@ -84,10 +87,12 @@ class RunDatabase:
             for statement in _TABLES.split(";"):
                 self._sql.execute(statement)
             self._set("format", str(FORMAT))
+            self._set("mark", secrets.token_hex(8))
         self._sql.execute("COMMIT")
         self.meta = dict(self._sql.execute("SELECT name, value FROM meta"))
         if (made := self.meta.get("format")) != str(FORMAT):
             raise sqlite3.DatabaseError(f"it is of format {made}, and this version reads {FORMAT}")
+        mark = _checked_place(self.meta)[0]
         self.frames = self._frames_written = int(self.meta.get("frames", 0))
         rows = self._sql.execute(
             "SELECT first, stop, name, rows, size, hits, cells, "
@@ -95,6 +100,8 @@ class RunDatabase:
             (self.frames,),
         )
         for first, stop, name, count, size, hits, cells, summaries in rows:
+            if not is_part_of(mark, name):
+                raise ValueError(f"{name!r} is not a part of this run")
             box = tuple(json.loads(cells))
             self._enter(Receipt(-1, first, stop, name, count, size, hits, box, summaries))
         trials = self._sql.execute("SELECT data FROM trials ORDER BY trial")
@@ -278,15 +285,19 @@ class RunDatabase:
         except sqlite3.OperationalError as error:
             if "locked" in str(error):
                 raise LidarpoolError(f"Another run is using {self.path.parent}.") from error
+            if "no such" in str(error):  # table or column
+                raise self._damaged(error) from error
             raise LidarpoolError(
                 f"{self.path} cannot be written ({error}): make room on its disk, or give another "
                 "folder."
             ) from error
         except (sqlite3.Error, ValueError, TypeError, KeyError) as error:
-            raise LidarpoolError(
-                f"{self.path} is damaged ({error}): drop the run with --fresh, or give another "
-                "folder."
-            ) from error
+            raise self._damaged(error) from error
+
+    def _damaged(self, error: Exception) -> LidarpoolError:
+        return LidarpoolError(
+            f"{self.path} is damaged ({error}): drop the run with --fresh, or give another folder."
+        )
 
 
 def _trial_of(data: dict[str, Any]) -> Trial:
@@ -294,12 +305,50 @@ def _trial_of(data: dict[str, Any]) -> Trial:
     return Trial(waypoints=waypoints, **data)
 
 
-def parts_place(path: Path) -> str:
-    """Place of a run's parts, from its database; empty if that cannot be read."""
-    with (
-        suppress(sqlite3.Error),
-        closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as sql,
-    ):
-        found = sql.execute("SELECT value FROM meta WHERE name = 'parts'").fetchone()
-        return str(found[0]) if found else ""
-    return ""
+def parts_folder(mark: str) -> str:
+    """Name of the folder of the parts in a place that runs share."""
+    return f"run-{mark}"
+
+
+def _checked_place(meta: Mapping[str, str]) -> tuple[str, str]:
+    """Mark and place of parts of a database's values; ValueError if they are not of a run."""
+    mark, place = meta["mark"], meta.get("parts", "")
+    if not re.fullmatch("[0-9a-f]{16}", mark):
+        raise ValueError(f"{mark!r} is not the mark of a run")
+    if place and not place.endswith(f"/{parts_folder(mark)}"):
+        raise ValueError(f"{place!r} is not the place of this run's parts")
+    return mark, place
+
+
+def read_place(path: Path) -> tuple[str, str] | None:
+    """Mark of a run, and the place of its parts or "", from its database.
+
+    Returns
+    -------
+    None if there is no database, or a damaged one.
+
+    Raises
+    ------
+    LidarpoolError
+        If a run is using it, or if it is another program's.
+    """
+    if not path.exists():
+        return None
+    try:
+        # Not read-only: then SQLite could not undo a transaction that was interrupted.
+        with closing(
+            sqlite3.connect(f"{path.absolute().as_uri()}?mode=rw", uri=True, timeout=1.0)
+        ) as sql:
+            tables = {name for (name,) in sql.execute("SELECT name FROM sqlite_master")}
+            if tables and not tables >= {"meta", "parts", "trials"}:
+                raise LidarpoolError(
+                    f"{path} is not the database of a run: move it elsewhere, or give another "
+                    "folder."
+                )
+            return _checked_place(dict(sql.execute("SELECT name, value FROM meta")))
+    except sqlite3.Error as error:
+        if "locked" in str(error):
+            raise LidarpoolError(f"Another run is using {path.parent}.") from error
+        return None
+    except (ValueError, TypeError, KeyError):
+        return None

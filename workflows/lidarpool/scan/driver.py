@@ -35,7 +35,7 @@ from ..base.errors import LidarpoolError
 from ..base.task_book import TaskBook
 from ..base.tracing import trace
 from ..columns.cloud import Cloud
-from ..columns.parts import SUFFIX
+from ..columns.parts import part_name, probe_name
 from ..columns.storage import Storage
 from .batches import Batch, Batches, Place
 from .cast import intersect
@@ -123,8 +123,8 @@ class SurveyDriver:
         self._offer_count = 0
         self._seconds: deque[float] = deque(maxlen=64)  # casting times of batches
         self._condemned: list[str] = []  # why scans cannot be done
-        # Named like parts: leftovers of a killed driver are removed with parts without a receipt.
-        self._probe = (f".probe-{self.run_id}{SUFFIX}", secrets.token_bytes(16))
+        self._mark = db.meta["mark"]
+        self._probe = (probe_name(self._mark, self.run_id), secrets.token_bytes(16))
         self._hidden: list[str] = []  # names of LIDAR workers that do not see the storage
         self._summary = summary_type(samples_of_scan(self.survey.scan_count))
         self._sorter = -1  # number of the current attempt
@@ -526,14 +526,13 @@ class SurveyDriver:
         batch.collector = name
         batch.to(Place.COLLECTING, time.monotonic())
         self._trace("handon", COLLECT, batch.scans)
-        part = f"{batch.first:08d}-{batch.stop:08d}-{secrets.token_hex(4)}{SUFFIX}"
         return {
             "offer": batch.offer,
             "key": batch.future.key,
             "at": batch.worker,
             "first": batch.first,
             "stop": batch.stop,
-            "name": part,
+            "name": part_name(self._mark, batch.first, batch.stop),
         }
 
     def _under_way(self, offer: int) -> Batch | None:
