@@ -190,6 +190,24 @@ def test_a_damaged_part_is_made_again(damage, unfinished):
     assert RunStore(JOB, unfinished, resume=True).notes == []
 
 
+def test_a_part_that_is_damaged_meanwhile_is_made_again_by_the_next_run(folder):
+    store = RunStore(JOB, folder)
+    add(store, 0, 2)
+    part = part_of(folder, 0)
+    part.write_bytes(part.read_bytes()[:-1])
+    for read in (lambda: store.points().load(), store.hit_counts):
+        with pytest.raises(LidarpoolError, match="cannot be used") as caught:
+            read()
+        assert "Resuming the run (--resume, in Python resume=True) casts its" in str(caught.value)
+        assert "anew" not in str(caught.value)
+    with pytest.raises(LidarpoolError) as caught, store.kept_on_error():
+        store.points().load()
+    (note,) = caught.value.__notes__
+    assert "continue with --resume" in note
+    again = RunStore(JOB, folder, resume=True)
+    assert again.db.missing(0, 6) == [(0, 6)] and part.name in again.notes[0]
+
+
 def test_a_part_with_the_content_of_another_is_made_again(unfinished):
     other = part_of(unfinished, 0).read_bytes()
     assert len(other) == part_of(unfinished, 3).stat().st_size
