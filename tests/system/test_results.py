@@ -73,6 +73,23 @@ def test_a_report_does_not_replace_that_of_another_survey_unasked(result, anothe
         another.report(tmp_path)
 
 
+def test_files_of_no_result_are_neither_replaced_nor_removed_unasked(result, tmp_path):
+    own = tmp_path / "kitti" / "notes.txt"
+    own.parent.mkdir()
+    own.write_text("mine")
+    result.report(tmp_path, only_cloud=True)
+    result.report(tmp_path, only_cloud=True)
+    with pytest.raises(LidarpoolError, match=r"holds kitti, which no result there lists: .*--over"):
+        result.report(tmp_path, only_cloud=True, formats=["kitti"])
+    assert own.read_text() == "mine"
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "cloud.ply").write_text("mine")
+    with pytest.raises(LidarpoolError, match=r"other holds cloud\.ply, which no result there lists"):
+        result.report(tmp_path / "other", only_cloud=True)
+    result.report(tmp_path / "other", only_cloud=True, overwrite=True)
+    result.report(tmp_path / "other", only_cloud=True)
+
+
 def test_the_command_does_not_either(tmp_path, cluster, lidarpool, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "s.yaml").write_text("sensor: {layers: 2}\nsteps: 1\nplanning: {enabled: false}\n")

@@ -76,7 +76,7 @@ class Result(RunResult):
         wanted = [Format.of(entry) for entry in formats if entry != "ply"]
         with result_folder(place) as local:
             if not overwrite:
-                refuse_to_replace(place, lambda: self.identity)
+                refuse_to_replace(place, lambda: self.identity, wanted)
             write_result(local, place, self, only_cloud=only_cloud, formats=wanted)
 
     @checked

@@ -106,7 +106,7 @@ def forecast(
     """
     reasons, notes = _look_at_folder(out)
     try:
-        refuse_to_replace(out, lambda: identity_of(job))
+        refuse_to_replace(out, lambda: identity_of(job), formats)
     except LidarpoolError as error:
         notes.append(str(error).rstrip("."))
     for one in formats:

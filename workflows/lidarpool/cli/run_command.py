@@ -132,7 +132,7 @@ def _simulate(
     with result_folder(out) as folder:
         goes_on = options.resume and FILE in Storage.at(f"{out}/{RUN_FOLDER}").sizes()
         if not (options.overwrite or goes_on):
-            refuse_to_replace(out, lambda: identity_of(job))
+            refuse_to_replace(out, lambda: identity_of(job), formats)
         store = _store(job, options, goes_on)
 
         left = ""

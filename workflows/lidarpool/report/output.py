@@ -36,8 +36,12 @@ _SURVEY = ("scene", "survey")  # what tells one from another
 EXPORTS = tuple(file for file, _ in FORMATS.values())
 
 
-def refuse_to_replace(place: Path | Storage, identity: Callable[[], Mapping[str, str]]) -> None:
-    """Refuse a folder that holds the result of another survey.
+def refuse_to_replace(
+    place: Path | Storage,
+    identity: Callable[[], Mapping[str, str]],
+    formats: Sequence[Format] = (),
+) -> None:
+    """Refuse a folder that holds the result of another survey, or files of no result.
 
     Parameters
     ----------
@@ -45,26 +49,45 @@ def refuse_to_replace(place: Path | Storage, identity: Callable[[], Mapping[str,
         Place for the new result.
     identity
         Returns that of this result, see `RunResult.identity`; large scenes take a moment.
+    formats
+        That the cloud will be exported to.
 
     Raises
     ------
     LidarpoolError
-        If there is a result of another scene or survey, or one that cannot be read.
+        If there is a result of another scene or survey, or one that cannot be read; or a file that
+        this result would replace and that no report there lists.
     """
+    storage = place if isinstance(place, Storage) else Storage.at(place)
+    advice = "give another folder with --out, or replace it with --overwrite (in Python "
+    advice += "overwrite=True)."
     try:
-        storage = place if isinstance(place, Storage) else Storage.at(place)
-        report = json.loads(storage.read(REPORT))
-        there = {name: report["identity"][name] for name in _SURVEY}
-    except (FileNotFoundError, NotADirectoryError):
+        there = set(storage.entries())
+    except NotADirectoryError:
         return
+    except OSError as error:
+        raise LidarpoolError(f"{place} cannot be read: {error.strerror or error}.") from error
+    if REPORT in there:
+        try:
+            report = json.loads(storage.read(REPORT))
+            earlier = {name: report["identity"][name] for name in _SURVEY}
+        except (OSError, ValueError, TypeError, LookupError):
+            earlier = {}
+        here = identity()
+        if earlier != {name: here[name] for name in _SURVEY}:
+            raise LidarpoolError(f"{place} holds the result of another survey: {advice}")
+    listed = _listed(storage)
+    names = (*FILES, *(one.file for one in formats))
+    if foreign := [name for name in names if name in there and name not in listed]:
+        raise LidarpoolError(f"{place} holds {foreign[0]}, which no result there lists: {advice}")
+
+
+def _listed(storage: Storage) -> frozenset[str]:
+    """Names of the files of the result in a folder: only these may be removed there."""
+    try:
+        return frozenset(json.loads(storage.read(REPORT))["files"])
     except (OSError, ValueError, TypeError, LookupError):
-        there = {}
-    here = identity()
-    if there != {name: here[name] for name in _SURVEY}:
-        raise LidarpoolError(
-            f"{place} holds the result of another survey: give another folder with --out, or "
-            "replace it with --overwrite (in Python overwrite=True)."
-        )
+        return frozenset()
 
 
 def write_result(
@@ -81,7 +104,7 @@ def write_result(
 
     They are made in a temporary folder within `folder` and moved into place once all are on the
     disk, so that an earlier result stays whole if one cannot be written. Pictures of an earlier
-    run that this one does not make are removed. `then` is called when all are in place, before
+    result that this one does not make are removed. `then` is called when all are in place, before
     a pending interrupt is raised. `only_cloud` leaves out pictures and page; `formats` are
     written as well, those of many files by `workers`, if there are any.
 
@@ -112,6 +135,7 @@ def write_result(
     pictures = [] if only_cloud else [*(f"{name}.png" for name in makers), PICTURE_FILE]
     files = [CLOUD, *exported, *pictures, SWEEPS_FILE, *([] if only_cloud else [PAGE]), REPORT]
     storage = place if isinstance(place, Storage) else None
+    earlier = _listed(storage or Storage.at(folder))
     direct = [one for one in formats if one.in_pieces] if storage and workers else []
 
     def draw(name: str) -> str:
@@ -129,7 +153,7 @@ def write_result(
             if one not in direct:
                 one.write(staged / one.file, result.points, sweeps, workers=workers)
         if storage and direct:
-            _remove_earlier(storage, files)
+            _remove_earlier(storage, earlier, files)
             for one in direct:
                 one.put(storage, result.points, sweeps, workers)
         if workers:
@@ -145,7 +169,7 @@ def write_result(
         (staged / REPORT).write_text(text, encoding="utf-8")
         if storage:
             if not direct:
-                _remove_earlier(storage, files)
+                _remove_earlier(storage, earlier, files)
             for name in (*EXPORTS, *FILES):
                 if (staged / name).exists():
                     storage.put(staged / name, name)
@@ -155,7 +179,7 @@ def write_result(
         for name in files:
             flush(staged / name)
         with deferred_interrupts():
-            _publish(staged, folder, files)
+            _publish(staged, folder, earlier, files)
             then()
     except LidarpoolError as error:  # names the file, without its temporary folder
         raise LidarpoolError(str(error).replace(str(staged), str(place))) from error
@@ -170,7 +194,7 @@ def write_result(
     return report
 
 
-def _publish(staged: Path, folder: Path, files: Collection[str]) -> None:
+def _publish(staged: Path, folder: Path, earlier: Collection[str], files: Collection[str]) -> None:
     """Move a whole result into place.
 
     A folder with a report is a result: the earlier report is removed first, and the new one is
@@ -181,15 +205,26 @@ def _publish(staged: Path, folder: Path, files: Collection[str]) -> None:
     flush(folder)
     for name in (*EXPORTS, *FILES):
         # A path of an earlier run would look like this one's; and folders are not replaced.
-        if name not in files or name in EXPORTS:
+        if _goes(name, earlier, files):
             remove(folder / name)
         if name in files:
             (staged / name).replace(folder / name)
     flush(folder)
 
 
-def _remove_earlier(storage: Storage, files: Collection[str]) -> None:
+def _remove_earlier(storage: Storage, earlier: Collection[str], files: Collection[str]) -> None:
     """Remove what an earlier result has in a storage and this one would not replace."""
     for name in (REPORT, PAGE, *EXPORTS, *FILES):
-        if name in (REPORT, PAGE, *EXPORTS) or name not in files:
+        if name in (REPORT, PAGE) or _goes(name, earlier, files):
             storage.discard(name)
+
+
+def _goes(name: str, earlier: Collection[str], files: Collection[str]) -> bool:
+    """Whether a file of a folder is removed before a result of these files is moved there.
+
+    Folders and files of formats only if they are replaced, or the earlier result lists them. If a
+    killed run has removed the earlier report, they stay.
+    """
+    if name in EXPORTS:
+        return name in files or name in earlier
+    return name not in files
