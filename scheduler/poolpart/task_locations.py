@@ -28,12 +28,15 @@ class TaskPlace:
         Workers that died, unexpectedly, while the task was assigned to them.
     long_running
         Whether it runs and has seceded.
+    started
+        Whether a worker runs it, as of the worker's last heartbeat.
     """
 
     state: str
     workers: tuple[str, ...]
     deaths: int
     long_running: bool = False
+    started: bool = False
 
 
 @dataclass(frozen=True)
@@ -49,8 +52,8 @@ class Whereabouts:
         considers a worker dead after its ``worker-ttl``, five minutes.
     free
         Slots that no task holds or waits for, by address of the worker; below 0 if a worker has
-        more tasks than slots. Workers that take no tasks at the moment, or are silent, are left
-        out.
+        more tasks than slots. Workers that take no tasks at the moment, because Dask has paused
+        them for their memory or they are leaving, and silent ones are left out.
     slots
         Slots of the workers that take tasks at the moment, free or not.
     tasks
@@ -117,7 +120,8 @@ def _place(task: Any) -> TaskPlace:
     holders = task.who_has or ([worker] if worker else [])
     long_running = worker is not None and task in worker.long_running
     places = tuple(ws.address for ws in holders)
-    return TaskPlace(task.state, places, task.suspicious, long_running)
+    started = worker is not None and task in worker.executing
+    return TaskPlace(task.state, places, task.suspicious, long_running, started)
 
 
 def _in_use(worker: Any, resource: str) -> float:

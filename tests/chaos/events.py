@@ -28,13 +28,15 @@ from lidarpool.base.tracing import trace_to
 
 Event = dict[str, Any]
 
-KILL, TERM, SEGV, STOP, RETIRE, RESTART = KINDS = (
+KILL, TERM, SEGV, STOP, RETIRE, RESTART, PAUSE, DAMAGE = KINDS = (
     "kill",  # SIGKILL
     "term",  # SIGTERM
     "segv",  # segmentation fault
     "stop",  # SIGSTOP, and SIGCONT some time later
     "retire",  # the worker leaves gracefully; one of its name joins
     "restart",  # its nanny is told to start it again
+    "pause",  # as Dask does if memory is short, and on again some time later
+    "damage",  # a bit of a part in storage is flipped; the run is resumed once it has ended
 )
 SIGNALS = {
     KILL: signal.SIGKILL,
@@ -60,7 +62,7 @@ class Fault:
     partition: str = ""  # whose worker; "" for the one that passes the point
     pick: float = 0.0  # which of the partition's workers, from 0 to 1
     after_s: float = 0.0  # at a random time: seconds after the one before
-    stop_s: float = 0.5  # until SIGCONT
+    stop_s: float = 0.5  # until it goes on
     # Whether the scheduler is to give the stopped worker up meanwhile, at once. Its time to live
     # can then be so long that no other worker is given up for being slow.
     given_up: bool = False

@@ -11,13 +11,27 @@ from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from itertools import chain, cycle
+from pathlib import Path
 
 import psutil
+from distributed import Worker
 
 from lidarpool.base.tracing import trace_to
 
 from .arena import TIME_TO_LIVE_S, Arena
-from .events import KINDS, RANDOM, RESTART, RETIRE, SIGNALS, STOP, Fault, Fired, Sink
+from .events import (
+    DAMAGE,
+    KINDS,
+    PAUSE,
+    RANDOM,
+    RESTART,
+    RETIRE,
+    SIGNALS,
+    STOP,
+    Fault,
+    Fired,
+    Sink,
+)
 
 PARTITIONS = ("GPU", "LIDAR", "OTHER")
 ALL_AT_ONCE = 0.15  # part of the faults at random times that come together with the one before
@@ -82,12 +96,14 @@ def _fault(
 class Nemesis:
     """Carries out faults during a run whose driver is in this process; a context manager around it.
 
+    The run keeps its parts in the folder `parts`.
+
     Faults at points are armed at once; those at random times follow one another, from when
     anybody passes a point.
     """
 
-    def __init__(self, arena: Arena, faults: Sequence[Fault]) -> None:
-        self.arena = arena
+    def __init__(self, arena: Arena, faults: Sequence[Fault], parts: Path) -> None:
+        self.arena, self.parts = arena, parts
         self.faults = {fault.number: fault for fault in faults}
         self.done: Counter[tuple[str, str]] = Counter()  # {(kind, point): times}
         self.left: list[Fault] = []  # afterwards: those that were not carried out
@@ -149,7 +165,8 @@ class Nemesis:
         fault = self.faults[fired.number]
         if fault.partition:  # the driver does that in its own thread
             return
-        self._note(fault)
+        if fault.kind != DAMAGE or self._damage(fault):
+            self._note(fault)
         fired.path.unlink()
         if fault.kind == STOP:
             if fault.given_up:
@@ -158,8 +175,8 @@ class Nemesis:
                 self.arena.give_up(fired.pid)
             with self._lock:
                 self._stopped[fired.pid] = time.monotonic() + fault.stop_s
-        elif fault.kind in (RETIRE, RESTART):
-            self._help(fault.kind, fired.worker)
+        elif fault.kind in (RETIRE, RESTART, PAUSE):
+            self._help(fault, fired.worker)
 
     def _wake(self, now: float) -> None:
         """Let those go on that have been stopped for long enough."""
@@ -183,7 +200,10 @@ class Nemesis:
         if not names:
             return False
         name = names[int(fault.pick * len(names))]
-        done = self._signal(fault, name) if fault.kind in SIGNALS else self._help(fault.kind, name)
+        if fault.kind == DAMAGE:
+            done = self._damage(fault)
+        else:
+            done = (self._signal if fault.kind in SIGNALS else self._help)(fault, name)
         if done:
             self._note(fault)
         return done
@@ -197,18 +217,43 @@ class Nemesis:
                 self._stopped[pid] = time.monotonic() + fault.stop_s
         return True
 
-    def _help(self, kind: str, name: str) -> bool:
-        """Have a worker leave or restart, in a thread of its own; False if it is not there."""
+    def _damage(self, fault: Fault) -> bool:
+        """Flip a bit of some part; False if there is none now."""
+        parts = sorted(self.parts.glob("*.npz"))
+        with suppress(FileNotFoundError):  # just removed, as one that came twice
+            if parts:
+                path = parts[int(fault.pick * len(parts))]
+                data = bytearray(path.read_bytes())
+                data[int(fault.pick * 1e6) % len(data)] ^= 1 << fault.number % 8
+                path.write_bytes(data)
+                return True
+        return False
+
+    def _help(self, fault: Fault, name: str) -> bool:
+        """Have a worker leave, restart or pause, in a thread; False if it is not there."""
         address = self.arena.address(name)
         if address is None:
             return False
-        act = self._retire if kind == RETIRE else self._restart
-        helper = threading.Thread(target=act, args=(name, address), name=f"{kind} {name}")
+        acts = {RETIRE: self._retire, RESTART: self._restart, PAUSE: self._pause}
+        arguments = (name, address, fault.stop_s)
+        helper = threading.Thread(
+            target=acts[fault.kind], args=arguments, name=f"{fault.kind} {name}"
+        )
         self._helpers.append(helper)
         helper.start()
         return True
 
-    def _retire(self, name: str, address: str) -> None:
+    def _pause(self, name: str, address: str, seconds: float) -> None:
+        def pause_at(fraction: float, dask_worker: Worker) -> None:
+            dask_worker.memory_manager.memory_pause_fraction = fraction
+
+        for fraction in (1e-9, 0.8):
+            with suppress(OSError, ValueError):  # it died by another fault
+                self.arena.client.run(pause_at, fraction, workers=[address], on_error="ignore")
+            if fraction < 0.8:
+                self._over.wait(seconds)
+
+    def _retire(self, name: str, address: str, _: float) -> None:
         self.arena.client.retire_workers([address], close_workers=True)
         there = False
         while not there:
@@ -216,7 +261,7 @@ class Nemesis:
                 self.arena.revive(name)
             there = name not in self.arena.deserted
 
-    def _restart(self, name: str, address: str) -> None:
+    def _restart(self, name: str, address: str, _: float) -> None:
         with suppress(KeyError, ValueError, TimeoutError):  # it left by another fault
             self.arena.client.restart_workers([address], timeout=30, raise_for_error=False)
 

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import hashlib
+import shutil
+import tempfile
 import time
 import traceback
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 
@@ -18,7 +22,7 @@ from poolpart import placement_violations
 
 from .arena import Arena
 from .checker import Verdict, judge
-from .events import Event, Fault
+from .events import DAMAGE, Event, Fault
 from .nemesis import Nemesis
 
 STEPS, POSES = 360, 2
@@ -103,28 +107,43 @@ def disturbed(
     planning: Planning | None = PLANNING,
     **options: float,
 ) -> Outcome:
-    """Run it while the nemesis does its worst, and judge what comes of it."""
+    """Run it while the nemesis does its worst, and judge what comes of it.
+
+    Where parts were damaged, it is resumed in the end.
+    """
     arena.wait_until_whole()
     arena.board.forget_events()
     started = time.monotonic()
     result: Result | None = None
     error = ""
-    with Nemesis(arena, faults) as nemesis:
-        try:
-            result = simulate(
-                room(), what, planning, client=arena.client, backend="numpy", **options
-            )
-        except Exception as failure:
-            error = "".join(traceback.format_exception(failure))
-    events = arena.board.events(nemesis.run)
+    place = tempfile.mkdtemp(prefix="chaos-run-")
+    again = partial(
+        simulate, room(), what, planning, client=arena.client, backend="numpy", folder=place
+    )
+    try:
+        with Nemesis(arena, faults, Path(place, "parts")) as nemesis:
+            try:
+                result = again(**options)
+            except Exception as failure:
+                error = "".join(traceback.format_exception(failure))
+        events = arena.board.events(nemesis.run)
+        if result is not None and any(kind == DAMAGE for kind, _ in nemesis.done):
+            arena.wait_until_whole()
+            mended = again(resume=True)
+            cloud, same = mended.cloud, digest(mended) == known.digest
+        else:
+            cloud = None if result is None else result.cloud
+            same = result is not None and digest(result) == known.digest
+    finally:
+        shutil.rmtree(place)
     return Outcome(
         verdict=judge(
             events,
             what.scan_count,
-            [] if result is None else result.cloud.scan.tolist(),
+            [] if cloud is None else cloud.scan.tolist(),
             known.rows,
         ),
-        identical=result is not None and digest(result) == known.digest,
+        identical=same,
         done=nemesis.done,
         left=tuple(nemesis.left),
         seconds=time.monotonic() - started,

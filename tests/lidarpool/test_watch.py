@@ -13,17 +13,23 @@ from lidarpool.scan.watch import Watch
 def look(monkeypatch):
     """Looks at workers, given as partition and status, so many seconds after the first look."""
     monkeypatch.setattr(watch, "time", SimpleNamespace(monotonic=lambda: 1000.0))
-    watching = Watch(None, ["GPU", "OTHER"], lasting=["LIDAR"])
+    told: list[str] = []
+    watching = Watch(None, ["GPU", "OTHER"], lasting=["LIDAR"], tell=told.append)
 
     def look(seconds, *workers):
         identities = {
-            str(number): {"resources": {name: 1.0}, "status": status}
+            str(number): {
+                "name": f"w{number}",
+                "resources": {name: 1.0},
+                "status": status,
+                "memory_limit": 150 * 2**20,
+            }
             for number, (name, status) in enumerate(workers)
         }
         monkeypatch.setattr(watch, "worker_identities", lambda client: identities)
         watching.look(1000.0 + seconds)
 
-    look.watching = watching
+    look.watching, look.told = watching, told
     return look
 
 
@@ -46,8 +52,20 @@ def test_workers_that_are_paused_take_no_tasks(look):
         look(61, *paused)
 
 
-def test_one_that_is_not_paused_will_do(look):
+def test_one_that_is_not_paused_will_do_and_the_other_is_named_once(look):
+    look(30, ("GPU", "paused"), *ALL)
     look(61, ("GPU", "paused"), *ALL)
+    [note] = look.watching.notes
+    assert look.told == [note]
+    assert "paused worker w0 of partition GPU, whose memory limit is 150.00 MiB" in note
+
+
+def test_while_all_are_paused_it_says_what_to_do(look):
+    look(30, ("GPU", "paused"), *ALL[1:])
+    assert look.told[-1] == (
+        "waiting for paused workers of partition GPU, for another 30 s: give them a larger "
+        "--memory-limit"
+    )
 
 
 def test_what_runs_already_goes_on_where_workers_are_paused(look):

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
-from distributed import Client
+from distributed import Client, Worker
 from tests.clusters import thread_cluster
 
 from lidarpool import Frame, LidarpoolError, Planning, Scene, Sensor, Survey, simulate
 from lidarpool.run.trials import TrialPump
 from lidarpool.scan import SurveyDriver
+from lidarpool.scan.watch import WATCH_EVERY_S
 from poolpart import placement_violations, worker_identities
 
 # Enough batches that the run is still under way when something happens to it.
@@ -73,6 +76,49 @@ def test_a_partition_that_stays_empty_ends_the_run(tmp_path):
         )  # fmt: skip
     assert '--resources "GPU=1"' in str(end.value)
     assert "of 180 scans are kept" in end.value.__notes__[0]
+
+
+def _pause(client: Client, name: str, *, on: bool) -> None:
+    """Have Dask pause a worker as if its memory were full, or continue it; waits until it has."""
+
+    def pause_at(fraction: float, dask_worker: Worker) -> None:
+        dask_worker.memory_manager.memory_pause_fraction = fraction
+
+    [address] = [a for a, w in worker_identities(client).items() if w["name"] == name]
+    client.run(pause_at, 1e-9 if on else 0.8, workers=[address])
+    wanted = "paused" if on else "running"
+    while worker_identities(client)[address]["status"] != wanted:
+        time.sleep(0.02)
+
+
+def test_a_worker_that_dask_pauses_gets_no_more_batches(client, undisturbed, same_cloud):
+    def on_frame(frame: Frame) -> None:
+        if frame.scan == 30:
+            _pause(client, "GPU-0", on=True)
+            time.sleep(WATCH_EVERY_S)
+
+    try:
+        result = simulate(Scene.seed(), SURVEY, client=client, on_frame=on_frame)
+        assert any("Dask has paused worker GPU-0" in note for note in result.notes)
+    finally:
+        _pause(client, "GPU-0", on=False)
+    assert same_cloud(result.cloud, undisturbed.cloud)
+    assert placement_violations(result.records) == []
+
+
+def test_where_all_are_paused_it_says_what_to_do(client, tmp_path):
+    def on_frame(frame: Frame) -> None:
+        if frame.scan == 30:
+            for name in ("GPU-0", "GPU-1"):
+                _pause(client, name, on=True)
+
+    options = {"folder": tmp_path / "run", "patience_s": 2.0}
+    try:
+        with pytest.raises(LidarpoolError, match=r"'GPU' have taken no tasks .* --memory-limit"):
+            simulate(Scene.seed(), SURVEY, client=client, on_frame=on_frame, **options)
+    finally:
+        for name in ("GPU-0", "GPU-1"):
+            _pause(client, name, on=False)
 
 
 @pytest.mark.parametrize("kind", [ZeroDivisionError, KeyboardInterrupt])

@@ -84,7 +84,7 @@ def test_files_of_no_result_are_neither_replaced_nor_removed_unasked(result, tmp
     assert own.read_text() == "mine"
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "cloud.ply").write_text("mine")
-    with pytest.raises(LidarpoolError, match=r"other holds cloud\.ply, which no result there lists"):
+    with pytest.raises(LidarpoolError, match=r"other holds cloud\.ply, which no"):
         result.report(tmp_path / "other", only_cloud=True)
     result.report(tmp_path / "other", only_cloud=True, overwrite=True)
     result.report(tmp_path / "other", only_cloud=True)

@@ -243,6 +243,7 @@ class Run:
                 self._call(on_progress, self._progress(survey, trials, now - started))
             pause_s = 0.0 if moved else min(max(0.001, 2 * pause_s), LONGEST_PAUSE_S)
             (time.sleep if survey.finished else survey.wait)(pause_s)
+        self.notes += watch.notes
         return times
 
     def _progress(self, survey: SurveyDriver, trials: TrialPump | None, seconds: float) -> Progress:

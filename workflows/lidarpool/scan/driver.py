@@ -300,7 +300,8 @@ class SurveyDriver:
     def _look(self) -> None:
         """Check workers and stages from time to time."""
         if self.workers.due:
-            self.workers.look()
+            casting = self.batches.at(Place.CASTING)
+            self.workers.look([batch.future.key for batch in casting if batch.future])
             self._leave_lost_workers()
             self._leave_late()
         else:
@@ -416,13 +417,18 @@ class SurveyDriver:
         return moved
 
     def _leave_lost_workers(self) -> None:
-        """Offer batches again whose workers have gone or are silent."""
+        """Offer batches again whose workers have gone, are silent, or will not start them."""
         seen = self.workers.seen
         for batch in self.batches.at(Place.CASTING, Place.CAST):
             if batch.worker not in seen.members:
                 self._lost(batch, died=batch.place is Place.CASTING)
-            elif batch.worker in seen.silent and self.workers.slots:
-                self._lost(batch, died=False)
+            elif batch.worker in seen.silent:
+                if self.workers.slots:
+                    self._lost(batch, died=False)
+            elif batch.worker not in seen.free and batch.place is Place.CASTING:
+                task = seen.tasks.get(batch.future.key) if batch.future else None
+                if task is not None and task.state == "processing" and not task.started:
+                    self._again(batch, "its worker takes no tasks")
 
     def _lost(self, batch: Batch, died: bool) -> None:
         alone = not any(

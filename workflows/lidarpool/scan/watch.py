@@ -1,10 +1,12 @@
-"""Waiting for empty partitions, with messages and a time limit."""
+"""Waiting for partitions whose workers are gone or take no tasks, with messages and a limit."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
 
+from dask.utils import format_bytes
 from distributed import Client
 
 from poolpart import worker_identities
@@ -49,6 +51,7 @@ class Watch:
         # {partition: when it last had workers}
         self._seen = dict.fromkeys([*names, *self.lasting], self._looked)
         self._paused: set[str] = set()  # partitions whose workers take no tasks
+        self.notes: list[str] = []  # what a user should know: workers that Dask has paused
 
     def forget(self, names: Iterable[str]) -> None:
         """Stop watching these partitions, which have no more work."""
@@ -67,10 +70,22 @@ class Watch:
                     self._seen[name] = now
                 else:
                     self._paused.add(name)
+                    if worker["status"] == "paused":
+                        self._note_paused(name, worker)
         self._say(now)
         for name, seen in self._seen.items():
             if now - seen > self.patience_s:
                 raise LidarpoolError(self._error(name))
+
+    def _note_paused(self, partition: str, worker: Mapping[str, Any]) -> None:
+        """Say once of each worker that it gets no more tasks."""
+        note = (
+            f"Dask has paused worker {worker['name']} of partition {partition}, whose memory limit "
+            f"is {format_bytes(worker['memory_limit'])}: others get its work until memory is free"
+        )
+        if note not in self.notes:
+            self.notes.append(note)
+            self._tell(note)
 
     def _say(self, now: float) -> None:
         """Print what the run waits for."""
@@ -79,7 +94,11 @@ class Watch:
             self._told = now
             for name, seen in waiting.items():
                 left = max(0.0, self.patience_s - (now - seen))
-                self._tell(f"waiting for workers of partition {name}, for another {left:.0f} s")
+                advice = ": give them a larger --memory-limit" if name in self._paused else ""
+                what = "paused workers" if advice else "workers"
+                self._tell(
+                    f"waiting for {what} of partition {name}, for another {left:.0f} s{advice}"
+                )
 
     def _error(self, name: str) -> str:
         start = f'start some with --resources "{name}=1" and run it again.'

@@ -1,10 +1,10 @@
-"""The driver's record of stage 2 workers: prepared, refused, silent, gone."""
+"""The driver's record of stage 2 workers: prepared, refused, paused, silent, gone."""
 
 from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from typing import Any
 
@@ -73,8 +73,13 @@ class CastingWorkers:
         """Keys of the tasks that prepare workers now."""
         return [f.key for a, f in self._setups.items() if a not in self.slots]
 
-    def look(self) -> None:
-        """Handle workers that have joined or left.
+    def look(self, keys: Iterable[str] = ()) -> None:
+        """Handle workers that have joined or left, or take no tasks at the moment.
+
+        Parameters
+        ----------
+        keys
+            Other tasks whose state is wanted in `seen`.
 
         Raises
         ------
@@ -82,11 +87,11 @@ class CastingWorkers:
             If preparing the scene fails, or kills several workers in a row.
         """
         self._looked_at = time.monotonic()
-        keys = [future.key for future in self.futures]
+        keys = [*(future.key for future in self.futures), *keys]
         self.seen = look_for_tasks(self._client, self._partition.name, keys)
         for address in self._setups.keys() - self.seen.members:
             self._remove(address)
-        for address in sorted(self.seen.members - self._setups.keys() - self.seen.silent):
+        for address in sorted(self.seen.free.keys() - self._setups.keys()):
             if address not in self._refused:
                 self._prepare(address)
         self.check()
@@ -95,9 +100,9 @@ class CastingWorkers:
         """Record the workers that are prepared."""
         for address, future in list(self._setups.items()):
             if address in self.slots:
-                if address in self.seen.silent:
+                if address not in self.seen.free:
                     del self.slots[address]
-            elif future.status == "finished" and address not in self.seen.silent:
+            elif future.status == "finished" and address in self.seen.free:
                 self._take(address, future)
             elif future.status == "error" and not was_killed(future):
                 raise_if_failed(future, PREPARING)
