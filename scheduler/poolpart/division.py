@@ -15,7 +15,7 @@ from distributed import Client
 
 from .errors import PoolError
 from .fence import enclose, lower
-from .inherit import begin_inheritance, end_inheritance
+from .inherit import begin_inheritance, end_inheritance, workers_told
 from .internals import asks_for, lift_restrictions
 from .page import close_page
 from .rules import Rule
@@ -77,6 +77,7 @@ async def declare(
         steward.enter(name, rule)
         for seat in seats[name]:
             steward.put(seat, name, rule.slots_of(seat.info))
+    await workers_told()  # before they get tasks
     everyone = [seat for group in seats.values() for seat in group]
     late = await steward.arrive(everyone, PATIENCE_S)
     if away := [seat for seat in everyone if seat in late or seat.gone]:
@@ -271,6 +272,7 @@ async def dissolve(steward: Steward, names: Collection[str] | None, timeout_s: f
     for seat in seats:
         steward.put(seat, None)
     lift_restrictions(scheduler, gone)
+    await workers_told()
     # An absent worker comes back as it was started.
     here = [seat for seat in seats if not seat.away]
     if late := await steward.arrive(here, max(timeout_s, _RETURN_S)):

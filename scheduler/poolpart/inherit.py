@@ -5,10 +5,8 @@ gives such tasks the partition of the task that submits them, at any depth, unle
 otherwise: by resources, workers or a partition of their own, or with
 ``dask.annotate(resources={})`` for none.
 
-They take no slot. The task that submits them holds one until it ends, also while it waits for
-them and also when it has seceded; if each needed another, a partition whose slots are all
-held by such tasks would wait for ever. A thread they do need, so a task that waits for what
-it has submitted must secede, as always with Dask; `worker_client` does it.
+Each takes a slot, as a task that `Partition.submit` submits. The task that submits them lends its
+own while it waits for them (`lending.py`).
 
 Who submits is known by its thread: what a coroutine, or a thread that the task started itself,
 submits is not inherited. Tried and left: running each function under ``dask.annotate`` (the
@@ -18,20 +16,22 @@ tasks that *those* submit, and every task is pickled with a wrapper around it).
 
 from __future__ import annotations
 
+import asyncio
 import logging
+from collections import defaultdict
 from collections.abc import Iterable
 from typing import Any
 
-from distributed import Client
 from distributed.diagnostics.plugin import SchedulerPlugin
 
 from .errors import PoolError
-from .internals import Resources, Rules, rule_for_graphs, rule_for_shuffles
-from .workers import on_scheduler
+from .internals import Resources, Rules, rule_for_graphs, rule_for_shuffles, tell_of_plugin
+from .lending import lending_plugin
 
 logger = logging.getLogger(__name__)
 
 NAME = "poolpart-inherit"
+ANSWER_S = 5.0  # for workers to begin or end lending; a worker that is stopped does so later
 
 
 class Inheritance(SchedulerPlugin):
@@ -42,6 +42,8 @@ class Inheritance(SchedulerPlugin):
     def __init__(self, scheduler: Any) -> None:
         self.scheduler = scheduler
         self.names: set[str] = set()
+        # {partition that workers were started with: clients that submit to it, by id}
+        self.clients: dict[str, set[str]] = defaultdict(set)
         self.note = ""  # what a user should know where this version of Dask has no room for it
         self._rules = Rules()
         try:
@@ -55,7 +57,14 @@ class Inheritance(SchedulerPlugin):
     def _bequeath(self, task: Any) -> Resources:
         """Resources for what a task submits; none if it belongs to no partition."""
         asked = task.resource_restrictions
-        return dict.fromkeys(self.names & asked.keys(), 0) if asked else {}
+        return dict.fromkeys(self.names & asked.keys(), 1) if asked else {}
+
+    def remove_client(self, scheduler: Any, client: str) -> None:
+        """End what nobody who asked for it is left to use."""
+        for name in [name for name, clients in self.clients.items() if client in clients]:
+            self.clients[name].discard(client)
+            if not self.clients[name]:
+                end_inheritance(scheduler, name)
 
     def uninstall(self) -> None:
         """Take the rules back."""
@@ -63,25 +72,56 @@ class Inheritance(SchedulerPlugin):
         self.scheduler.remove_plugin(NAME)
 
 
-def begin_inheritance(names: Iterable[str] = (), dask_scheduler: Any = None) -> str:
+def begin_inheritance(names: Iterable[str], scheduler: Any, client: str | None = None) -> str:
     """Have tasks that tasks of these partitions submit belong to them, and shuffles stay there.
 
-    Returns what a user should know, where there is anything.
+    Until the partition is dissolved, or the clients that are given, by id, have left. Returns what
+    a user should know, where there is anything.
     """
-    rule: Inheritance = dask_scheduler.plugins.get(NAME) or Inheritance(dask_scheduler)
-    rule.names.update(names)
+    rule: Inheritance = scheduler.plugins.get(NAME) or Inheritance(scheduler)
+    for name in names:
+        if client is not None and (name not in rule.names or name in rule.clients):
+            rule.clients[name].add(client)
+        elif client is None:
+            rule.clients.pop(name, None)
+        if name not in rule.names:
+            rule.names.add(name)
+            _tell(scheduler, name, lending_plugin(name))
     return rule.note
+
+
+def is_inherited(scheduler: Any, name: str) -> bool:
+    """Whether what tasks of a partition submit belongs to it."""
+    rule: Inheritance | None = scheduler.plugins.get(NAME)
+    return rule is not None and name in rule.names
 
 
 def end_inheritance(scheduler: Any, name: str | None) -> None:
     """Leave it to Dask again where such tasks go, or all of them; nothing is left behind."""
     rule: Inheritance | None = scheduler.plugins.get(NAME)
-    if rule is not None:
-        rule.names -= rule.names if name is None else {name}
-        if not rule.names:
-            rule.uninstall()
+    if rule is None:
+        return
+    for ended in rule.names & (rule.names if name is None else {name}):
+        rule.names.discard(ended)
+        rule.clients.pop(ended, None)
+        _tell(scheduler, ended, None)
+    if not rule.names:
+        rule.uninstall()
 
 
-def keep_shuffles_in(client: Client) -> None:
-    """Have shuffles and rechunks of tasks that ask for a partition stay in it, from now on."""
-    on_scheduler(client, begin_inheritance)
+# -- workers, which lend -------------------------------------------------------------------
+
+_told: set[asyncio.Future[Any]] = set()  # requests to workers under way, of all schedulers here
+
+
+def _tell(scheduler: Any, name: str, plugin: bytes | None) -> None:
+    for request in tell_of_plugin(scheduler, f"poolpart-lending-{name}", plugin):
+        _told.add(request)
+        request.add_done_callback(_told.discard)
+
+
+async def workers_told() -> None:
+    """Wait until workers that answer have begun or ended to lend."""
+    own = {request for request in _told if request.get_loop() is asyncio.get_running_loop()}
+    if own:
+        await asyncio.wait(own, timeout=ANSWER_S)

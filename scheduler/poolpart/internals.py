@@ -8,6 +8,7 @@ worker or nanny.
 
 from __future__ import annotations
 
+import asyncio
 import inspect
 import logging
 import time
@@ -20,10 +21,12 @@ from typing import Any
 
 import dask
 import distributed
-from distributed import Client, Future, SpecCluster, Status
+from distributed import Client, Future, SpecCluster, Status, as_completed, futures_of
 from distributed.protocol import to_serialize
 from distributed.protocol.pickle import dumps
 from distributed.protocol.serialize import Serialize, Serialized, deserialize
+from distributed.worker import thread_state
+from distributed.worker_state_machine import UnpauseEvent
 from tornado import web
 
 from .errors import PoolError
@@ -374,7 +377,9 @@ def declare_on_worker(resources: Resources, dask_worker: Any = None) -> bool:
     """
     state = dask_worker.state
     total, available = state.total_resources, state.available_resources
-    if any(available[name] < total[name] for name in total.keys() - resources.keys()):
+    # Not what is available: a task may have lent its slots, and takes them back.
+    held = {name for task in state.all_running_tasks for name in resources_of(task)}
+    if held & (total.keys() - resources.keys()):
         return False
     for name, quantity in {**dict.fromkeys(total, 0), **resources}.items():
         available[name] = available.get(name, 0) + quantity - total.get(name, 0)
@@ -382,9 +387,106 @@ def declare_on_worker(resources: Resources, dask_worker: Any = None) -> bool:
     return True
 
 
+def resources_of(task: Any) -> Resources:
+    """Resources that a task of this worker takes while it runs."""
+    return {name: slots for name, slots in (task.resource_restrictions or {}).items() if slots}
+
+
 def resources_here(worker: Any) -> tuple[str, ...]:
     """Names of the resources that a worker has; runs on the worker."""
     return tuple(sorted(name for name, slots in worker.state.total_resources.items() if slots))
+
+
+# -- slots that a task lends while it waits -------------------------------------------------
+#
+# What Dask does when a task secedes and rejoins, also several times: the worker counts it as
+# long-running from the first time to its end, so that a task in its place may start but have to
+# wait for a thread; its resources stay taken throughout.
+
+
+def task_of_thread() -> tuple[Any, Any] | None:
+    """Worker and state of the task that runs in this thread; None in any other thread."""
+    if (key := getattr(thread_state, "key", None)) is None:
+        return None
+    worker = thread_state.execution_state["worker"]
+    task = worker.state.tasks.get(key)
+    return None if task is None else (worker, task)
+
+
+def free_slots(worker: Any, slots: Resources) -> None:
+    """Let waiting tasks of a worker have these slots; runs in its event loop."""
+    for name, number in slots.items():
+        worker.state.available_resources[name] += number
+    if worker.state.running:  # or it is paused, and starts them when it goes on
+        worker.handle_stimulus(UnpauseEvent(stimulus_id=f"poolpart-lent-{time.time()}"))
+
+
+def take_slots(worker: Any, slots: Resources) -> None:
+    """Keep these slots from waiting tasks, also if there are fewer now; runs in its event loop."""
+    for name, number in slots.items():
+        worker.state.available_resources[name] -= number
+
+
+def slots_here(worker: Any, name: str) -> tuple[float, float]:
+    """Slots of a worker that are available, below 0 if reserved, and all."""
+    return worker.state.available_resources[name], worker.state.total_resources[name]
+
+
+class Waits:
+    """Has what waits for futures in tasks of this process do it within a context.
+
+    That is `Future.result` and `exception`, `Client.gather`, `wait`, the computing of collections,
+    and `as_completed`, where they are called in the thread of a task and have to wait. All but the
+    last come down to `Client.sync`, which is called for much else.
+    """
+
+    def __init__(self, context: Callable[[], AbstractContextManager[None]]) -> None:
+        of_future = (Future._result, Future._exception, Future._traceback)
+        waits = {*of_future, Client._gather, distributed.client._wait}
+        sync, following = Client.sync, as_completed.__next__
+
+        def sync_within(client: Any, function: Any, *args: Any, **kwargs: Any) -> Any:
+            if getattr(function, "__func__", function) in waits and task_of_thread():
+                owner = getattr(function, "__self__", None)
+                futures = futures_of(owner if isinstance(owner, Future) else args[0])
+                if any(future.status in ("pending", "lost") for future in futures):
+                    with context():
+                        return sync(client, function, *args, **kwargs)
+            return sync(client, function, *args, **kwargs)
+
+        def following_within(done: Any) -> Any:
+            if task_of_thread() and not done.has_ready() and not done.is_empty():
+                with context():
+                    return following(done)
+            return following(done)
+
+        self._following = following
+        Client.sync = sync_within  # inherited until now
+        as_completed.__next__ = as_completed.next = following_within
+
+    def take_back(self) -> None:
+        """Leave the classes as they were."""
+        del Client.sync
+        as_completed.__next__ = as_completed.next = self._following
+
+
+def tell_of_plugin(scheduler: Any, name: str, plugin: bytes | None) -> list[asyncio.Future[Any]]:
+    """Give a plugin to all workers, also later ones before they get tasks, or take it from all.
+
+    Returns the requests under way. A worker that does not answer is in the log.
+    """
+    if plugin is None:
+        scheduler.worker_plugins.pop(name, None)
+        message: dict[str, Any] = {"op": "plugin-remove", "name": name}
+    else:
+        scheduler.worker_plugins[name] = plugin
+        message = {"op": "plugin-add", "name": name, "plugin": plugin}
+    return [  # each by itself: one that is stopped keeps none of the others
+        asyncio.ensure_future(
+            scheduler.broadcast(msg=message, workers=[address], on_error="ignore")
+        )
+        for address in scheduler.workers
+    ]
 
 
 # -- queues and variables, which a pipe is made of ---------------------------------------

@@ -25,6 +25,7 @@ from dask.utils import funcname
 from distributed import CancelledError, Client, Future, Reschedule
 
 from .internals import when_done
+from .lending import slots_lent
 from .workers import all_workers
 
 logger = logging.getLogger(__name__)
@@ -367,7 +368,7 @@ class Results(Iterator[Any]):
                 )
             if time.monotonic() > self._next_look:
                 self._look()
-            with suppress(queue.Empty):
+            with suppress(queue.Empty), slots_lent(self._done.empty()):
                 done.append(self._done.get(timeout=1))
         while not self._done.empty():
             done.append(self._done.get())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from contextvars import ContextVar
 from typing import Any, Self
@@ -12,8 +12,8 @@ from distributed import Client, Future
 
 from .division import ask, dissolve, grow, shrink
 from .errors import PoolError
-from .inherit import keep_shuffles_in
 from .mapping import Results, Stage
+from .membership import addresses_of, check_slots, forget_memberships
 from .stats import PartitionStats, partition_stats
 from .task_context import own_client
 from .workers import WorkerInfo, all_workers
@@ -46,9 +46,10 @@ class Partition:
     def __init__(self, name: str, client: Client | None = None, note: str = "") -> None:
         self.name, self.note = name, note
         self._client = client
+        self._by_rule = False  # made while the cluster ran, so that it can be dissolved
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return Partition, (self.name, None, self.note)
+        return Partition, (self.name, None, self.note), {"_by_rule": self._by_rule}
 
     @property
     def client(self) -> Client:
@@ -94,7 +95,7 @@ class Partition:
         priority: int = 0,
         retries: int = 0,
         slots: int = 1,
-        worker: str | None = None,
+        workers: str | Sequence[str] | None = None,
         **kwargs: Any,
     ) -> Future:
         """Submit one task to these workers.
@@ -111,10 +112,11 @@ class Partition:
         retries
             How often the task runs again if it fails.
         slots
-            Slots of one worker that it takes while it runs; it waits for ever if no member has
-            so many.
-        worker
-            Address of the member to run on; if it leaves, the task waits for ever.
+            Slots of one worker that it takes while it runs. In a task of a partition they are
+            lent to others while it waits for other tasks.
+        workers
+            Name or address of the member to run on, or a list of them. Names become the present
+            addresses: if these workers leave, or are started again, the task waits for ever.
 
         Returns
         -------
@@ -124,7 +126,17 @@ class Partition:
         ------
         ValueError
             If `slots` is below 1.
+        PoolError
+            If the partition was dissolved, none of its workers has so many slots, or a worker
+            belongs to another. Without any workers the task waits for one. The client asks at
+            most once a second, and not within an event loop.
         """
+        asks = not self.client.asynchronous  # or it would wait for the answer in its event loop
+        resources = self._taking(slots, asks)
+        if workers is not None:
+            workers = [workers] if isinstance(workers, str) else list(workers)
+            if asks:
+                workers = addresses_of(self.client, self.name, workers)
         return self.client.submit(
             function,
             *args,
@@ -132,14 +144,17 @@ class Partition:
             pure=False,
             priority=priority,
             retries=retries or None,
-            resources=self._taking(slots),
-            workers=None if worker is None else [worker],
+            resources=resources,
+            workers=workers,
             **kwargs,
         )
 
-    def _taking(self, slots: int) -> dict[str, int]:
+    def _taking(self, slots: int, asks: bool = True) -> dict[str, int]:
+        """Resources of a task, which is checked first; `asks` allows a request."""
         if not isinstance(slots, int) or slots < 1:
             raise ValueError(f"slots is {slots!r}; give a whole number, 1 or more.")
+        if asks:
+            self._by_rule = check_slots(self.client, self.name, slots, self._by_rule)
         return {self.name: slots}
 
     def map(
@@ -224,7 +239,6 @@ class Partition:
         >>> total.result()                                               # doctest: +SKIP
         1000000000.0
         """
-        keep_shuffles_in(self.client)
         return self.client.compute(collections, resources=self._taking(slots), **options)
 
     def persist(self, collections: Any, *, slots: int = 1, **options: Any) -> Any:
@@ -235,7 +249,6 @@ class Partition:
         collection or list of collections
             The same collections, backed by futures.
         """
-        keep_shuffles_in(self.client)
         return self.client.persist(collections, resources=self._taking(slots), **options)
 
     def gather(self, futures: Any, **options: Any) -> Any:
@@ -275,10 +288,10 @@ class Partition:
         >>> with io:                                                     # doctest: +SKIP
         ...     total = dask.array.ones(10**9).sum().compute()
         """
-        keep_shuffles_in(self.client)
+        resources = self._taking(1)
         with ExitStack() as stack:
             stack.enter_context(self.client.as_current())
-            stack.enter_context(dask.annotate(resources={self.name: 1}))
+            stack.enter_context(dask.annotate(resources=resources))
             _entered.set((*_entered.get(), stack.pop_all()))
         return self
 
@@ -340,3 +353,4 @@ class Partition:
     def dissolve(self, timeout_s: float = 30.0) -> None:
         """Undo this partition; see `Pool.dissolve`."""
         ask(self.client, dissolve, names=[self.name], timeout_s=timeout_s)
+        forget_memberships()

@@ -12,6 +12,7 @@ from distributed import Client
 
 from .division import ask, declare, dissolve
 from .errors import PoolError
+from .membership import forget_memberships
 from .page import leave_page, partitions_page
 from .partition import Partition
 from .probe import probe_worker
@@ -301,6 +302,7 @@ class Pool:
             If their tasks have not ended; then everything stays.
         """
         names: list[str] = ask(self.client, dissolve, names=None, timeout_s=timeout_s)
+        forget_memberships()
         return names
 
     def _divide(
@@ -334,5 +336,8 @@ class Pool:
         )
         told = {name: "; ".join(filter(None, (notes.get(name), common))) for name in rules}
         parts = {name: Partition(name, self.client, told[name]) for name in rules}
+        for part in parts.values():
+            part._by_rule = True
+        forget_memberships()
         taken = {worker.address for group in chosen.values() for worker in group}
         return parts, Pool(self.client, [w for w in mine if w.address not in taken])

@@ -182,6 +182,11 @@ def divide(
             )
         if isinstance(rule, per_gpu) and free and not any(worker.gpus for worker in free):
             notes[name] = NO_GPU
+        if isinstance(rule, n_workers) and len(chosen[name]) < rule.workers:
+            notes[name] = (
+                f"has {len(chosen[name])} of the {rule.workers} workers that it asks for; later "
+                "workers join it"
+            )
     return chosen, notes
 
 

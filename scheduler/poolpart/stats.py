@@ -81,19 +81,18 @@ def running_on(worker: Any, partition: str) -> tuple[Counter[str], int]:
     """Tasks of a partition that a worker runs, by stage, and the slots that they hold.
 
     The scheduler only knows which tasks it gave to a worker: as many of them run as the worker
-    has slots. Nested tasks take no slot, but a thread each.
+    has slots. So of a task that waits and the nested tasks in its slots, some do not count.
     """
-    slots, threads = slots_of(worker, partition), worker.nthreads
-    held = nested = 0
+    slots = slots_of(worker, partition)
+    held = 0
     stages: Counter[str] = Counter()
     for task in islice(worker.processing, _LOOK_AT_MOST):
         if partition_of(task) != partition:
             continue
         takes = int(task.resource_restrictions[partition]) if partition else 1
-        if held + takes > slots or (not takes and nested == threads):
+        if held + takes > slots:
             continue
         held += takes
-        nested += not takes
         stages[task.prefix.name] += 1
     return stages, held
 
@@ -142,7 +141,7 @@ class PartitionStats(StageStats):
     workers
         Workers that it has now.
     slots, busy
-        Slots of these workers, and how many are held by a task. Nested tasks hold none.
+        Slots of these workers, and how many are held by a task.
     exclusive
         Whether a fence keeps other tasks out.
     stages

@@ -30,7 +30,7 @@ def test_the_busy_one_is_kept_and_the_idle_one_may_go(start, wait_until):
     parts = Pool.from_client(client).divide({"A": rest(minimum=1)})
     event = Event("busy", client)
     busy = parts["A"].workers[1].address
-    task = parts["A"].submit(wait_for, "busy", worker=busy)
+    task = parts["A"].submit(wait_for, "busy", workers=busy)
     wait_until(lambda: client.cluster.scheduler.workers[busy].processing)
     assert len(to_close(client)) == 2
     assert busy not in to_close(client)

@@ -163,5 +163,5 @@ def test_a_worker_without_a_name_that_its_nanny_starts_again(nameless, wait_unti
         wait_until(lambda: len(part) == 2)
         (newcomer,) = {worker.address for worker in part.workers} - now.keys()
         # Both of its slots at once, and by a task of its own rather than by the client.
-        asked = [part.submit(own_device, worker=newcomer) for _ in range(4)]
+        asked = [part.submit(own_device, workers=newcomer) for _ in range(4)]
         assert client.gather(asked) == [device] * 4

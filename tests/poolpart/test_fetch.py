@@ -99,7 +99,7 @@ def test_a_worker_that_does_not_answer_keeps_only_its_own_results(nannies, wait_
 def test_results_come_from_the_worker_that_has_them(client):
     part = Partition("A", client)
     one, two = (worker.address for worker in part.workers)
-    there, elsewhere = (part.submit(twice, n, worker=a) for n, a in ((3, one), (4, two)))
+    there, elsewhere = (part.submit(twice, n, workers=a) for n, a in ((3, one), (4, two)))
     wait([there, elsewhere], timeout=LONG_S)
     keys = [there.key, elsewhere.key, "never-submitted"]
     assert fetch_available(client, keys, LONG_S, at=one) == {there.key: 6}

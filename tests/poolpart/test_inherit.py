@@ -39,7 +39,7 @@ def client(start):
 
 
 @pytest.mark.parametrize("way", ["get_client", "worker_client", "compute"])
-def test_at_any_depth_and_without_waiting_for_a_slot(client, way):
+def test_at_any_depth_and_on_a_single_slot(client, way):
     names = Partition("A", client).submit(descend, 3, way).result(LONG_S)
     assert names == ["A-0"] * 15
     by_resource = client.submit(descend, 3, way, resources={"B": 1}, pure=False)
@@ -76,15 +76,3 @@ def test_unless_they_say_otherwise(client):
     assert anywhere > {"A-0"}
     assert named == ["B-0", "B-0", "plain", "A-0"]
     assert mixed == ("B-0", "A-0")
-
-
-def test_a_worker_that_left_the_partition_gets_none(start, wait_until):
-    client = start({"a": {}})
-    pool = Pool.from_client(client)
-    part, _ = pool.partition("A", n_workers=1, minimum=0)
-    part.shrink()
-    # As what a task of the partition submits: it takes no slot, and no slots are what is there.
-    nested = client.submit(here, resources={"A": 0}, pure=False)
-    wait_until(lambda: client.cluster.scheduler.unrunnable)
-    part.grow()
-    assert nested.result(LONG_S) == "a"

@@ -100,7 +100,7 @@ def test_the_least_busy_worker_goes(divided):
     client, parts = divided
     event = Event("least-busy", client)
     busy = parts["A"].workers[:2]
-    tasks = [parts["A"].submit(wait_for, "least-busy", worker=w.address) for w in busy]
+    tasks = [parts["A"].submit(wait_for, "least-busy", workers=w.address) for w in busy]
     scheduler = client.cluster.scheduler
     while sum(len(scheduler.workers[w.address].processing) for w in busy) < 2:
         time.sleep(0.01)
@@ -114,7 +114,7 @@ def test_a_task_that_does_not_end_keeps_its_worker(divided, wait_until):
     client, parts = divided
     event = Event("endless", client)
     tasks = [
-        parts["A"].submit(function, "endless", key=f"endless-{i}", worker=worker.address)
+        parts["A"].submit(function, "endless", key=f"endless-{i}", workers=worker.address)
         for i, (function, worker) in enumerate(
             zip((wait_for, hold_on, hold_on), parts["A"].workers, strict=True)
         )
@@ -137,7 +137,7 @@ def test_a_task_that_was_cancelled_but_runs_on_keeps_its_slot(divided):
     event = Event("cancelled", client)
     workers = {w.address for w in parts["A"].workers}
     tasks = [
-        parts["A"].submit(begin_and_wait_for, "cancelled", worker=address) for address in workers
+        parts["A"].submit(begin_and_wait_for, "cancelled", workers=address) for address in workers
     ]
     assert {begun.get(timeout=LONG_S) for _ in workers} == {"cancelled"}
     client.cancel(tasks)

@@ -1,6 +1,7 @@
 """Statistics of partitions: each task counted once, whatever happens."""
 
 import threading
+import uuid
 
 import pytest
 from distributed import Client, get_worker, worker_client
@@ -27,7 +28,7 @@ def broken(_):
 
 def nesting():
     with worker_client() as client:
-        client.submit(held, "nested", pure=False).result()
+        client.submit(held, "nested", pure=False, key=f"nested-{uuid.uuid4()}").result()
 
 
 @pytest.fixture
@@ -110,13 +111,11 @@ def test_a_task_whose_worker_dies_while_it_runs(start, wait_until):
     assert (part.stats().done, part.stats().failed) == (2, 0)
 
 
-def test_nested_tasks_run_beside_the_slots(client, wait_until):
-    tasks = [
-        client.submit(nesting, resources={"A": 1}, key="nesting"),
-        client.submit(held, 1, resources={"A": 0}, key="nested-1"),
-    ]
+def test_a_task_that_lends_its_slots_and_the_one_that_has_them_are_one(client, wait_until):
     part = Partition("A", client)
-    wait_until(lambda: part.stats().running == 2)
-    assert part.stats().queued == 0
+    tasks = [part.submit(nesting) for _ in range(2)]
+    wait_until(lambda: part.stats().stages.get("nested", StageStats()) != StageStats())
+    wait_until(lambda: part.stats().running + part.stats().queued == 4)
+    assert (part.stats().busy, part.stats().running) == (2, 2)
     go.set()
     client.gather(tasks)

@@ -16,7 +16,7 @@ def test_slots_that_long_tasks_hold_are_not_free(client, wait_until):
     one, two = (worker.address for worker in partition.workers)
     assert look_for_tasks(client, "A").free == {one: 2, two: 2}
     done = Event("slots-done", client=client)
-    futures = [partition.submit(hold, "slots-done", worker=one) for _ in range(3)]
+    futures = [partition.submit(hold, "slots-done", workers=one) for _ in range(3)]
     keys = [future.key for future in futures]
 
     def running():

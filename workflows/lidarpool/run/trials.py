@@ -95,7 +95,7 @@ class TrialPump:
             self.planning,
             number,
             key=f"{TRIAL}-{self._run_id}-{number}.{self._rounds[number]}",
-            worker=worker,
+            workers=worker,
         )
         self._rounds[number] += 1
         self._running[future] = number

@@ -393,7 +393,7 @@ class SurveyDriver:
             batch.stop,
             self.run_id,
             key=f"{INTERSECT}-{self.run_id}-{batch.first}.{offer}",
-            worker=address,
+            workers=address,
         )
         batch.to(Place.CASTING, time.monotonic())
         self._trace("submit", INTERSECT, batch.scans)

@@ -251,7 +251,7 @@ class LongStages:
         function, arguments = self._commands[name](number)
         earlier = self._tasks.get(name)
         key = f"{name}-{self.run}-{number}"
-        future = self.partition.submit(function, *arguments, key=key, worker=worker)
+        future = self.partition.submit(function, *arguments, key=key, workers=worker)
         self._tasks[name] = _Task(future, worker, time.monotonic())
         if earlier is not None:
             # If it still runs, it ends with its pipe; its result is dropped.

@@ -145,7 +145,7 @@ class CastingWorkers:
             self._plan,
             key=f"prepare-{self.handle}-{self._count}",
             priority=10,
-            worker=address,
+            workers=address,
         )
 
     def _take(self, address: str, future: Future) -> None:

@@ -1,0 +1,287 @@
+"""Tasks take slots of their partition at any depth, and lend their own while they wait."""
+
+import subprocess
+import sys
+import threading
+import time
+
+import dask
+import pytest
+from distributed import Client, Event, as_completed, get_client, wait, worker_client
+from tests.poolpart.helpers import LONG_S, declared, here, join, kill, wait_for
+
+from poolpart import Partition, Pool, PoolError, rest
+from poolpart.lending import lending_plugin
+
+
+class Gauge:
+    """How many are in its block at a time; tasks of a cluster of threads share it."""
+
+    def __init__(self):
+        self.now = self.most = 0
+        self._lock = threading.Lock()
+
+    def __enter__(self):
+        with self._lock:
+            self.now += 1
+            self.most = max(self.most, self.now)
+
+    def __exit__(self, *_):
+        with self._lock:
+            self.now -= 1
+
+
+gauge = Gauge()
+meeting = threading.Barrier(2)  # of two tasks that have to run at a time
+
+
+@pytest.fixture(autouse=True)
+def _new_gauge():
+    gauge.most = 0
+
+
+def work(number):
+    with gauge:
+        time.sleep(0.02)
+    return number
+
+
+def parent(way, number=8):
+    """Sum of what nested tasks return, for which it waits in one of several ways."""
+    with gauge:
+        client = get_client()
+        items = range(number)
+    if way == "collection":
+        found = dask.compute(*(dask.delayed(work, pure=False)(i) for i in items))
+    elif isinstance(way, Partition):
+        found = list(way.map(work, items, chunk=1))
+    else:
+        futures = client.map(work, items, pure=False)
+        if way == "gather":
+            found = client.gather(futures)
+        elif way == "result":
+            found = [future.result() for future in futures]
+        elif way == "as_completed":
+            found = []
+            for future in as_completed(futures):
+                with gauge:
+                    found.append(future.result())
+        elif way == "wait":
+            wait(futures)
+            found = [future.result() for future in futures]
+        else:
+            with worker_client() as client:
+                found = client.gather(futures)
+    with gauge:
+        return sum(found)
+
+
+def one_worker(start, slots, nthreads=4):
+    """Partition of one worker."""
+    client = start({"a": {"nthreads": nthreads}})
+    return Pool.from_client(client).partition("A", n_workers=1, slots=slots)[0]
+
+
+def slots_there(part):
+    """Slots that the workers of a partition have available."""
+    addresses = [worker.address for worker in part.workers]
+    return list(part.client.run(_available, part.name, workers=addresses).values())
+
+
+def _available(name, dask_worker):
+    return dask_worker.state.available_resources[name]
+
+
+WAYS = ("gather", "result", "as_completed", "wait", "worker_client", "collection", "map")
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_on_one_slot_nested_tasks_and_their_parent_run_one_at_a_time(start, way):
+    part = one_worker(start, slots=1)
+    given = part if way == "map" else way
+    assert part.submit(parent, given).result(LONG_S) == 28
+    assert gauge.most == 1
+    assert slots_there(part) == [1]
+
+
+def meet(_):
+    meeting.wait(LONG_S)
+    return 1
+
+
+def test_on_two_slots_two_at_a_time(start):
+    part = one_worker(start, slots=2)
+    assert part.submit(parent_of_pairs).result(LONG_S) == 8
+    parents = [part.submit(parent, "result") for _ in range(3)]
+    assert part.client.gather(parents) == [28] * 3
+    assert gauge.most == 2
+    assert slots_there(part) == [2]
+
+
+def parent_of_pairs():
+    client = get_client()
+    return sum(client.gather(client.map(meet, range(8), pure=False)))
+
+
+def descend(depth):
+    """Three deep, with a wait at each level before another."""
+    if not depth:
+        return 1
+    client = get_client()
+    first = client.submit(descend, depth - 1, pure=False).result()
+    return first + sum(client.gather(client.map(descend, [depth - 1] * 2, pure=False)))
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_one_thread_and_one_slot_each_are_enough_at_any_depth(start, workers):
+    client = start({str(number): {} for number in range(workers)})
+    part, _ = Pool.from_client(client).partition("A", n_workers=workers)
+    assert client.gather([part.submit(descend, 3) for _ in range(3)]) == [27] * 3
+    assert slots_there(part) == [1] * workers
+
+
+def submit_into(part, number, slots=1):
+    return part.submit(work, number, slots=slots).result()
+
+
+def fail_below():
+    try:
+        get_client().submit(int, "x").result()
+    except ValueError:
+        return get_client().submit(int, "3").result()
+
+
+def not_wait_long(gate):
+    client = get_client()
+    child = client.submit(wait_for, gate)
+    with pytest.raises(TimeoutError):
+        child.result(timeout=0.01)
+    Event(gate, client).set()
+    return child.result()
+
+
+def test_errors_and_timeouts_give_the_slots_back(start):
+    part = one_worker(start, slots=2, nthreads=2)
+    assert part.submit(fail_below).result(LONG_S) == 3
+    assert part.submit(not_wait_long, "lending-timeout").result(LONG_S)
+    with pytest.raises(PoolError, match=r"asks for 5 slots .* partition 'A' have 2 at most"):
+        part.submit(submit_into, part, 1, slots=5).result(LONG_S)
+    with pytest.raises(ValueError, match="invalid literal"):
+        part.submit(_raise_from_below).result(LONG_S)
+    assert slots_there(part) == [2]
+
+
+def _raise_from_below():
+    return get_client().submit(int, "x").result()
+
+
+def wait_below(gate, begun):
+    client = get_client()
+    child = client.submit(wait_for, gate, workers="b")  # which is not in the partition
+    Event(begun, client).set()
+    return child.result()
+
+
+def test_a_parent_that_is_cancelled_keeps_its_worker_until_it_ends(start, wait_until):
+    client = start({"a": {}, "b": {}})
+    part, _ = Pool.from_client(client).partition("A", workers=["a"], minimum=0)
+    future = part.submit(wait_below, "lending-cancelled", "lending-begun")
+    assert wait_for_in(client, "lending-begun")
+    wait_until(lambda: slots_there(part) == [1])  # lent
+    with pytest.raises(PoolError, match=r"could not be moved within 0\.2 s"):
+        part.shrink(timeout_s=0.2)
+    future.cancel()
+    wait_until(lambda: future.key not in client.cluster.scheduler.tasks)
+    with pytest.raises(PoolError, match=r"could not be moved within 0\.2 s"):
+        part.shrink(timeout_s=0.2)
+    Event("lending-cancelled", client).set()
+    assert part.shrink(timeout_s=LONG_S) == ["a"]
+    assert part.grow(timeout_s=LONG_S)
+    assert part.submit(descend, 2).result(LONG_S) == 9
+
+
+def wait_for_in(client, event):
+    return Event(event, client).wait(LONG_S)
+
+
+def hold(gate):
+    client = get_client()
+    return client.submit(wait_for, gate, resources={"R": 1}).result(timeout=0.5)
+
+
+def test_what_holds_a_resource_that_is_no_partition_lends_nothing(start):
+    client = start({"a": {"nthreads": 2, "resources": {"R": 1}}, "b": {}})
+    Pool.from_client(client).partition("A", workers=["b"])
+    Event("lending-r", client).set()
+    with pytest.raises(TimeoutError):
+        client.submit(hold, "lending-r", resources={"R": 1}).result(LONG_S)
+
+
+# -- workers that were started with a partition ------------------------------------------
+
+
+def test_a_partition_that_workers_were_started_with(start, wait_until):
+    client = start({"a": {"resources": {"A": 1}}})
+    scheduler = client.cluster.scheduler
+    before, untouched = set(scheduler.plugins), "sync" not in vars(Client)
+    with Client(client.cluster) as other:
+        part = Partition("A", other)
+        assert part.submit(submit_into, part, 5).result(LONG_S) == 5
+        assert part.submit(descend, 3).result(LONG_S) == 27
+        join(client, "b", resources={"A": 1})  # is told before it gets tasks
+        assert part.submit(descend, 3, workers="b").result(LONG_S) == 27
+    # What a client that is still there has begun ends with it.
+    wait_until(lambda: set(scheduler.plugins) == before and not _lends(client))
+    if untouched:  # no other cluster of this process has partitions
+        assert "sync" not in vars(Client)
+        assert as_completed.next is as_completed.__next__
+        assert as_completed.__next__.__module__ == "distributed.client"
+
+
+def _lends(client):
+    plugins = client.run(lambda dask_worker: list(dask_worker.plugins)).values()
+    return [name for names in plugins for name in names if "lending" in name]
+
+
+def test_a_worker_without_this_package_ignores_the_plugin():
+    code = (
+        "import sys; sys.modules['poolpart'] = None\n"
+        "from distributed.protocol.pickle import loads\n"
+        "plugin = loads(sys.stdin.buffer.read())\n"
+        "plugin.setup(worker=None); plugin.transition('x', 'ready', 'executing')\n"
+        "plugin.teardown(worker=None)"
+    )
+    subprocess.run([sys.executable, "-c", code], input=lending_plugin("A"), check=True)
+
+
+# -- deaths --------------------------------------------------------------------------------
+
+
+def wait_and_say(gate):
+    wait_for(gate)
+    return here()
+
+
+@pytest.mark.parametrize("who", ["parent", "child"])
+def test_whoever_dies_while_the_parent_waits(nannies, wait_until, who):
+    part = Pool.from_client(nannies).divide({"A": rest()})["A"]
+    gate = f"lending-dies-{who}"
+    parent = part.submit(across, part, gate)
+    assert wait_for_in(nannies, f"{gate}-begun")
+    scheduler = nannies.cluster.scheduler
+    wait_until(lambda: any(t.key.startswith("wait_and_say") for t in scheduler.tasks.values()))
+    wait_until(lambda: scheduler.tasks[parent.key].processing_on is not None)
+    lender = str(scheduler.tasks[parent.key].processing_on.name)
+    kill(nannies, lender if who == "parent" else str(1 - int(lender)))
+    nannies.wait_for_workers(2, timeout=LONG_S)
+    Event(gate, nannies).set()
+    assert parent.result(LONG_S) == 1
+    wait_until(lambda: declared(nannies) == {"0": {"A": 1}, "1": {"A": 1}})
+    wait_until(lambda: slots_there(part) == [1, 1])
+
+
+def across(part, gate):
+    child = part.submit(wait_and_say, gate)
+    Event(f"{gate}-begun", part.client).set()
+    child.result()
+    return descend(0)
