@@ -409,7 +409,7 @@ def task_of_thread() -> tuple[Any, Any] | None:
     if (key := getattr(thread_state, "key", None)) is None:
         return None
     worker = thread_state.execution_state["worker"]
-    task = worker.state.tasks.get(key)
+    task = worker.state.tasks.get(key)  # an actor's method is no task
     return None if task is None else (worker, task)
 
 
@@ -448,7 +448,7 @@ class Waits:
         def sync_within(client: Any, function: Any, *args: Any, **kwargs: Any) -> Any:
             if getattr(function, "__func__", function) in waits and task_of_thread():
                 owner = getattr(function, "__self__", None)
-                futures = futures_of(owner if isinstance(owner, Future) else args[0])
+                futures = futures_of(owner if isinstance(owner, Future) else [*args])
                 if any(future.status in ("pending", "lost") for future in futures):
                     with context():
                         return sync(client, function, *args, **kwargs)

@@ -40,7 +40,9 @@ class Partition:
 
     Notes
     -----
-    It can be an argument of a task, which then submits with the client of its worker.
+    It can be an argument of a task, which then submits with the client of its worker. What a task
+    of a partition submits to a `Client` belongs to the same partition and takes a slot; the task
+    lends its own while it waits for results.
     """
 
     def __init__(self, name: str, client: Client | None = None, note: str = "") -> None:
