@@ -5,7 +5,7 @@ from .caster import RayCaster
 from .hits import Hits, ScanReturns
 from .pattern import Pattern
 from .poses import Motion
-from .registry import available_backends
+from .registry import available_backends, backend_build
 
 __all__ = [
     "BackendUnavailable",
@@ -15,4 +15,5 @@ __all__ = [
     "RayCaster",
     "ScanReturns",
     "available_backends",
+    "backend_build",
 ]

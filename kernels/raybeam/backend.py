@@ -60,6 +60,11 @@ class Backend(ABC):
     def missing(cls) -> str:
         """Why this backend cannot be used here and what to install; "" when it can."""
 
+    @classmethod
+    def build(cls) -> str:
+        """Versions and instruction set that its bits depend on, beside NumPy; "" for none."""
+        return ""
+
     def __init__(self, mesh: LocalMesh, threads: int | None, device: int | None) -> None:
         self._mesh = mesh
 

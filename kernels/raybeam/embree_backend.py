@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from importlib.metadata import files, version
 from typing import Any, ClassVar
 
 import numpy as np
@@ -36,6 +38,9 @@ _NEAR = 2.0
 _CLEAR = 2.0**-8
 
 _SHARE = 1 << 13  # rays that a thread takes at a time, where there are several
+
+# RTC_DEVICE_PROPERTY_NATIVE_RAY…_SUPPORTED, and the rays.
+_WIDTHS = ((34, 16), (33, 8), (32, 4))
 
 
 @dataclass(frozen=True)
@@ -100,6 +105,20 @@ class EmbreeBackend(Backend):
         except ImportError as error:
             return f"embreex does not load ({error}): pip install embreex"
         return ""
+
+    @classmethod
+    def build(cls) -> str:
+        """See `Backend.build`: embreex, its copy of Embree, and the width of Embree's vectors."""
+        [library] = [file for file in files("embreex") or () if "libembree4" in file.name]
+        embree = ctypes.CDLL(str(library.locate()))
+        embree.rtcNewDevice.restype = ctypes.c_void_p
+        embree.rtcGetDeviceProperty.restype = ctypes.c_ssize_t
+        device = ctypes.c_void_p(embree.rtcNewDevice(None))
+        # By the processor: native packets of 16 rays need AVX-512, of 8 rays AVX.
+        width = next((n for p, n in _WIDTHS if embree.rtcGetDeviceProperty(device, p)), 1)
+        embree.rtcReleaseDevice(device)
+        digest = library.hash.value[:8] if library.hash else ""
+        return f"{version('embreex')} ({digest}, vectors of {width})"
 
     def __init__(
         self, mesh: LocalMesh, threads: int | None = None, device: int | None = None

@@ -22,6 +22,19 @@ def available_backends() -> dict[str, str]:
     return {backend.name: backend.missing() for backend in _BACKENDS}
 
 
+def backend_build(name: str) -> str:
+    """Versions and instruction set that the bits of a backend depend on, beside NumPy.
+
+    Two processes in which these and NumPy's are the same give the same hits, to the bit.
+
+    Raises
+    ------
+    ValueError, BackendUnavailable
+        As of `RayCaster`, if there is no such backend here.
+    """
+    return choose(name).build()
+
+
 def choose(name: str) -> type[Backend]:
     """Return the backend of that name, or for "auto" the first that can be used.
 

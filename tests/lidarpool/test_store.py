@@ -123,9 +123,9 @@ def test_another_run_cannot_go_on(other, unfinished):
 
 
 def test_another_version_cannot_go_on(unfinished, monkeypatch):
-    later = identity_of(JOB) | {"numpy": "99.0"}
+    later = identity_of(JOB) | {"lidarpool": "0.2 (sources 12345678)"}
     monkeypatch.setattr(lidarpool.run.store, "identity_of", lambda job: later)
-    with pytest.raises(LidarpoolError, match=r"it was written with numpy 2\S+, here it is 99\.0"):
+    with pytest.raises(LidarpoolError, match=r"lidarpool \S+ \(sources \w+\), here it is 0\.2"):
         RunStore(JOB, unfinished, resume=True)
 
 

@@ -100,13 +100,13 @@ OPTIONS: dict[str, tuple[list[str], str]] = {
 
 @pytest.fixture
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A working folder with a good scenario and an earlier result."""
+    """A working folder with a good scenario and files in its output folder."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "good.yaml").write_text("sensor: {layers: 2}\nsteps: 2\n")
     (tmp_path / "a.stl").write_bytes(BOX.export(file_type="stl"))
     (tmp_path / "good.ply").touch()
     (tmp_path / "lidarpool-out").mkdir()
-    for name in ("cloud.ply", "path.png", "report.html", "notes of mine.txt"):
+    for name in ("cloud.laz", "notes of mine.txt"):
         (tmp_path / "lidarpool-out" / name).write_text(f"an earlier {name}")
     return tmp_path
 
@@ -289,6 +289,7 @@ class Absent:
 sys.meta_path.insert(0, Absent())
 """
 ANOTHER_PYTHON = "import platform; platform.python_version = lambda: '3.99.1'"
+OTHER_SOURCES = "import lidarpool.base.software as s; s.sources = lambda: '12345678'"
 ANOTHER_VERSION = "import lidarpool._version as v; v.__version__ = '99.0'"
 
 
@@ -296,7 +297,8 @@ def test_workers_whose_lidarpool_is_not_ours(outside, place, refused):
     cluster = outside()
     for preload, says in (
         (WITHOUT_LIDARPOOL, "does not have lidarpool: install lidarpool"),
-        (ANOTHER_VERSION, "has lidarpool 99.0, here it is"),
+        (ANOTHER_VERSION, "has lidarpool 99.0 (sources "),
+        (OTHER_SOURCES, "(sources 12345678), here it is"),
         (ANOTHER_PYTHON, "has Python 3.99.1, here it is"),
     ):
         worker = cluster.add(("GPU", 1), preload=preload)

@@ -67,6 +67,7 @@ class RunningCommand:
                     "s.yaml",
                     "--out",
                     "out",
+                    "--overwrite",
                     *options,
                 ],
                 cwd=folder,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import sys
 import time
@@ -16,7 +17,8 @@ from distributed import Client
 from tests.system.default_survey import DEFAULT_CLOUD_SHA256
 
 import lidarpool as package
-from lidarpool import Frame, Scene, Sensor, Survey, __version__, simulate
+from lidarpool import Frame, LidarpoolError, Planning, Scene, Sensor, Survey, simulate
+from lidarpool.base.software import sources
 from poolpart import worker_identities
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "seed.yaml"
@@ -55,13 +57,60 @@ def test_an_outside_cluster_gives_the_same_bytes(
     assert "6 workers" in told.out and "GPU-0" in told.out.split()
 
 
+def test_a_worker_whose_embree_gives_other_bits_casts_nothing(outside, cluster_client, same_cloud):
+    """Another instruction set, for example: workers like most others cast."""
+    survey = Survey(
+        Sensor.grid(rays_per_revolution=360, layers=4, step_deg=5), [(0, 0, 1)], steps=72
+    )
+    expected = simulate(Scene.seed(), survey, client=cluster_client, backend="numpy")
+    cluster = outside()
+    ours = [cluster.add(("GPU", 1)), cluster.add(("GPU", 1))]
+    preload = "import lidarpool.base.software as s; s.backend_build = lambda name: 'by hand'"
+    other = cluster.add(("GPU", 1), preload=preload)
+    cluster.add(("LIDAR", 4))
+    cluster.wait()
+    with Client(cluster.address, set_as_default=False) as client:
+        result = simulate(Scene.seed(), survey, client=client, backend="numpy")
+    assert same_cloud(result.cloud, expected.cloud)
+    [note] = [note for note in result.notes if note.startswith(f"worker {other} ")]
+    assert note.endswith("has numpy by hand, the run numpy: it cast nothing")
+    assert {r.worker for r in result.records if r.stage == "intersect"} <= {*ours}
+
+
+@pytest.mark.parametrize("partition", ["LIDAR", "OTHER"])
+def test_other_workers_with_other_sources_end_the_run_before_they_change_a_byte(outside, partition):
+    """Those that are there when it begins are refused; this one joins late."""
+    survey = Survey(
+        Sensor.grid(rays_per_revolution=360, layers=4, step_deg=5), [(0, 0, 1)], steps=72
+    )
+    planning = Planning((25, 25), (-30, -20), trials=200, particles=60, iterations=60)
+    cluster = outside()
+    cluster.add(("GPU", 1))
+    lidar = cluster.add(("LIDAR", 4))
+    cluster.add(("OTHER", 1))
+    cluster.wait()
+    preload = "import lidarpool.base.software as s; s.sources = lambda: '12345678'"
+
+    def on_frame(frame: Frame) -> None:
+        if frame.scan == 10:
+            cluster.add((partition, 4), preload=preload)
+            cluster.wait()
+            if partition == "LIDAR":
+                cluster.kill(lidar)  # its stages go to the other one
+
+    with (
+        Client(cluster.address, set_as_default=False) as client,
+        pytest.raises(LidarpoolError, match=r"sources 12345678\), the run .*: install the same"),
+    ):
+        simulate(Scene.seed(), survey, planning, client=client, backend="numpy", on_frame=on_frame)
+
+
 @pytest.mark.slow
-def test_a_worker_of_another_version_that_joins_late_casts_nothing(
+def test_a_worker_with_other_sources_that_joins_late_casts_nothing(
     outside, cluster_client, tmp_path, same_cloud
 ):
     copy = tmp_path / "other" / "lidarpool"
     shutil.copytree(Path(package.__file__).parent, copy)
-    (copy / "_version.py").write_text('__version__ = "0.0.1"\n')
     returns = copy / "scan" / "returns.py"
     text = returns.read_text()
     assert "found.distance" in text
@@ -88,9 +137,9 @@ def test_a_worker_of_another_version_that_joins_late_casts_nothing(
         late = list(cluster.processes)[-1]
         (address,) = (a for a, w in worker_identities(client).items() if w["name"] == late)
     assert same_cloud(result.cloud, expected.cloud)
-    assert (
-        f"worker {late} at {address} has lidarpool 0.0.1, the run {__version__}: it cast nothing"
-    ) in result.notes
+    [note] = [note for note in result.notes if note.startswith(f"worker {late} at {address} has")]
+    other, ours_there = re.findall(r"lidarpool \S+ \(sources (\w{8})\)", note)
+    assert other != ours_there == sources()
     casts = {record.worker for record in result.records if record.stage == "intersect"}
     assert casts == {ours}
     assert np.array_equal(result.hit_counts, expected.hit_counts)

@@ -124,7 +124,7 @@ def forecast(
             backend = _backend_here(job.backend)
         else:
             planning = job.planning is not None
-            _, casting, backend = find_workers(client, job.collectors, planning, job.backend)
+            _, casting, backend, _ = find_workers(client, job.collectors, planning, job.backend)
             memory = min((worker.memory for worker in casting if worker.memory), default=0)
             if not any(worker.gpus for worker in casting):
                 notes.append(f"no GPU in partition GPU: CPU workers cast the rays with {backend}")

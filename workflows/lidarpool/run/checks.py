@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import platform
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -16,6 +17,7 @@ from raybeam import available_backends
 from .._version import __version__
 from ..base.errors import LidarpoolError
 from ..base.interrupts import deferred_interrupts
+from ..base.software import difference, software, software_there
 from ..base.words import did_you_mean
 from ..scan import COLLECT, GENERATE, GPU, LIDAR, OTHER, SORT
 from ..scene.scene import Scene
@@ -24,6 +26,7 @@ from ..sensor import Survey
 AUTO_TAKES = "Backend 'auto' takes one that works."
 LOOK_EVERY_S = 0.2
 TELL_EVERY_S = 5.0  # and less often in a long wait
+_ALL_LEFT = "The workers of partition 'GPU' left before the run started: their logs say why."
 
 
 class TooFewWorkersError(LidarpoolError):
@@ -68,11 +71,12 @@ def find_workers(
     planning: bool,
     wanted: str,
     advice: str = AUTO_TAKES,
+    earlier: Mapping[str, str] | None = None,
     *,
     wait_s: float = 0.0,
     tell: Callable[[str], None] = lambda words: None,
-) -> tuple[Pool, list[WorkerInfo], str]:
-    """Find all workers, the casting ones among them, and their backend.
+) -> tuple[Pool, list[WorkerInfo], str, dict[str, str]]:
+    """Find all workers, the casting ones among them, their backend and their software.
 
     Parameters
     ----------
@@ -84,6 +88,8 @@ def find_workers(
         Backend.
     advice
         End of the message if it is not available.
+    earlier
+        Software that a resumed run was cast with.
     wait_s
         How long to wait for missing workers, or ones that just died, seconds.
     tell
@@ -101,7 +107,9 @@ def find_workers(
         try:
             pool = _survey_pool(client, slots_needed(collectors, planning))
             casting = [worker for worker in pool if worker.resources.get(GPU)]
-            return pool, casting, common_backend(client, wanted, casting, advice)
+            backend = common_backend(client, wanted, casting, advice)
+            casts = common_software(client, backend, casting, earlier or {})
+            return pool, casting, backend, casts
         except TooFewWorkersError as error:
             # One that has just died takes half a minute not to answer, which is no waiting: what
             # counts is when the last look began.
@@ -145,7 +153,7 @@ def _survey_pool(client: Client, needed: Mapping[str, int]) -> Pool:
 
 
 def _check_versions(client: Client, workers: Sequence[str]) -> None:
-    """Check that the workers at these addresses have this version of Python and of lidarpool."""
+    """Check that the workers at these addresses have this Python and these sources."""
     here = platform.python_version()
     for address, python in ask_workers(client, platform.python_version, workers).items():
         if str(python).split(".")[:2] != here.split(".")[:2]:  # code is sent to it by value
@@ -154,23 +162,51 @@ def _check_versions(client: Client, workers: Sequence[str]) -> None:
                 "one on both sides."
             )
 
-    # Nested, so that it is sent by value: a worker without the package can still run it.
-    def version() -> str:
-        from lidarpool._version import __version__
-
-        return __version__
-
-    for address, answer in ask_workers(client, version, workers).items():
-        if isinstance(answer, ModuleNotFoundError):
+    ours = software()["lidarpool"]
+    for address, answer in ask_workers(client, software_there(), workers).items():
+        if answer == {}:
             raise LidarpoolError(
                 f"The worker at {address} does not have lidarpool: install lidarpool "
                 f"{__version__} in the environment that dask worker is started from."
             )
-        if answer != __version__:
+        if isinstance(answer, BaseException):
+            raise answer
+        if answer["lidarpool"] != ours:
             raise LidarpoolError(
-                f"The worker at {address} has lidarpool {answer}, here it is {__version__}: "
-                "install the same version on both sides."
+                f"The worker at {address} has lidarpool {answer['lidarpool']}, here it is "
+                f"{ours}: install the same on both sides, and start the worker again."
             )
+
+
+def common_software(
+    client: Client, backend: str, workers: Sequence[WorkerInfo], earlier: Mapping[str, str]
+) -> dict[str, str]:
+    """Software of the workers that cast: `earlier` if there is one, else what most of them have.
+
+    Workers with another are refused one by one when they are prepared.
+
+    Raises
+    ------
+    LidarpoolError
+        If no worker has the earlier one.
+    """
+    asked = [worker.address for worker in workers]
+    answers = ask_workers(client, software_there(backend), asked)
+    for answer in answers.values():
+        if isinstance(answer, BaseException):
+            raise answer
+    if not answers:
+        raise TooFewWorkersError(_ALL_LEFT)
+    if earlier and dict(earlier) not in answers.values():
+        address, there = next(iter(answers.items()))
+        raise LidarpoolError(
+            f"The scans of the run were cast with other software than the GPU workers have: the "
+            f"worker at {address} has {difference(there, earlier)}. Continue it there, or drop it "
+            "with --fresh (in Python remove_run)."
+        )
+    counts = Counter(tuple(answer.items()) for answer in answers.values())
+    most = max(counts, key=lambda one: (counts[one], one))
+    return dict(earlier) if earlier else dict(most)
 
 
 def common_backend(
@@ -193,9 +229,7 @@ def common_backend(
         if isinstance(answer, BaseException):
             raise answer
     if not answers:
-        raise TooFewWorkersError(
-            "The workers of partition 'GPU' left before the run started: their logs say why."
-        )
+        raise TooFewWorkersError(_ALL_LEFT)
     if wanted == "auto":
         names = next(iter(answers.values()))
         return next(n for n in names if not any(reasons[n] for reasons in answers.values()))

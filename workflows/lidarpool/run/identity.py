@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib.metadata import PackageNotFoundError, version
 
-from .._version import __version__
 from ..base.fingerprint import fingerprint
+from ..base.software import software
 from .job import Job
 
 _CONTENT = ("scene", "survey", "planning")
 
 
 def identity_of(job: Job) -> dict[str, str]:
-    """Fingerprints of the inputs of a run, and versions of the software.
+    """Fingerprints of the inputs of a run, and of lidarpool's sources.
+
+    The software of the workers that cast is no part of it: see `RunStore.casting`.
 
     Raises
     ------
@@ -22,9 +23,7 @@ def identity_of(job: Job) -> dict[str, str]:
     """
     scene, survey = job.scene, job.survey
     return {
-        "lidarpool": __version__,
-        "numpy": version("numpy"),
-        "embreex": _embreex_version(),
+        **software(),
         "scene": fingerprint(
             scene.vertices, scene.faces, scene.face_object, scene.origin, scene.names, scene.actors
         ),
@@ -53,10 +52,3 @@ def difference(here: Mapping[str, str], there: Mapping[str, str]) -> str:
                 return f"it is of another {name}"
             return f"it was written with {name} {there.get(name, 'none')}, here it is {value}"
     return ""
-
-
-def _embreex_version() -> str:
-    try:
-        return version("embreex")
-    except PackageNotFoundError:
-        return "none"

@@ -14,6 +14,7 @@ from distributed import Client, Future, Reschedule
 from poolpart import Partition, Recorder, TaskRecord, fetch_available, own_client
 
 from ..base.errors import LidarpoolError
+from ..base.software import call_alike, software
 from ..base.task_book import TaskBook
 from ..export.pieces import RangeWriter, Span, Written
 from ..scan import EXPORT, LIDAR, Watch
@@ -33,7 +34,7 @@ class LidarWorkers:
     ) -> None:
         self._client, self._partition = client, partition
         self._patience_s, self._tell = patience_s, tell
-        self._book = TaskBook()
+        self._book, self._sources = TaskBook(), software()["lidarpool"]
 
     def __call__(self, writer: RangeWriter, spans: Sequence[Span]) -> dict[Span, Written]:
         """Write ranges; returns what was written of those whose workers see the folder.
@@ -54,7 +55,10 @@ class LidarWorkers:
             while waiting or running:
                 while waiting and len(running) < most:
                     span = waiting.popleft()
-                    running[self._partition.submit(_write_range, shared.key, span)] = span
+                    future = self._partition.submit(
+                        call_alike, self._sources, _write_range, shared.key, span
+                    )
+                    running[future] = span
                 for future in (shared, *running):
                     raise_if_failed(future, f"Writing {writer.place}")
                 ended = {future.key: future for future in running if future.status == "finished"}

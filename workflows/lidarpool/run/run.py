@@ -79,16 +79,17 @@ class Run:
         # For errors about a lost cluster; a client that was never connected is refused below.
         self.address: str = getattr(client.scheduler, "address", "")
         try:
-            pool, casting, backend = find_workers(
+            pool, casting, backend, software = find_workers(
                 client,
                 job.collectors,
                 job.planning is not None,
                 store.backend or job.backend,
                 store.advice,
+                store.casting if store.resumed else {},
                 wait_s=job.wait_s,
                 tell=tell,
             )
-            store.backend = backend
+            store.backend, store.casting = backend, software
             assign_devices(
                 client, casting
             )  # all at once: workers that see few devices choose first
@@ -139,7 +140,11 @@ class Run:
         try:
             if self.job.planning is not None:  # first: no slot of OTHER waits for the survey
                 trials = TrialPump(
-                    self.client, self.partitions[OTHER], self.job.planning, self.store.db.trials
+                    self.client,
+                    self.partitions[OTHER],
+                    self.job.planning,
+                    self.store.casting["lidarpool"],
+                    self.store.db.trials,
                 )
                 pumps.append(trials)
                 trials.step()
@@ -186,6 +191,7 @@ class Run:
             self.client,
             self.partitions,
             RigPlan(job.scene, job.survey, self.store.backend),
+            self.store.casting,
             self.store.db,
             self.store.storage,
             self.store.points_of_scan,

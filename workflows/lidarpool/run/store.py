@@ -260,6 +260,17 @@ class RunStore:
             self.db.set(backend=name)
 
     @property
+    def casting(self) -> dict[str, str]:
+        """Software of the workers that cast the scans, see `software`; empty until known."""
+        found: dict[str, str] = json.loads(self.db.meta.get("casting", "{}"))
+        return found
+
+    @casting.setter
+    def casting(self, software: dict[str, str]) -> None:
+        if software != self.casting:
+            self.db.set(casting=json.dumps(software))
+
+    @property
     def kept(self) -> str:
         """Committed scans and trials in words; empty for none."""
         if self.db.scans_done:

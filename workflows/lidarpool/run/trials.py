@@ -12,6 +12,7 @@ from distributed import Client, Future
 from poolpart import Partition, fetch_available, look_for_tasks, recorded
 
 from ..base.errors import LidarpoolError
+from ..base.software import call_alike
 from ..base.task_book import TaskBook
 from ..plan import Planning, Trial, run_trial
 from ..scan.failures import was_killed
@@ -32,6 +33,8 @@ class TrialPump:
         Partition of the trials.
     planning
         What to plan.
+    sources
+        ``lidarpool`` of the run's `software`.
     done
         Trials that an earlier run has finished.
     """
@@ -41,9 +44,11 @@ class TrialPump:
         client: Client,
         partition: Partition,
         planning: Planning,
+        sources: str,
         done: Sequence[Trial] = (),
     ) -> None:
         self.client, self.partition, self.planning = client, partition, planning
+        self._sources = sources
         self.trials: list[Trial] = list(done)
         self.book = TaskBook()
         self._run_id = uuid.uuid4().hex[:8]
@@ -88,6 +93,8 @@ class TrialPump:
 
     def _submit(self, number: int, worker: str | None = None) -> None:
         future = self.partition.submit(
+            call_alike,
+            self._sources,
             recorded,
             TRIAL,
             self.partition.name,

@@ -13,7 +13,7 @@ import statistics
 import time
 import uuid
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -74,6 +74,8 @@ class SurveyDriver:
         The GPU and LIDAR partitions, by name.
     plan
         Scene, survey and backend.
+    software
+        That of the workers that may cast, see `base.software`.
     db
         Committed parts; their scans are not cast again.
     storage
@@ -97,6 +99,7 @@ class SurveyDriver:
         client: Client,
         partitions: dict[str, Partition],
         plan: RigPlan,
+        software: Mapping[str, str],
         db: RunDatabase,
         storage: Storage,
         read: Callable[[int], Cloud],
@@ -114,7 +117,7 @@ class SurveyDriver:
         self._collectors = collectors
         self.book = TaskBook()
         self.batches = Batches()
-        self.workers = CastingWorkers(client, self._gpu, self.run_id, plan)
+        self.workers = CastingWorkers(client, self._gpu, self.run_id, plan, software)
         self.generated = 0  # scans taken from stage 1, from the first on
         self.cast = 0  # scans that stage 2 has finished
         self.offered_again = 0
@@ -140,7 +143,13 @@ class SurveyDriver:
         for number in range(collectors):
             commands[f"{COLLECT}-{number}"] = self._collector(f"{COLLECT}-{number}")
         self.stages = LongStages(
-            client, self._lidar, self.run_id, commands, self._stage_died, patience_s
+            client,
+            self._lidar,
+            self.run_id,
+            software["lidarpool"],
+            commands,
+            self._stage_died,
+            patience_s,
         )
         self._inbox: dict[str, list[Any]] = {}  # {name of a pipe: items taken from it}
         self._closed_at: float | None = None  # when all was committed and the pipes were closed

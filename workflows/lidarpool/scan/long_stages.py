@@ -13,6 +13,7 @@ from distributed import Client, Future, Lock
 from poolpart import Partition, Whereabouts, look_for_tasks
 
 from ..base.errors import LidarpoolError
+from ..base.software import call_alike
 from .failures import raise_if_failed, was_killed, words_on_memory
 
 LOOK_EVERY_S = 0.5
@@ -52,6 +53,8 @@ class LongStages:
         Where the stages run.
     run
         Id of the run, part of the tasks' keys.
+    sources
+        ``lidarpool`` of the run's `software`.
     commands
         Makers of the stages' tasks, by name; called for each start.
     on_death
@@ -65,11 +68,13 @@ class LongStages:
         client: Client,
         partition: Partition,
         run: str,
+        sources: str,
         commands: Mapping[str, Command],
         on_death: Callable[[str], None],
         patience_s: float,
     ) -> None:
         self.client, self.partition, self.run = client, partition, run
+        self._sources = sources
         self._commands, self._on_death, self._patience_s = commands, on_death, patience_s
         self._tasks: dict[str, _Task] = {}
         self._submitted = 0
@@ -251,7 +256,9 @@ class LongStages:
         function, arguments = self._commands[name](number)
         earlier = self._tasks.get(name)
         key = f"{name}-{self.run}-{number}"
-        future = self.partition.submit(function, *arguments, key=key, workers=worker)
+        future = self.partition.submit(
+            call_alike, self._sources, function, *arguments, key=key, workers=worker
+        )
         self._tasks[name] = _Task(future, worker, time.monotonic())
         if earlier is not None:
             # If it still runs, it ends with its pipe; its result is dropped.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from typing import Any
 
@@ -12,8 +12,8 @@ from distributed import Client, Future
 
 from poolpart import Partition, Whereabouts, fetch_available, look_for_tasks
 
-from .._version import __version__
 from ..base.errors import LidarpoolError
+from ..base.software import difference, software_there
 from .failures import raise_if_failed, was_killed, words_on_memory
 from .rig import RigPlan, drop_rig
 
@@ -27,8 +27,8 @@ PREPARING = "preparing the scene on the GPU workers"
 class CastingWorkers:
     """The GPU workers with a rig; each makes its own, including late ones.
 
-    A worker's version is checked before it unpickles anything: a worker with another version of
-    lidarpool is refused by name and casts nothing.
+    A worker's software is checked before it unpickles anything: a worker with other sources of
+    lidarpool, or whose NumPy or ray caster gives other bits, is refused by name and casts nothing.
 
     Parameters
     ----------
@@ -38,11 +38,21 @@ class CastingWorkers:
         Name of their rigs.
     plan
         What rigs are made of.
+    software
+        That of the workers that may cast, see `base.software`.
     """
 
-    def __init__(self, client: Client, partition: Partition, handle: str, plan: RigPlan) -> None:
+    def __init__(
+        self,
+        client: Client,
+        partition: Partition,
+        handle: str,
+        plan: RigPlan,
+        software: Mapping[str, str],
+    ) -> None:
         self._client, self._partition = client, partition
         self.handle, self._packed = handle, plan.packed()
+        self._backend, self._software = plan.backend, dict(software)
         self._plan: Future | None = None  # the packed plan, on the workers
         self._setups: dict[str, Future] = {}  # {address: task that prepares the worker}
         self._refused: dict[str, str] = {}  # {address: reason of refusal}
@@ -140,7 +150,7 @@ class CastingWorkers:
                 )
         self._count += 1
         self._setups[address] = self._partition.submit(
-            _preparation(__version__),
+            _preparation(self._backend, self._software),
             self.handle,
             self._plan,
             key=f"prepare-{self.handle}-{self._count}",
@@ -154,18 +164,16 @@ class CastingWorkers:
         if future.key not in found:
             return
         answer: dict[str, Any] = found[future.key]
-        if answer["version"] != __version__:
-            self._refused[address] = answer["version"]
+        if differs := difference(answer["software"], self._software):
+            self._refused[address] = differs
             del self._setups[address]
             self.notes.append(
-                f"worker {answer['worker']} at {address} has lidarpool "
-                f"{answer['version'] or 'not installed'}, the run {__version__}: it cast nothing"
+                f"worker {answer['worker']} at {address} has {differs}: it cast nothing"
             )
             if self._refused.keys() >= self.seen.members:
                 raise LidarpoolError(
-                    f"No worker of partition {self._partition.name!r} has lidarpool {__version__}: "
-                    f"the one at {address} has {answer['version'] or 'none'}. Install the same "
-                    "version on both sides."
+                    f"No worker of partition {self._partition.name!r} has the run's software: the "
+                    f"one at {address} has {differs}. Install the same on all."
                 )
             return
         self.slots[address] = max(1, answer["slots"].get(self._partition.name, 1))
@@ -192,28 +200,24 @@ def _same(packed: bytes) -> bytes:
     return packed
 
 
-def _preparation(wanted: str) -> Callable[[str, bytes], dict[str, Any]]:
+def _preparation(backend: str, wanted: dict[str, str]) -> Callable[[str, bytes], dict[str, Any]]:
     """Make the task that prepares a worker.
 
     It is nested, so that it is sent by value: a worker without the package, or with another
     version, can still say so.
     """
+    software = software_there(backend)
 
     def prepare(handle: str, packed: bytes) -> dict[str, Any]:
         from distributed import get_worker
 
         worker = get_worker()
         slots = {name: int(count) for name, count in worker.state.total_resources.items()}
-        answer = {"worker": str(worker.name), "version": "", "slots": slots}
-        try:
-            from lidarpool._version import __version__
-        except ModuleNotFoundError:
-            return answer
-        answer["version"] = __version__
-        if __version__ == wanted:
+        here = software()
+        if here == wanted:
             from lidarpool.scan.rig import set_up
 
             set_up(handle, packed)
-        return answer
+        return {"worker": str(worker.name), "software": here, "slots": slots}
 
     return prepare
