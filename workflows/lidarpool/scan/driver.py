@@ -436,7 +436,8 @@ class SurveyDriver:
                     self._lost(batch, died=False)
             elif batch.worker not in seen.free and batch.place is Place.CASTING:
                 task = seen.tasks.get(batch.future.key) if batch.future else None
-                if task is not None and task.state == "processing" and not task.started:
+                # "no-worker": not even sent there, as the worker was paused before.
+                if task and task.state in ("no-worker", "processing") and not task.started:
                     self._again(batch, "its worker takes no tasks")
 
     def _lost(self, batch: Batch, died: bool) -> None:
