@@ -13,7 +13,7 @@ import inspect
 import logging
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import AbstractContextManager
 from functools import cache, wraps
 from multiprocessing import spawn
@@ -489,56 +489,25 @@ def tell_of_plugin(scheduler: Any, name: str, plugin: bytes | None) -> list[asyn
     ]
 
 
-# -- queues and variables, which a pipe is made of ---------------------------------------
+# -- requests to a scheduler, which pipes are made of -------------------------------------
+#
+# `run_on_scheduler` pickles its function for each request, which takes twice the time of a handler.
 
 
-def depth_of(scheduler: Any, name: str) -> int | None:
-    """Items in a queue; None if there is no such queue."""
-    queue = scheduler.extensions["queues"].queues.get(name)
-    return None if queue is None else int(queue.qsize())
+def scheduler_answers(scheduler: Any, answers: Mapping[str, Any]) -> None:
+    """Add handlers to a scheduler; they and their callers exchange plain data."""
+    scheduler.handlers.update(answers)
 
 
-def queues_of(scheduler: Any) -> list[str]:
-    """Names of all queues."""
-    return list(scheduler.extensions["queues"].queues)
+def scheduler_answers_no_longer(scheduler: Any, questions: Iterable[str]) -> None:
+    """Remove such handlers."""
+    for question in questions:
+        del scheduler.handlers[question]
 
 
-def state_of(scheduler: Any, name: str) -> Any:
-    """Value of a variable; None if there is no such variable."""
-    return scheduler.extensions["variables"].variables.get(name, {}).get("value")
-
-
-async def set_state(scheduler: Any, name: str, value: Any) -> None:
-    """Change the value of a variable."""
-    await scheduler.extensions["variables"].set(name=name, data=value)
-
-
-async def make_queue(scheduler: Any, name: str, state: Any) -> None:
-    """Make a queue without a limit, and a variable of the same name."""
-    scheduler.extensions["queues"].create(name=name)
-    await set_state(scheduler, name, state)
-
-
-async def take_all(scheduler: Any, name: str) -> list[Any]:
-    """Take all items of a queue, which are plain data, or none if there is no such queue."""
-    if not depth_of(scheduler, name):
-        return []
-    records = await scheduler.extensions["queues"].get(name=name, client=None, batch=True)
-    return [record["value"] for record in records]
-
-
-async def put_into(scheduler: Any, name: str, item: Any) -> None:
-    """Put plain data into a queue without a limit."""
-    await scheduler.extensions["queues"].put(name=name, data=item)
-
-
-async def forget_queue(scheduler: Any, name: str) -> None:
-    """Delete a queue and the variable of the same name, whoever refers to them."""
-    queues, variables = scheduler.extensions["queues"], scheduler.extensions["variables"]
-    while name in queues.queues:
-        queues.release(name=name, client="poolpart")
-    if name in variables.variables:
-        await variables.delete(name=name, client="poolpart")
+async def ask_scheduler(client: Client, question: str, **arguments: Any) -> Any:
+    """Call such a handler; None if the scheduler does not have it, which its log tells."""
+    return await getattr(client.scheduler, question)(**arguments)
 
 
 # -- the scheduler's HTTP server ---------------------------------------------------------

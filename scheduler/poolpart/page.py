@@ -15,7 +15,7 @@ from tornado import web
 
 from .errors import PoolError
 from .fence import fences_of
-from .internals import depth_of, link_from_dashboard, serve, serve_no_longer
+from .internals import link_from_dashboard, serve, serve_no_longer
 from .pipe import pipes_of
 from .stats import NAME as STATISTICS
 from .stats import (
@@ -109,9 +109,9 @@ def _worker(worker: Any) -> list[object]:
 
 def _pipes(scheduler: Any) -> Iterator[list[object]]:
     for name, state in pipes_of(scheduler).items():
-        failed = state["failure"] and f"failed: {state['failure']}"
-        shown = failed or ("closed" if state["closed"] else "open")
-        yield [name, depth_of(scheduler, name), shown]
+        failed = state.failure and f"failed: {state.failure}"
+        shown = failed or ("closed" if state.closed else "open")
+        yield [name, len(state.items), shown]
 
 
 class _Handler(web.RequestHandler):

@@ -1,13 +1,12 @@
 """Bounded, closable pipes between the tasks of a Dask cluster.
 
-A pipe is a `distributed.Queue` of items and a `distributed.Variable` with its state, both under
-the pipe's name. A Queue alone has three problems: a consumer that dies within `Queue.get` leaves
-its request on the scheduler, and the next item is lost; a queue cannot be closed, so its consumers
-cannot end; and a blocking `put` or `get` does not notice that the other side has failed.
+A `distributed.Queue` has three problems: a consumer that dies within `Queue.get` leaves its request
+on the scheduler, and the next item is lost; a queue cannot be closed, so its consumers cannot end;
+and a blocking `put` or `get` does not notice that the other side has failed.
 
-So both are used only by functions that run on the scheduler, one request each: it waits there,
-looks at items and state together, and puts or takes an item only if its client is still there.
-Polling over the network would cost a request each time, and be late.
+So a plugin of the scheduler keeps items and states, and answers requests. A request waits there,
+looks at items and state together, and puts or takes items only if its client is still there.
+Producers pickle the items, consumers unpickle them.
 
 Pipes end with the client that made them, also if it was killed. Otherwise tasks at both ends would
 wait for ever, and keep their slots; Dask does not stop the thread of a task whose client has left.
@@ -16,47 +15,31 @@ wait for ever, and keep their slots; Dask does not stop the thread of a task who
 from __future__ import annotations
 
 import asyncio
+import math
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, field
+from itertools import islice
 from typing import Any
 
 from distributed import Client
 from distributed.diagnostics.plugin import SchedulerPlugin
+from distributed.protocol.pickle import dumps, loads
 
 from .errors import PipeClosed, PipeFailed
-from .internals import (
-    depth_of,
-    forget_queue,
-    make_queue,
-    put_into,
-    queues_of,
-    set_state,
-    state_of,
-    take_all,
-)
+from .internals import ask_scheduler, scheduler_answers, scheduler_answers_no_longer
 from .task_context import own_client
-from .workers import on_scheduler
+from .workers import check_client, on_scheduler
 
 _WAIT_S = 1.0  # in one request; a pipe that is closed or fails ends it
-_SOON_S = 0.02  # most items come soon
-_LOOK_EVERY_S = (
-    0.002,
-    0.005,
-)  # between looks on the scheduler, first and later; some microseconds each
-_OWNERS = "poolpart-pipe-owners"
+_LOOK_EVERY_S = 0.005  # between looks of the scheduler at tasks that are waited for
+_LINGER_S = 0.0005  # a request that waited for an item also takes those that come just after it
+_PIPES = "poolpart-pipes"
 
-
-@dataclass(frozen=True)
-class PipeState:
-    """Content of a pipe's Variable, as a dictionary."""
-
-    owner: str  # id of the client that made the pipe
-    closed: bool = False
-    failure: str = ""  # the reason, empty while there is none
-    advice: int = 1
+Reply = dict[str, Any]  # state of a pipe, and the answer to a request
+Replies = dict[str, Reply]  # by pipe, of those that exist
 
 
 class Pipe:
@@ -98,13 +81,13 @@ class Pipe:
     >>> pipe.delete(); client.close()
     """
 
-    def __init__(self, name: str, capacity: int, client: Client | None = None) -> None:
+    def __init__(self, name: str, capacity: int = 16, client: Client | None = None) -> None:
         if capacity < 1:
             raise ValueError(f"The capacity of pipe {name!r} is {capacity}; it must be at least 1.")
         self.name, self.capacity = name, capacity
         self._client = client
         self._taken: deque[Any] = deque()
-        self._state: PipeState | None = None  # as the last request found it
+        self._advice: int | None = None  # as the last request found it
 
     def __reduce__(self) -> tuple[Any, ...]:
         return Pipe, (self.name, self.capacity)
@@ -128,13 +111,12 @@ class Pipe:
         Raises
         ------
         ValueError
-            If the cluster has a queue or a variable of that name.
+            If the cluster has a pipe of that name.
         """
-        state = PipeState(self.client.id)
-        if not on_scheduler(self.client, _open, name=self.name, state=asdict(state)):
+        if not on_scheduler(self.client, _open, name=self.name, owner=self.client.id):
             raise ValueError(
-                f"The cluster has a queue or variable {self.name!r}: give the pipe another "
-                "name, or delete what is left of an earlier one."
+                f"The cluster has a pipe {self.name!r}: give this one another name, or delete "
+                "what is left of an earlier one."
             )
         return self
 
@@ -148,34 +130,32 @@ class Pipe:
     def __exit__(self, *_: object) -> None:
         self.delete()
 
-    def _ask(self, question: Callable[..., Any], **arguments: Any) -> tuple[PipeState, Any]:
+    def _ask(self, question: str, **arguments: Any) -> Reply:
         """Ask the scheduler; returns the state of the pipe, and the answer."""
-        asker = self.client.id
-        state, answer = on_scheduler(
-            self.client, question, name=self.name, asker=asker, **arguments
-        )
-        if state is None:
+        replies = _ask(self.client, question, names=[self.name], **arguments)
+        if self.name not in replies:
             raise PipeFailed(f"Pipe {self.name!r} does not exist: never created, or deleted.")
-        self._state = PipeState(**state)
-        return self._state, answer
+        reply: Reply = replies[self.name]
+        self._advice = reply["advice"]
+        return reply
 
     # -- both ends ---------------------------------------------------------------------
 
     @property
     def depth(self) -> int:
         """Items queued now."""
-        return int(self._ask(_look)[1])
+        return int(self._ask(_CHANGE)["answer"])
 
     def close(self) -> None:
         """End the pipe for producers; consumers take the remaining items, then end."""
-        self._ask(_change, closed=True)
+        self._ask(_CHANGE, closed=True)
 
     def fail(self, reason: str) -> None:
         """Make every `put` and `get`, at both ends, raise `PipeFailed` with this reason.
 
         The first reason stays.
         """
-        self._ask(_change, failure=reason or "no reason was given")
+        self._ask(_CHANGE, failure=reason or "no reason was given")
 
     # -- producers ---------------------------------------------------------------------
 
@@ -185,12 +165,12 @@ class Pipe:
 
         A producer may ignore it.
         """
-        return (self._state or self._ask(_look)[0]).advice
+        return int(self._ask(_CHANGE)["advice"] if self._advice is None else self._advice)
 
     def advise(self, amount: int) -> None:
         """Set the amount that producers should put into one item; for one caller."""
         if amount != self.advice:
-            self._ask(_change, advice=amount)
+            self._ask(_CHANGE, advice=amount)
 
     def put(self, item: Any, timeout_s: float | None = None, *, unbounded: bool = False) -> None:
         """Add an item; waits while the pipe is full.
@@ -214,35 +194,44 @@ class Pipe:
         TimeoutError
             If it stayed full for so long.
         """
+        self.put_many([item], timeout_s, unbounded=unbounded)
+
+    def put_many(
+        self, items: Iterable[Any], timeout_s: float | None = None, *, unbounded: bool = False
+    ) -> None:
+        """Add items in order, up to `capacity` of them in one request; waits like `put`.
+
+        The items may be endless. Those before an error, such as that the pipe stayed full for
+        `timeout_s` in all, are in the pipe.
+        """
         deadline = _deadline(timeout_s)
-        most = None if unbounded else self.capacity
-        while True:
-            seconds = _one_wait(deadline)
-            state, done = self._ask(_put, item=item, most=most, seconds=seconds)
-            if done:
-                return
-            if state.failure:
-                raise PipeFailed(state.failure)
-            if state.closed:
+        most, source = None if unbounded else self.capacity, iter(items)
+        waiting: list[bytes] = []
+        while waiting := waiting or [dumps(item) for item in islice(source, self.capacity)]:
+            reply = self._ask(_PUT, items=waiting, most=most, seconds=_one_wait(deadline))
+            if reply["failure"]:
+                raise PipeFailed(reply["failure"])
+            if reply["closed"]:
                 raise PipeClosed(f"Pipe {self.name!r} is closed; nothing can be put into it.")
-            if time.monotonic() > deadline:
+            waiting = waiting[reply["answer"] :]
+            if waiting and time.monotonic() > deadline:
                 raise TimeoutError(f"Pipe {self.name!r} stayed full for {timeout_s} s.")
 
     # -- consumers ---------------------------------------------------------------------
 
     def poll(self) -> list[Any]:
         """Take all queued items, possibly none; never waits, and raises `PipeFailed`."""
-        return self._take(0.0)[1]
+        return self._take(0.0)[0]
 
-    def _take(self, seconds: float) -> tuple[PipeState, list[Any]]:
-        state, items = self._ask(_take, seconds=seconds)
-        if state.failure:
-            raise PipeFailed(state.failure)
+    def _take(self, seconds: float) -> tuple[list[Any], bool]:
+        reply = self._ask(_TAKE, seconds=seconds)
+        if reply["failure"]:
+            raise PipeFailed(reply["failure"])
         taken = []
         with suppress(IndexError):  # threads may share this object
             while True:
                 taken.append(self._taken.popleft())
-        return state, [*taken, *items]
+        return [*taken, *map(loads, reply["answer"])], reply["closed"]
 
     def get_all(self, timeout_s: float | None = None) -> list[Any]:
         """Take all queued items, as soon as there are any.
@@ -263,10 +252,10 @@ class Pipe:
         """
         deadline = _deadline(timeout_s)
         while True:
-            state, items = self._take(_one_wait(deadline))
+            items, closed = self._take(_one_wait(deadline))
             if items:
                 return items
-            if state.closed:
+            if closed:
                 raise PipeClosed(f"Pipe {self.name!r} is closed and empty.")
             if time.monotonic() > deadline:
                 raise TimeoutError(f"Nothing came through pipe {self.name!r} for {timeout_s} s.")
@@ -316,7 +305,8 @@ def take_news(
     seconds
         The longest wait.
     pipes
-        Names of pipes; one that was closed, has failed or is gone ends the wait as well.
+        Names of pipes, one at least; one that was closed, has failed or is gone ends the wait as
+        well.
     keys
         Keys of tasks; one that the scheduler does not know ends the wait as well.
 
@@ -325,134 +315,164 @@ def take_news(
     dict
         Items by pipe, of those that had some.
     """
-    arguments = {"pipes": list(pipes), "keys": list(keys), "asker": client.id}
-    found: dict[str, list[Any]] = on_scheduler(client, _take_news, seconds=seconds, **arguments)
-    return found
+    replies = _ask(client, _TAKE, names=list(pipes), keys=list(keys), seconds=seconds)
+    return {name: [*map(loads, r["answer"])] for name, r in replies.items() if r["answer"]}
+
+
+def _ask(client: Client, question: str, **arguments: Any) -> Replies:
+    check_client(client)
+    replies = client.sync(ask_scheduler, client, question, asker=client.id, **arguments)
+    return replies or {}  # a scheduler without pipes has no such handler
 
 
 # -- on the scheduler ------------------------------------------------------------------
 
-State = dict[str, Any]  # a PipeState
+_CHANGE, _PUT, _TAKE = (f"poolpart_pipes_{name}" for name in ("change", "put", "take"))
 
 
-def pipe_of(scheduler: Any, name: str) -> State | None:
-    """State of a pipe; None if there is no such pipe."""
-    state = state_of(scheduler, name)
-    is_pipe = isinstance(state, dict) and "owner" in state and depth_of(scheduler, name) is not None
-    return state if is_pipe else None
+@dataclass
+class PipeState:
+    """What the scheduler keeps of a pipe."""
+
+    owner: str  # id of the client that made the pipe
+    closed: bool = False
+    failure: str = ""  # the reason, empty while there is none
+    advice: int = 1
+    items: deque[bytes] = field(default_factory=deque)  # pickled
+
+    @property
+    def ended(self) -> bool:
+        """Whether it was closed or has failed."""
+        return self.closed or bool(self.failure)
 
 
-def pipes_of(scheduler: Any) -> dict[str, State]:
+def pipes_of(scheduler: Any) -> dict[str, PipeState]:
     """States of all pipes, by name."""
-    return {name: state for name in queues_of(scheduler) if (state := pipe_of(scheduler, name))}
+    return scheduler.plugins[_PIPES].states if _PIPES in scheduler.plugins else {}
 
 
-async def _open(name: str, state: State, dask_scheduler: Any = None) -> bool:
-    taken = depth_of(dask_scheduler, name) is not None or state_of(dask_scheduler, name) is not None
+def _open(name: str, owner: str, dask_scheduler: Any = None) -> bool:
     # The last request of a killed owner may arrive after its removal: nobody would delete the pipe,
     # or get the answer.
-    if taken or state["owner"] not in dask_scheduler.clients:
+    if name in pipes_of(dask_scheduler) or owner not in dask_scheduler.clients:
         return False
-    # Without a limit: if two producers see room for one, the second would wait inside the queue.
-    await make_queue(dask_scheduler, name, state)
-    if _OWNERS not in dask_scheduler.plugins:
-        dask_scheduler.add_plugin(PipeOwners(), name=_OWNERS)
+    if _PIPES not in dask_scheduler.plugins:
+        dask_scheduler.add_plugin(Pipes(dask_scheduler))
+    pipes_of(dask_scheduler)[name] = PipeState(owner)
     return True
 
 
-async def _look(
-    name: str, asker: str, dask_scheduler: Any = None
-) -> tuple[State | None, int | None]:
-    return pipe_of(dask_scheduler, name), depth_of(dask_scheduler, name)
+def _forget(names: Collection[str], dask_scheduler: Any = None) -> None:
+    if _PIPES in dask_scheduler.plugins:
+        dask_scheduler.plugins[_PIPES].forget(names)
 
 
-async def _change(
-    name: str, asker: str, dask_scheduler: Any = None, **changes: Any
-) -> tuple[State | None, None]:
-    state = pipe_of(dask_scheduler, name)
-    if state is not None:
-        if state["failure"]:  # the first reason is the cause, later ones are its consequences
-            changes.pop("failure", None)
-        state = asdict(replace(PipeState(**state), **changes))
-        await set_state(dask_scheduler, name, state)
-    return state, None
+class Pipes(SchedulerPlugin):
+    """The pipes of a scheduler; exists, and answers requests, as long as there are any."""
 
+    name = _PIPES
 
-async def _put(
-    name: str, item: Any, most: int | None, seconds: float, asker: str, dask_scheduler: Any = None
-) -> tuple[State | None, bool]:
-    def room() -> bool:
-        return most is None or (depth_of(dask_scheduler, name) or 0) < most
-
-    await _until(seconds, lambda: room() or _has_ended(dask_scheduler, name))
-    state, done = pipe_of(dask_scheduler, name), False
-    if not _has_ended(dask_scheduler, name) and room() and asker in dask_scheduler.clients:
-        await put_into(dask_scheduler, name, item)
-        done = True
-    return state, done
-
-
-async def _take(
-    name: str, seconds: float, asker: str, dask_scheduler: Any = None
-) -> tuple[State | None, list[Any]]:
-    await _wait(seconds, [name], [], dask_scheduler)
-    state = pipe_of(dask_scheduler, name)
-    if state is None or state["failure"] or asker not in dask_scheduler.clients:
-        return state, []
-    return state, await take_all(dask_scheduler, name)
-
-
-async def _forget(names: list[str], dask_scheduler: Any = None) -> None:
-    for name in names:
-        await forget_queue(dask_scheduler, name)
-    if _OWNERS in dask_scheduler.plugins and not pipes_of(dask_scheduler):
-        dask_scheduler.remove_plugin(_OWNERS)
-
-
-class PipeOwners(SchedulerPlugin):
-    """Deletes the pipes of clients that leave; exists as long as there are pipes."""
-
-    def __init__(self) -> None:
-        self._under_way: set[asyncio.Future[None]] = set()  # else they might be collected
+    def __init__(self, scheduler: Any) -> None:
+        self.scheduler = scheduler
+        self.states: dict[str, PipeState] = {}
+        self._changed = asyncio.Event()  # set, and replaced, when a pipe changes
+        self._answers = {_CHANGE: self.change, _PUT: self.put, _TAKE: self.take}
+        scheduler_answers(scheduler, self._answers)
 
     def remove_client(self, scheduler: Any, client: str) -> None:
         """Delete the pipes of a client that has left."""
-        names = [name for name, state in pipes_of(scheduler).items() if state["owner"] == client]
-        if names:
-            work = asyncio.ensure_future(_forget(names, dask_scheduler=scheduler))
-            self._under_way.add(work)
-            work.add_done_callback(self._under_way.discard)
+        self.forget([name for name, state in self.states.items() if state.owner == client])
 
+    def forget(self, names: Collection[str]) -> None:
+        """Delete pipes, as far as they exist; with the last one, leave the scheduler."""
+        for name in self.states.keys() & set(names):
+            self.states.pop(name).closed = True  # ends the requests that wait
+        self._wake()
+        if not self.states:
+            self.scheduler.remove_plugin(_PIPES)
+            scheduler_answers_no_longer(self.scheduler, self._answers)
 
-async def _take_news(
-    seconds: float, pipes: list[str], keys: list[str], asker: str, dask_scheduler: Any = None
-) -> dict[str, list[Any]]:
-    await _wait(seconds, pipes, keys, dask_scheduler)
-    if asker not in dask_scheduler.clients:
-        return {}
-    found = {name: await take_all(dask_scheduler, name) for name in pipes}
-    return {name: items for name, items in found.items() if items}
+    def change(self, names: Sequence[str], asker: str, **changes: Any) -> Replies:
+        """Change the state of pipes; the answer is the number of items."""
+        states = self._states(names)
+        for state in states.values():
+            if state.failure:  # the first reason is the cause, later ones are its consequences
+                changes.pop("failure", None)
+            vars(state).update(changes)
+        return self._replies(states, lambda state: len(state.items))
 
+    async def put(
+        self, names: Sequence[str], asker: str, items: list[bytes], most: int | None, seconds: float
+    ) -> Replies:
+        """Put items into a pipe as soon as there is room for any; the answer is their number."""
 
-async def _wait(seconds: float, pipes: list[str], keys: list[str], scheduler: Any) -> None:
-    """Wait until a pipe has an item, or a pipe or task has ended."""
+        def put(state: PipeState) -> int:
+            if state.ended or asker not in self.scheduler.clients:
+                return 0
+            fitting = items[: room(state)]
+            state.items.extend(fitting)
+            return len(fitting)
 
-    def news() -> bool:
-        tasks = (scheduler.tasks.get(key) for key in keys)
-        return any(depth_of(scheduler, p) or _has_ended(scheduler, p) for p in pipes) or any(
-            task is None or task.state in ("memory", "erred") for task in tasks
-        )
+        def room(state: PipeState) -> int:
+            return len(items) if most is None else max(0, most - len(state.items))
 
-    await _until(seconds, news)
+        states = self._states(names)
+        await self._until(seconds, lambda: all(s.ended or room(s) for s in states.values()))
+        return self._replies(states, put)
 
+    async def take(
+        self, names: Sequence[str], asker: str, seconds: float, keys: Sequence[str] = ()
+    ) -> Replies:
+        """Take the items of pipes, once one has any or has ended, or a task has ended."""
 
-async def _until(seconds: float, condition: Callable[[], bool]) -> None:
-    start = time.monotonic()
-    while not condition() and (waited := time.monotonic() - start) < seconds:
-        await asyncio.sleep(min(_LOOK_EVERY_S[waited > _SOON_S], seconds - waited))
+        def news() -> bool:
+            tasks = (self.scheduler.tasks.get(key) for key in keys)
+            return (
+                len(states) < len(names)
+                or any(state.items or state.ended for state in states.values())
+                or any(task is None or task.state in ("memory", "erred") for task in tasks)
+            )
 
+        def take(state: PipeState) -> list[bytes]:
+            if asker not in self.scheduler.clients:
+                return []
+            items = list(state.items)
+            state.items.clear()
+            return items
 
-def _has_ended(scheduler: Any, name: str) -> bool:
-    """Whether a pipe was closed, has failed or is gone."""
-    state = pipe_of(scheduler, name)
-    return state is None or bool(state["closed"] or state["failure"])
+        states = self._states(names)
+        if seconds and not news():
+            await self._until(seconds, news, _LOOK_EVERY_S if keys else math.inf)
+            await asyncio.sleep(_LINGER_S)
+        return self._replies(states, take)
+
+    def _wake(self) -> None:
+        """Let requests that wait look again."""
+        self._changed.set()
+        self._changed = asyncio.Event()
+
+    async def _until(
+        self, seconds: float, condition: Callable[[], bool], look_every_s: float = math.inf
+    ) -> None:
+        deadline = time.monotonic() + seconds
+        while not condition() and (left := deadline - time.monotonic()) > 0:
+            with suppress(TimeoutError):
+                async with asyncio.timeout(min(left, look_every_s)):
+                    await self._changed.wait()
+
+    def _states(self, names: Sequence[str]) -> dict[str, PipeState]:
+        return {name: self.states[name] for name in names if name in self.states}
+
+    def _replies(self, states: dict[str, PipeState], answer: Callable[[PipeState], Any]) -> Replies:
+        """Answer for each pipe that was not deleted meanwhile."""
+        self._wake()
+        return {
+            name: {
+                "answer": answer(state),
+                "closed": state.closed,
+                "failure": state.failure,
+                "advice": state.advice,
+            }
+            for name, state in states.items()
+            if self.states.get(name) is state
+        }

@@ -7,6 +7,8 @@ from typing import Any
 
 from distributed import Client
 
+from poolpart.pipe import pipes_of
+
 SETTLE_S = 300.0  # for what was closed to be gone: connections end a moment later
 
 
@@ -25,6 +27,7 @@ def _look(dask_scheduler: Any) -> dict[str, Any]:
         "unrunnable": sorted(str(task.key) for task in dask_scheduler.unrunnable),
         "queued": len(dask_scheduler.queued),
         "clients": len(dask_scheduler.clients) - _clients_of_workers(dask_scheduler),
+        "pipes": sorted(pipes_of(dask_scheduler)),
         "queues": sorted(queues.queues),
         "queue references": sorted(map(str, queues.client_refcount)),
         "queued futures": sorted(map(str, queues.future_refcount)),

@@ -13,6 +13,7 @@ import pytest
 from distributed import Client, LocalCluster
 
 from poolpart import Partition
+from poolpart.pipe import pipes_of
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "thumbnails.py"
 
@@ -59,7 +60,7 @@ def test_whichever_worker_is_killed_the_file_is_the_same(tmp_path, wait_until):
         driver.join(120)
         assert not driver.is_alive()
         assert path.read_bytes() == thumbnails(total)
-        assert not cluster.scheduler.extensions["queues"].queues
+        assert not pipes_of(cluster.scheduler)
 
 
 def test_a_writer_goes_on_where_one_has_died(start, tmp_path):
@@ -77,7 +78,7 @@ def test_an_error_of_a_picture_reaches_the_driver(start, tmp_path):
     run.__globals__["shrink"] = lambda picture: 1 / 0
     with pytest.raises(Exception, match=r"picture 0: division by zero"):
         run(client, tmp_path / "out.bin", 3)
-    assert not client.cluster.scheduler.extensions["queues"].queues
+    assert not pipes_of(client.cluster.scheduler)
 
 
 def test_it_is_short():

@@ -19,6 +19,7 @@ from poolpart import (
     take_news,
 )
 from poolpart import pipe as pipe_module
+from poolpart.pipe import pipes_of
 
 
 def again(pipe):
@@ -27,10 +28,9 @@ def again(pipe):
 
 
 def known(client):
-    """What the scheduler knows of queues and variables."""
-    extensions = client.cluster.scheduler.extensions
-    queues = extensions["queues"]
-    return set(queues.queues), set(queues.client_refcount), set(extensions["variables"].variables)
+    """What the scheduler knows of pipes, and can be asked."""
+    scheduler = client.cluster.scheduler
+    return set(pipes_of(scheduler)), set(scheduler.plugins), set(scheduler.handlers)
 
 
 def consume(pipe):
@@ -168,13 +168,51 @@ def test_advice_can_return_to_what_it_was(client, make_pipe):
     assert again(pipe).advice == 1
 
 
-# -- items -----------------------------------------------------------------------------
+# -- many items ------------------------------------------------------------------------
+
+
+def test_many_items_of_several_producers_stay_in_order_and_within_the_bound(
+    client, make_pipe, pool
+):
+    pipe = make_pipe(client, capacity=4)
+    items = [[(n, item) for item in range(50)] for n in range(3)]
+    producers = [pool.submit(again(pipe).put_many, iter(mine)) for mine in items]
+    received = []
+    while len(received) < 150:
+        assert pipe.depth <= 4
+        received += pipe.get_all(LONG_S)
+    for producer in producers:
+        producer.result(LONG_S)
+    assert [[item for item in received if item[0] == n] for n in range(3)] == items
+
+
+def test_of_many_items_those_before_an_error_are_in_the_pipe(client, make_pipe):
+    pipe, source = make_pipe(client, capacity=2), itertools.count()
+    pipe.put_many([])
+    pipe.put("first")
+    with pytest.raises(TimeoutError, match=r"stayed full for 0\.1 s"):
+        pipe.put_many(source, timeout_s=0.1)
+    assert next(source) == 2  # no more than fit into one request
+    assert pipe.poll() == ["first", 0]
+    pipe.put_many(range(5), unbounded=True)
+    pipe.close()
+    with pytest.raises(PipeClosed):
+        pipe.put_many(range(5))
+    assert list(pipe) == [0, 1, 2, 3, 4]
+    with pytest.raises(PipeFailed, match="no more"):
+        make_failed(make_pipe(client)).put_many(range(5))
+
+
+def make_failed(pipe):
+    pipe.fail("no more")
+    return pipe
 
 
 # -- what is left ----------------------------------------------------------------------
 
 USES = {
     "put": lambda pipe: pipe.put(1),
+    "put_many": lambda pipe: pipe.put_many([1, 2]),
     "get": lambda pipe: pipe.get(),
     "get_all": lambda pipe: pipe.get_all(),
     "poll": lambda pipe: pipe.poll(),
@@ -186,7 +224,11 @@ USES = {
 }
 
 
-def test_using_a_deleted_pipe_says_so_and_does_not_bring_it_back(client, make_pipe):
+@pytest.mark.parametrize("others", [True, False])
+def test_using_a_deleted_pipe_says_so_and_does_not_bring_it_back(client, make_pipe, others):
+    """Without others, the scheduler does not know the requests either, as after a restart."""
+    if others:
+        make_pipe(client)
     before = known(client)
     pipe = make_pipe(client)
     pipe.put(1)
@@ -200,18 +242,18 @@ def test_using_a_deleted_pipe_says_so_and_does_not_bring_it_back(client, make_pi
 
 
 def test_leaving_its_block_deletes_a_pipe_also_after_an_error(client):
-    queues = client.cluster.scheduler.extensions["queues"].queues
+    scheduler = client.cluster.scheduler
     with pytest.raises(ZeroDivisionError), Pipe("in-a-block", 2, client).create() as pipe:
         pipe.put(1)
-        assert "in-a-block" in queues
+        assert "in-a-block" in pipes_of(scheduler)
         raise ZeroDivisionError
-    assert "in-a-block" not in queues
+    assert "in-a-block" not in pipes_of(scheduler)
 
 
 def test_two_pipes_of_one_name(client, make_pipe):
     pipe = make_pipe(client)
     pipe.put("mine")
-    with pytest.raises(ValueError, match=f"has a queue or variable {pipe.name!r}"):
+    with pytest.raises(ValueError, match=f"has a pipe {pipe.name!r}"):
         again(pipe).create()
     assert pipe.get() == "mine"
     pipe.delete()
@@ -289,8 +331,8 @@ def test_all_that_is_in_the_pipes_is_taken_in_one_request(client, make_pipe, mon
         one.put(number)
     two.put({"scan": 7})
     one.close()
-    asked, ask = [], client.run_on_scheduler
-    monkeypatch.setattr(client, "run_on_scheduler", lambda *a, **k: asked.append(1) or ask(*a, **k))
+    asked, ask = [], client.sync
+    monkeypatch.setattr(client, "sync", lambda *a, **k: asked.append(1) or ask(*a, **k))
     found = take_news(client, LONG_S, [pipe.name for pipe in pipes])
     assert len(asked) == 1
     assert found == {one.name: [0, 1, 2, 3, 4], two.name: [{"scan": 7}]}

@@ -12,6 +12,7 @@ import pytest
 from tests.poolpart.helpers import LONG_S
 
 from poolpart import Partition, Pipe, PipeFailed
+from poolpart.pipe import pipes_of
 
 
 def consume(pipe):
@@ -79,9 +80,7 @@ def test_a_consumer_that_is_killed_while_it_waits_swallows_nothing(processes, ma
 
 def test_deleting_forgets_consumers_that_were_killed(processes, make_pipe, wait_until):
     def names(dask_scheduler):
-        queues = dask_scheduler.extensions["queues"]
-        variables = dask_scheduler.extensions["variables"]
-        return {*queues.queues, *queues.client_refcount, *variables.variables}
+        return set(pipes_of(dask_scheduler))
 
     greetings, pipe = make_pipe(processes), make_pipe(processes)
     kill_a_waiting_consumer(processes, greetings, pipe)

@@ -26,6 +26,7 @@ from lidarpool.base.tracing import trace_to
 from lidarpool.cli.commands import main
 from lidarpool.run.local import local_cluster
 from poolpart import fetch_available
+from poolpart.pipe import pipes_of
 
 
 @pytest.fixture(scope="session")
@@ -114,12 +115,12 @@ def cluster() -> Iterator[str]:
 
 @pytest.fixture
 def left_over() -> Callable[[Client], tuple[list[str], list[str], list[str]]]:
-    """What a scheduler still knows of tasks, queues and variables, after a moment."""
+    """What a scheduler still knows of tasks, pipes and variables, after a moment."""
 
     def look(dask_scheduler):
-        queues = dask_scheduler.extensions["queues"].queues
+        pipes = pipes_of(dask_scheduler)
         variables = dask_scheduler.extensions["variables"].variables
-        return [str(key) for key in dask_scheduler.tasks], list(queues), list(variables)
+        return [str(key) for key in dask_scheduler.tasks], list(pipes), list(variables)
 
     def left_over(client: Client) -> tuple[list[str], list[str], list[str]]:
         until = time.monotonic() + 300  # cancelling is told to the scheduler, not asked
