@@ -13,9 +13,9 @@ import queue
 import reprlib
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import islice, repeat
 from typing import Any, NoReturn
@@ -23,6 +23,7 @@ from typing import Any, NoReturn
 from dask.sizeof import sizeof
 from dask.utils import funcname
 from distributed import CancelledError, Client, Future, Reschedule
+from distributed.protocol.pickle import dumps, loads
 
 from .internals import when_done
 from .lending import slots_lent
@@ -32,7 +33,8 @@ logger = logging.getLogger(__name__)
 
 NOTE = "poolpart: "  # how the notes that name a failed item start
 MOST_ITEMS = 1024
-GROWTH = 4  # most growth of the chunk size at once
+MOST_TASKS = 512  # under way, unless there are more slots: then two a slot
+GROWTH = 4  # most items in a chunk, in multiples of those that have come back
 MOST_BYTES = 2**20
 LOOK_S = 5.0  # between looks at the number of slots
 CHUNK_S = 0.1  # target time of a task …
@@ -74,16 +76,18 @@ def run_chunk(
     function: Callable[..., Any],
     patience_s: float,
     at: int,
+    return_exceptions: bool,
     first: int,
     calls: Sequence[Call],
+    keywords: dict[str, Any],
     before: Answer | None = None,
 ) -> Answer:
     """Call a function for the items of a chunk, one after the other; runs on a worker.
 
     It stops early after `patience_s` seconds, so that items which take longer than earlier ones do
     not wait for each other on one worker. An error of the first item is the task's; at a later
-    one it stops, and the error occurs when the rest is sent again. Argument number `at` is the
-    result of the stage before.
+    one it stops, and the error occurs when the rest is sent again; with `return_exceptions`, the
+    error is the item's result. Argument number `at` is the result of the stage before.
     """
     start = time.perf_counter()
     results: list[Any] = []
@@ -92,15 +96,17 @@ def run_chunk(
         calls = [(*call[:at], result, *call[at:]) for call, result in made]
     for number, call in enumerate(calls, first):
         try:
-            results.append(_call(function, call))
+            results.append(_call(function, call, keywords))
         except Reschedule:
             raise
         except Exception as error:
-            if results:
+            if results and not return_exceptions:
                 break
             shown = ", ".join(reprlib.repr(argument) for argument in call)
             error.add_note(f"{NOTE}this was item {number} of a map: {shown}")
-            raise
+            if not return_exceptions:
+                raise
+            results.append(_sendable(error))
         if time.perf_counter() - start > patience_s:
             break
     seconds = time.perf_counter() - start
@@ -109,19 +115,29 @@ def run_chunk(
     return Answer(results, seconds, sizeof(calls) + sizeof(results))
 
 
-def _call(function: Callable[..., Any], call: Call) -> Any:
+def _call(function: Callable[..., Any], call: Call, keywords: dict[str, Any]) -> Any:
     try:
-        return function(*call)
+        return function(*call, **keywords)
     except StopIteration as error:
         # Raised from an iterator's `__next__`, it would end the map silently.
         raise RuntimeError(f"{function} raised StopIteration") from error
 
 
+def _sendable(error: Exception) -> Exception:
+    """Copy an error without its traceback, or, as Dask does, make one that can be pickled."""
+    try:
+        copy: Exception = loads(dumps(error))
+    except Exception:
+        copy = Exception(repr(error))
+        copy.__notes__ = error.__notes__
+    return copy
+
+
 class ChunkSize:
     """Number of items for a task of about `target_s` seconds, learned from past chunks.
 
-    It starts with one, grows at most fourfold at once, and limits a task's items and results to
-    about a mebibyte.
+    It starts with one, is at most four times the number of items that have come back, and limits a
+    task's items and results to about a mebibyte.
 
     Examples
     --------
@@ -137,7 +153,7 @@ class ChunkSize:
     """
 
     def __init__(self) -> None:
-        self._tried = 0  # items in the largest chunk that has come back
+        self._tried = 0  # items that have come back
         self._item_s = self._item_bytes = 0.0  # moving averages
 
     def learn(self, items: int, seconds: float, nbytes: int) -> None:
@@ -145,7 +161,7 @@ class ChunkSize:
         weight = 0.3 if self._tried else 1.0
         self._item_s += weight * (seconds / items - self._item_s)
         self._item_bytes += weight * (nbytes / items - self._item_bytes)
-        self._tried = max(self._tried, items)
+        self._tried += items
 
     def items(self, target_s: float) -> int:
         """Return the number of items for the next chunk."""
@@ -167,6 +183,8 @@ class Stage:
     priority: int = 0
     retries: int = 0
     slots: int = 1
+    return_exceptions: bool = False
+    keywords: dict[str, Any] = field(default_factory=dict)
     at: int = 0  # number of the argument that is the result of the stage before
 
     def __post_init__(self) -> None:
@@ -181,12 +199,25 @@ class Stage:
         workers = all_workers(self.client)
         return sum(int(w.resources.get(self.partition, 0)) // self.slots for w in workers)
 
-    def send(self, patience_s: float, *columns: Sequence[Any]) -> list[Future]:
-        """Submit a task for each row of columns."""
+    def send(
+        self,
+        patience_s: float,
+        firsts: Sequence[int],
+        calls: Sequence[Sequence[Call]],
+        before: Sequence[Future] | None = None,
+    ) -> list[Future]:
+        """Submit a task for each chunk; `before` are the tasks of the stage before."""
+        # Dask tries again only what fails.
+        keep_errors = self.return_exceptions and not self.retries
         # One message is cheaper for the scheduler than one for each task.
         futures: list[Future] = self.client.map(
-            partial(run_chunk, self.function, patience_s, self.at),
-            *columns,
+            partial(run_chunk, self.function, patience_s, self.at, keep_errors),
+            firsts,
+            calls,
+            # As an argument, so that futures among them are replaced by results. Dask's own keyword
+            # arguments share one key on the cluster if they are large.
+            [self.keywords] * len(firsts),
+            *([before] if before else []),
             key=f"map-{funcname(self.function)}",
             pure=False,
             priority=self.priority,
@@ -200,10 +231,14 @@ class Results(Iterator[Any]):
     """Results of a function for many items, an iterator from `Partition.map`.
 
     The first tasks start at once; further items are taken, sent and fetched while results are
-    read. Close or delete it to stop early.
+    read. Close or delete it to stop early. It has a length if all iterables have one; `done` is the
+    number of results that were read.
     """
 
     def __init__(self, stage: Stage, iterables: Sequence[Iterable[Any]]) -> None:
+        self.done = 0
+        lengths = [_length(iterable) for iterable in iterables]
+        self._length = math.inf if math.inf in lengths else min(lengths, default=0)
         self._closed = False
         self._begun = False  # a result was requested
         self._taken = 0  # items taken from the source
@@ -258,7 +293,13 @@ class Results(Iterator[Any]):
             except BaseException:
                 self.close()
                 raise
+        self.done += 1
         return self._ready.popleft()
+
+    def __len__(self) -> int:
+        if self._length == math.inf:
+            raise TypeError("The length of a map is that of its iterables; one of them has none.")
+        return int(self._length)
 
     def __enter__(self) -> Results:
         return self
@@ -303,26 +344,38 @@ class Results(Iterator[Any]):
 
     def _look(self) -> None:
         """Read the number of slots: partitions grow, shrink, and lose workers."""
-        running = [stage.running() for stage in self._stages]
-        self._slots, self._window = max(running), 0
-        for stage, number in zip(self._stages, running, strict=True):
-            self._window += stage.window or max(2, 2 * number)
-            if not number:
+        self._slots = [stage.running() for stage in self._stages]
+        for stage, slots in zip(self._stages, self._slots, strict=True):
+            if not slots:
                 logger.warning("Partition %r has no workers: a map on it waits.", stage.partition)
         self._next_look = time.monotonic() + LOOK_S
 
     def _submit(self) -> None:
         """Send chunks, several in one message, up to the window."""
-        free = self._window - len(self._running)
+        size, window = self._sizes()
+        free = window - len(self._running)
         # Avoid a message for each chunk; the tasks under way keep the slots busy.
-        if self._running and free < self._window // 4:
+        if self._running and free < window // 4:
             return
         chunks: list[Chunk] = []
         # Chunks that came out of order take room as well, but not from earlier items.
         fresh = free - len(self._back)
-        while len(chunks) < free and (chunk := self._next_chunk(fresh=len(chunks) < fresh)):
+        while len(chunks) < free and (chunk := self._next_chunk(size, len(chunks) < fresh)):
             chunks.append(chunk)
         self._run(chunks)
+
+    def _sizes(self) -> tuple[int, int]:
+        """Return the number of items in the next chunk, and the number of tasks under way."""
+        learned = self._size.items(self._target_s())
+        size = next((stage.chunk for stage in self._stages[::-1] if stage.chunk), learned)
+        slots = zip(self._stages, self._slots, strict=True)
+        window = sum(stage.window or max(2, 2 * number) for stage, number in slots)
+        if not any(stage.window for stage in self._stages):
+            # With smaller chunks than would be learned, as many items under way as with those:
+            # else workers wait for the next message, and messages take most of the time.
+            grown = min(MOST_TASKS // len(self._stages), window * learned // size)
+            window = max(window, grown)
+        return size, window
 
     def _run(self, chunks: Sequence[Chunk], done: list[Future] | None = None) -> None:
         """Send chunks through all stages, or through the last if the others are `done`."""
@@ -335,15 +388,13 @@ class Results(Iterator[Any]):
             patience_s = math.inf if stage.chunk else PATIENCE * self._target_s()
             calls = [[row[number] for row in chunk.rows] for chunk in chunks]
             # Only the next task holds the result of a stage.
-            futures = stage.send(patience_s, firsts, calls, *([futures] if futures else []))
+            futures = stage.send(patience_s, firsts, calls, futures)
         for future, chunk in zip(futures or [], chunks, strict=True):
             self._running[future] = chunk
             when_done(future, self._done.put)
 
-    def _next_chunk(self, fresh: bool) -> Chunk | None:
+    def _next_chunk(self, size: int, fresh: bool) -> Chunk | None:
         """Take items: first those to send again, then, if `fresh`, from the source."""
-        own = (stage.chunk for stage in self._stages[::-1] if stage.chunk)
-        size = next(own, 0) or self._size.items(self._target_s())
         if self._again:
             first, rows = heapq.heappop(self._again)
             if len(rows) > size:
@@ -356,7 +407,7 @@ class Results(Iterator[Any]):
         return Chunk(first, rows) if rows else None
 
     def _target_s(self) -> float:
-        return max(CHUNK_S, CHUNK_S_PER_SLOT * self._slots)
+        return max(CHUNK_S, CHUNK_S_PER_SLOT * max(self._slots))
 
     def _wait(self) -> list[Future]:
         """Wait until tasks are done."""
@@ -399,8 +450,11 @@ class Results(Iterator[Any]):
                 return
             chunk, answer = self._back.pop(first)
             if isinstance(answer, Future):
-                self._failed = chunk, answer
-                return
+                error = answer.exception() if self._stages[-1].return_exceptions else None
+                if not _of_item(error):
+                    self._failed = chunk, answer
+                    return
+                answer = Answer([error], 0.0, 0)
             count = len(answer.results)
             self._ready.extend(answer.results)
             self._next_item += count
@@ -413,9 +467,20 @@ class Results(Iterator[Any]):
         try:
             future.result()
         except Exception as error:
-            # Without a note it comes from Dask, not from an item.
-            if not any(note.startswith(NOTE) for note in getattr(error, "__notes__", ())):
+            if not _of_item(error):
                 last = chunk.first + len(chunk.rows) - 1
                 error.add_note(f"{NOTE}the task was for items {chunk.first} to {last} of a map")
             raise
         raise AssertionError("the task has not failed")
+
+
+def _of_item(error: BaseException | None) -> bool:
+    """Whether an error comes from an item, rather than from Dask."""
+    return any(note.startswith(NOTE) for note in getattr(error, "__notes__", ()))
+
+
+def _length(iterable: Iterable[Any]) -> float:
+    """Return the number of items to come; infinite if it is not known."""
+    if isinstance(iterable, Results):
+        return iterable._length - iterable.done
+    return len(iterable) if isinstance(iterable, Sized) else math.inf

@@ -170,6 +170,8 @@ class Partition:
         priority: int = 0,
         retries: int = 0,
         slots: int = 1,
+        return_exceptions: bool = False,
+        **kwargs: Any,
     ) -> Results:
         """Call a function for each item; returns an iterator of the results.
 
@@ -188,23 +190,32 @@ class Partition:
         ordered
             Results in the order of the items, or as they complete.
         window
-            Tasks under way at most; by default twice the slots, which may change during the map.
+            Tasks under way at most. By default two for each slot, whose number may change during
+            the map; of short tasks, if `chunk` is given, as many as take 0.2 s, up to 512.
         chunk
             Items in a task; by default as many as take a tenth of a second, or longer if there
-            are many slots. Give 1 if items differ much, or must not wait for others.
+            are many slots, and have a mebibyte. Give 1 if items differ much, or must not wait for
+            others.
         priority
             Higher runs first.
         retries
             How often a failed item is tried again, at least.
         slots
             Slots of one worker that each task takes.
+        return_exceptions
+            Errors that `function` raises are results, in their places. A map over this map gets
+            them as arguments. An item that kills its workers still ends the map.
+        kwargs
+            Keyword arguments of each call. Bind those that have the name of an option with
+            `functools.partial`; scatter large ones, and give the futures.
 
         Returns
         -------
         Results
             An iterator. It raises an error of `function` after the results before it; a note
-            names the item. To continue after errors, let `function` catch and return them. To
-            stop early, close or delete the iterator: waiting tasks are cancelled.
+            names the item. To stop early, close or delete the iterator: waiting tasks are
+            cancelled. ``len`` is the number of items if each iterable has one, so that progress
+            bars such as ``tqdm(partition.map(…))`` work, and `Results.done` counts those read.
 
         Raises
         ------
@@ -212,7 +223,7 @@ class Partition:
             If the window, the chunk or `slots` is below 1, or `retries` below 0.
         """
         self._taking(slots)
-        options = (ordered, window, chunk, priority, retries, slots)
+        options = (ordered, window, chunk, priority, retries, slots, return_exceptions, kwargs)
         return Results(Stage(self.client, self.name, function, *options), iterables)
 
     # -- collections and data ----------------------------------------------------------

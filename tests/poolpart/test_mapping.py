@@ -2,6 +2,7 @@
 
 import itertools
 import logging
+import operator
 import os
 import signal
 import threading
@@ -10,7 +11,7 @@ import uuid
 from collections import Counter
 
 import pytest
-from distributed import CancelledError, Client, Event, get_worker
+from distributed import CancelledError, Client, Event, as_completed, get_worker, wait
 from distributed.comm import tcp
 from tests.poolpart.helpers import twice, wait_for
 
@@ -30,6 +31,32 @@ def slow_if_even(x):
 def slow_from_200_to_220(x):
     if 200 <= x < 220:
         time.sleep(0.15)
+    return x
+
+
+def slow_from_100(x):
+    time.sleep(0.005 if x < 100 else 0.06)
+    return x
+
+
+class UnpicklableError(Exception):
+    def __init__(self, item):
+        super().__init__(f"item {item}", lambda: None)
+
+    def __reduce__(self):
+        raise TypeError
+
+
+def fail_unpicklably(x):
+    raise UnpicklableError(x)
+
+
+TENS = {10, 20, 30, 40}
+
+
+def fail_at_tens(x):
+    if x in TENS:
+        raise ZeroDivisionError(f"at {x}")
     return x
 
 
@@ -94,6 +121,39 @@ def test_several_iterables_end_with_the_shortest(a):
     assert list(a.map(add, itertools.count(10), [1, 2, 3])) == [11, 13, 15]
 
 
+def test_keyword_arguments_are_those_of_each_call(a, b):
+    half = b.submit(twice, 8)
+    assert list(a.map(pow, [2, 3], exp=3, mod=5)) == [3, 2]
+    assert list(a.map(int, b.map(str, [10, 11]), base=half, chunk=1)) == [16, 17]
+
+
+def test_its_length_is_that_of_the_shortest_iterable(a, b):
+    results = a.map(add, range(9), [1, 2, 3, 4])
+    assert len(results) == operator.length_hint(results) == 4
+    assert [results.done for _ in results] == [1, 2, 3, 4]
+    assert len(results) == results.done == 4
+    assert len(b.map(add, a.map(twice, range(9)), range(7))) == 7
+    begun = a.map(twice, range(9))
+    next(begun)
+    rest = b.map(twice, begun)
+    assert len(rest) == len(list(rest)) == 8
+    assert len(a.map(twice)) == 0
+    for iterables in ([iter([1])], [itertools.count(), [1]], [a.map(twice, iter([1])), [1]]):
+        results = a.map(add, *iterables)
+        with pytest.raises(TypeError, match="one of them has none"):
+            len(results)
+        results.close()
+
+
+def test_futures_of_two_partitions_in_one_as_completed(a, b, gate):
+    waits, ready = a.submit(wait_for, gate.name), b.submit(twice, 4)
+    done = as_completed([waits, ready])
+    assert next(done) is ready
+    assert wait([waits, ready], return_when="FIRST_COMPLETED").done == {ready}
+    gate.set()
+    assert next(done).result() is True
+
+
 def test_futures_are_items(a, b):
     halves = [b.submit(twice, number) for number in range(5)]
     assert list(a.map(twice, halves)) == [0, 4, 8, 12, 16]
@@ -111,6 +171,22 @@ def test_a_bounded_number_is_under_way_even_of_endless_items(a, client, ordered,
         # Items taken and not delivered: a window under way, and one that has come back.
         assert next(taken) - number - (number + 1) <= 2 * window * chunk
         assert task_count(client) <= 2 * window  # those that are done go a moment later
+    results.close()
+
+
+def test_the_window_of_small_chunks_grows_with_short_items_and_shrinks_with_long_ones(a, client):
+    taken = itertools.count()
+    results = a.map(slow_from_100, taken, chunk=1)
+    most = 0
+    for number in range(100):
+        assert next(results) == number
+        most = max(most, task_count(client))
+    assert 4 * a.slots < most <= 2 * 512
+    reached = next(taken)
+    assert reached <= 100 + 2 * 512
+    for _ in range(100, reached):
+        next(results)
+    assert task_count(client) <= 4 * a.slots  # those that are done go a moment later
     results.close()
 
 
@@ -151,6 +227,42 @@ def test_an_error_names_its_item_and_lets_go_of_the_others(a, client, ordered, c
     assert "fail_at_3" in [entry.name for entry in caught.traceback]
     assert list(results) == []
     wait_until(lambda: task_count(client) <= 1)  # the failed one, by the traceback
+
+
+@pytest.mark.parametrize("retries", [0, 1])
+@pytest.mark.parametrize("chunk", [None, 1, 10])
+@pytest.mark.parametrize("ordered", [True, False])
+def test_errors_are_results_in_their_places(a, ordered, chunk, retries):
+    options = {"ordered": ordered, "chunk": chunk, "retries": retries}
+    results = list(a.map(fail_at_tens, range(1, 50), return_exceptions=True, **options))
+    errors = {r.__notes__[0]: r for r in results if isinstance(r, ZeroDivisionError)}
+    assert errors.keys() == {f"poolpart: this was item {x - 1} of a map: {x}" for x in TENS}
+    shown = [str(r) if isinstance(r, ZeroDivisionError) else r for r in results]
+    expected = [f"at {x}" if x in TENS else x for x in range(1, 50)]
+    assert shown == expected if ordered else Counter(shown) == Counter(expected)
+
+
+def test_an_error_that_cannot_be_sent_is_a_result_that_shows_it(a):
+    (error,) = a.map(fail_unpicklably, [1], return_exceptions=True)
+    assert "UnpicklableError('item 1'" in str(error)
+    assert error.__notes__ == ["poolpart: this was item 0 of a map: 1"]
+
+
+@pytest.mark.parametrize("chunk", [1, None])
+def test_errors_as_results_of_a_map_of_a_map(a, b, chunk):
+    inner = a.map(fail_at_tens, range(1, 50), chunk=chunk)
+    results = list(b.map(twice, inner, return_exceptions=True, chunk=chunk))
+    shown = [str(r) if isinstance(r, ZeroDivisionError) else r for r in results]
+    assert shown == [f"at {x}" if x in TENS else 2 * x for x in range(1, 50)]
+    # Errors that are results are arguments of the next function.
+    inner = a.map(fail_at_tens, range(1, 50), return_exceptions=True, chunk=chunk)
+    assert list(b.map(str, inner)) == [f"at {x}" if x in TENS else str(x) for x in range(1, 50)]
+
+
+def test_an_item_that_kills_its_workers_is_not_a_result(nannies):
+    partition, _ = Pool.from_client(nannies).partition("N", n_workers=2)
+    with pytest.raises(Exception, match="map-die_at_3"):
+        list(partition.map(die_at_3, [3], return_exceptions=True))
 
 
 def test_stop_iteration_in_a_task_does_not_end_the_map_silently(a):
@@ -264,7 +376,7 @@ def test_a_map_of_an_endless_map_has_a_bounded_number_under_way(a, b, client):
     for number in range(200):
         assert next(results) == 4 * number
         most = max(most, task_count(client))
-    assert most <= 4 * (2 * 4 + 2 * 1)  # two tasks an item, those that wait and those that ended
+    assert most <= 2 * 512  # those that wait and those that ended
     results.close()
 
 
