@@ -469,7 +469,10 @@ class Results(Iterator[Any]):
         except Exception as error:
             if not _of_item(error):
                 last = chunk.first + len(chunk.rows) - 1
-                error.add_note(f"{NOTE}the task was for items {chunk.first} to {last} of a map")
+                error.add_note(
+                    f"{NOTE}the task was for items {chunk.first} to {last} of a map; unless "
+                    "window=1, a task beside it may have killed the worker"
+                )
             raise
         raise AssertionError("the task has not failed")
 

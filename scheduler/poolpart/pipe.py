@@ -35,7 +35,7 @@ from .workers import check_client, on_scheduler
 
 _WAIT_S = 1.0  # in one request; a pipe that is closed or fails ends it
 _LOOK_EVERY_S = 0.005  # between looks of the scheduler at tasks that are waited for
-_LINGER_S = 0.0005  # a request that waited for an item also takes those that come just after it
+_LINGER_S = 0.002  # `get` waits so long for more items, which saves requests
 _PIPES = "poolpart-pipes"
 
 Reply = dict[str, Any]  # state of a pipe, and the answer to a request
@@ -113,7 +113,8 @@ class Pipe:
         ValueError
             If the cluster has a pipe of that name.
         """
-        if not on_scheduler(self.client, _open, name=self.name, owner=self.client.id):
+        state = {"owner": self.client.id, "capacity": self.capacity}
+        if not on_scheduler(self.client, _open, name=self.name, **state):
             raise ValueError(
                 f"The cluster has a pipe {self.name!r}: give this one another name, or delete "
                 "what is left of an earlier one."
@@ -201,14 +202,14 @@ class Pipe:
     ) -> None:
         """Add items in order, up to `capacity` of them in one request; waits like `put`.
 
-        The items may be endless. Those before an error, such as that the pipe stayed full for
-        `timeout_s` in all, are in the pipe.
+        The items may be endless. After an error, such as that `timeout_s` in all was too short, the
+        first of them may be in the pipe.
         """
         deadline = _deadline(timeout_s)
-        most, source = None if unbounded else self.capacity, iter(items)
-        waiting: list[bytes] = []
+        source, waiting = iter(items), list[bytes]()
         while waiting := waiting or [dumps(item) for item in islice(source, self.capacity)]:
-            reply = self._ask(_PUT, items=waiting, most=most, seconds=_one_wait(deadline))
+            seconds = _one_wait(deadline)
+            reply = self._ask(_PUT, items=waiting, unbounded=unbounded, seconds=seconds)
             if reply["failure"]:
                 raise PipeFailed(reply["failure"])
             if reply["closed"]:
@@ -223,8 +224,8 @@ class Pipe:
         """Take all queued items, possibly none; never waits, and raises `PipeFailed`."""
         return self._take(0.0)[0]
 
-    def _take(self, seconds: float) -> tuple[list[Any], bool]:
-        reply = self._ask(_TAKE, seconds=seconds)
+    def _take(self, seconds: float, linger_s: float = 0.0) -> tuple[list[Any], bool]:
+        reply = self._ask(_TAKE, seconds=seconds, linger_s=min(seconds, linger_s))
         if reply["failure"]:
             raise PipeFailed(reply["failure"])
         taken = []
@@ -250,9 +251,12 @@ class Pipe:
         TimeoutError
             If nothing came for so long.
         """
+        return self._take_some(timeout_s)
+
+    def _take_some(self, timeout_s: float | None, linger_s: float = 0.0) -> list[Any]:
         deadline = _deadline(timeout_s)
         while True:
-            items, closed = self._take(_one_wait(deadline))
+            items, closed = self._take(_one_wait(deadline), linger_s)
             if items:
                 return items
             if closed:
@@ -261,12 +265,12 @@ class Pipe:
                 raise TimeoutError(f"Nothing came through pipe {self.name!r} for {timeout_s} s.")
 
     def get(self, timeout_s: float | None = None) -> Any:
-        """Take the next item; waits for one, and raises like `get_all`."""
+        """Take the next item; waits for one and 2 ms for others, and raises like `get_all`."""
         try:
             # One atomic operation: threads may share this object.
             return self._taken.popleft()
         except IndexError:
-            item, *more = self.get_all(timeout_s)
+            item, *more = self._take_some(timeout_s, _LINGER_S)
             self._taken.extend(more)
             return item
 
@@ -335,6 +339,7 @@ class PipeState:
     """What the scheduler keeps of a pipe."""
 
     owner: str  # id of the client that made the pipe
+    capacity: int
     closed: bool = False
     failure: str = ""  # the reason, empty while there is none
     advice: int = 1
@@ -345,20 +350,25 @@ class PipeState:
         """Whether it was closed or has failed."""
         return self.closed or bool(self.failure)
 
+    @property
+    def full(self) -> bool:
+        """Whether producers have to wait."""
+        return len(self.items) >= self.capacity
+
 
 def pipes_of(scheduler: Any) -> dict[str, PipeState]:
     """States of all pipes, by name."""
     return scheduler.plugins[_PIPES].states if _PIPES in scheduler.plugins else {}
 
 
-def _open(name: str, owner: str, dask_scheduler: Any = None) -> bool:
+def _open(name: str, owner: str, capacity: int, dask_scheduler: Any = None) -> bool:
     # The last request of a killed owner may arrive after its removal: nobody would delete the pipe,
     # or get the answer.
     if name in pipes_of(dask_scheduler) or owner not in dask_scheduler.clients:
         return False
     if _PIPES not in dask_scheduler.plugins:
         dask_scheduler.add_plugin(Pipes(dask_scheduler))
-    pipes_of(dask_scheduler)[name] = PipeState(owner)
+    pipes_of(dask_scheduler)[name] = PipeState(owner, capacity)
     return True
 
 
@@ -399,10 +409,11 @@ class Pipes(SchedulerPlugin):
             if state.failure:  # the first reason is the cause, later ones are its consequences
                 changes.pop("failure", None)
             vars(state).update(changes)
+        self._wake()
         return self._replies(states, lambda state: len(state.items))
 
     async def put(
-        self, names: Sequence[str], asker: str, items: list[bytes], most: int | None, seconds: float
+        self, names: Sequence[str], asker: str, items: list[bytes], unbounded: bool, seconds: float
     ) -> Replies:
         """Put items into a pipe as soon as there is room for any; the answer is their number."""
 
@@ -410,18 +421,26 @@ class Pipes(SchedulerPlugin):
             if state.ended or asker not in self.scheduler.clients:
                 return 0
             fitting = items[: room(state)]
+            was_empty = not state.items
             state.items.extend(fitting)
+            if was_empty or state.full:  # else nobody waits for this
+                self._wake()
             return len(fitting)
 
         def room(state: PipeState) -> int:
-            return len(items) if most is None else max(0, most - len(state.items))
+            return len(items) if unbounded else max(0, state.capacity - len(state.items))
 
         states = self._states(names)
         await self._until(seconds, lambda: all(s.ended or room(s) for s in states.values()))
         return self._replies(states, put)
 
     async def take(
-        self, names: Sequence[str], asker: str, seconds: float, keys: Sequence[str] = ()
+        self,
+        names: Sequence[str],
+        asker: str,
+        seconds: float,
+        linger_s: float = 0.0,
+        keys: Sequence[str] = (),
     ) -> Replies:
         """Take the items of pipes, once one has any or has ended, or a task has ended."""
 
@@ -433,17 +452,21 @@ class Pipes(SchedulerPlugin):
                 or any(task is None or task.state in ("memory", "erred") for task in tasks)
             )
 
+        def full() -> bool:
+            return any(state.ended or state.full for state in states.values())
+
         def take(state: PipeState) -> list[bytes]:
             if asker not in self.scheduler.clients:
                 return []
             items = list(state.items)
             state.items.clear()
+            if items:
+                self._wake()
             return items
 
         states = self._states(names)
-        if seconds and not news():
-            await self._until(seconds, news, _LOOK_EVERY_S if keys else math.inf)
-            await asyncio.sleep(_LINGER_S)
+        await self._until(seconds, news, _LOOK_EVERY_S if keys else math.inf)
+        await self._until(linger_s, full)
         return self._replies(states, take)
 
     def _wake(self) -> None:
@@ -465,7 +488,6 @@ class Pipes(SchedulerPlugin):
 
     def _replies(self, states: dict[str, PipeState], answer: Callable[[PipeState], Any]) -> Replies:
         """Answer for each pipe that was not deleted meanwhile."""
-        self._wake()
         return {
             name: {
                 "answer": answer(state),
