@@ -13,7 +13,7 @@ import inspect
 import logging
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable
 from contextlib import AbstractContextManager
 from functools import cache, wraps
 from multiprocessing import spawn
@@ -494,15 +494,10 @@ def tell_of_plugin(scheduler: Any, name: str, plugin: bytes | None) -> list[asyn
 # `run_on_scheduler` pickles its function for each request, which takes twice the time of a handler.
 
 
-def scheduler_answers(scheduler: Any, answers: Mapping[str, Any]) -> None:
-    """Add handlers to a scheduler; they and their callers exchange plain data."""
-    scheduler.handlers.update(answers)
-
-
-def scheduler_answers_no_longer(scheduler: Any, questions: Iterable[str]) -> None:
-    """Remove such handlers."""
-    for question in questions:
-        del scheduler.handlers[question]
+def handlers_of(scheduler: Any) -> dict[str, Any]:
+    """Handlers of a scheduler, by request; they and their callers exchange plain data."""
+    handlers: dict[str, Any] = scheduler.handlers
+    return handlers
 
 
 async def ask_scheduler(client: Client, question: str, **arguments: Any) -> Any:

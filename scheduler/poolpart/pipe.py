@@ -29,7 +29,7 @@ from distributed.diagnostics.plugin import SchedulerPlugin
 from distributed.protocol.pickle import dumps, loads
 
 from .errors import PipeClosed, PipeFailed
-from .internals import ask_scheduler, scheduler_answers, scheduler_answers_no_longer
+from .internals import ask_scheduler, handlers_of
 from .task_context import own_client
 from .workers import check_client, on_scheduler
 
@@ -386,8 +386,8 @@ class Pipes(SchedulerPlugin):
         self.scheduler = scheduler
         self.states: dict[str, PipeState] = {}
         self._changed = asyncio.Event()  # set, and replaced, when a pipe changes
-        self._answers = {_CHANGE: self.change, _PUT: self.put, _TAKE: self.take}
-        scheduler_answers(scheduler, self._answers)
+        answers = {_CHANGE: self.change, _PUT: self.put, _TAKE: self.take}
+        handlers_of(scheduler).update(answers)
 
     def remove_client(self, scheduler: Any, client: str) -> None:
         """Delete the pipes of a client that has left."""
@@ -400,7 +400,8 @@ class Pipes(SchedulerPlugin):
         self._wake()
         if not self.states:
             self.scheduler.remove_plugin(_PIPES)
-            scheduler_answers_no_longer(self.scheduler, self._answers)
+            for question in (_CHANGE, _PUT, _TAKE):
+                del handlers_of(self.scheduler)[question]
 
     def change(self, names: Sequence[str], asker: str, **changes: Any) -> Replies:
         """Change the state of pipes; the answer is the number of items."""
@@ -488,13 +489,9 @@ class Pipes(SchedulerPlugin):
 
     def _replies(self, states: dict[str, PipeState], answer: Callable[[PipeState], Any]) -> Replies:
         """Answer for each pipe that was not deleted meanwhile."""
+        shown = ("closed", "failure", "advice")
         return {
-            name: {
-                "answer": answer(state),
-                "closed": state.closed,
-                "failure": state.failure,
-                "advice": state.advice,
-            }
+            name: {"answer": answer(state)} | {part: getattr(state, part) for part in shown}
             for name, state in states.items()
             if self.states.get(name) is state
         }
