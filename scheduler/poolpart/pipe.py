@@ -1,10 +1,11 @@
 """Bounded, closable pipes between the tasks of a Dask cluster.
 
-A `distributed.Queue` has three problems: a consumer that dies within `Queue.get` leaves its request
-on the scheduler, and the next item is lost; a queue cannot be closed, so its consumers cannot end;
-and a blocking `put` or `get` does not notice that the other side has failed.
+A pipe is a `distributed.Queue` of items and a `distributed.Variable` with its state, both under
+the pipe's name. A Queue alone has three problems: a consumer that dies within `Queue.get` leaves
+its request on the scheduler, and the next item is lost; a queue cannot be closed, so its consumers
+cannot end; and a blocking `put` or `get` does not notice that the other side has failed.
 
-So a plugin of the scheduler keeps items and states, and answers requests. A request waits there,
+So both are used only by a plugin of the scheduler, which answers requests. A request waits there,
 looks at items and state together, and puts or takes items only if its client is still there.
 Producers pickle the items, consumers unpickle them.
 
@@ -20,7 +21,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import islice
 from typing import Any
 
@@ -29,7 +30,7 @@ from distributed.diagnostics.plugin import SchedulerPlugin
 from distributed.protocol.pickle import dumps, loads
 
 from .errors import PipeClosed, PipeFailed
-from .internals import ask_scheduler, handlers_of
+from .internals import QueueAndVariable, ask_scheduler, handlers_of
 from .task_context import own_client
 from .workers import check_client, on_scheduler
 
@@ -111,13 +112,13 @@ class Pipe:
         Raises
         ------
         ValueError
-            If the cluster has a pipe of that name.
+            If the cluster has a queue or a variable of that name.
         """
         state = {"owner": self.client.id, "capacity": self.capacity}
         if not on_scheduler(self.client, _open, name=self.name, **state):
             raise ValueError(
-                f"The cluster has a pipe {self.name!r}: give this one another name, or delete "
-                "what is left of an earlier one."
+                f"The cluster has a queue or variable {self.name!r}: give the pipe another "
+                "name, or delete what is left of an earlier one."
             )
         return self
 
@@ -336,19 +337,27 @@ _CHANGE, _PUT, _TAKE = (f"poolpart_pipes_{name}" for name in ("change", "put", "
 
 @dataclass
 class PipeState:
-    """What the scheduler keeps of a pipe."""
+    """What the scheduler keeps of a pipe.
 
+    The items, pickled, are in a `distributed.Queue` of the pipe's name; all else is the value of a
+    `distributed.Variable`.
+    """
+
+    items: QueueAndVariable
     owner: str  # id of the client that made the pipe
     capacity: int
     closed: bool = False
     failure: str = ""  # the reason, empty while there is none
     advice: int = 1
-    items: deque[bytes] = field(default_factory=deque)  # pickled
 
     @property
     def ended(self) -> bool:
         """Whether it was closed or has failed."""
         return self.closed or bool(self.failure)
+
+    def publish(self) -> None:
+        """Let the Variable say what has changed."""
+        self.items.set({name: value for name, value in vars(self).items() if name != "items"})
 
     @property
     def full(self) -> bool:
@@ -364,11 +373,13 @@ def pipes_of(scheduler: Any) -> dict[str, PipeState]:
 def _open(name: str, owner: str, capacity: int, dask_scheduler: Any = None) -> bool:
     # The last request of a killed owner may arrive after its removal: nobody would delete the pipe,
     # or get the answer.
-    if name in pipes_of(dask_scheduler) or owner not in dask_scheduler.clients:
+    if QueueAndVariable.exists(dask_scheduler, name) or owner not in dask_scheduler.clients:
         return False
     if _PIPES not in dask_scheduler.plugins:
         dask_scheduler.add_plugin(Pipes(dask_scheduler))
-    pipes_of(dask_scheduler)[name] = PipeState(owner, capacity)
+    state = PipeState(QueueAndVariable(dask_scheduler, name), owner, capacity)
+    state.publish()
+    pipes_of(dask_scheduler)[name] = state
     return True
 
 
@@ -396,7 +407,9 @@ class Pipes(SchedulerPlugin):
     def forget(self, names: Collection[str]) -> None:
         """Delete pipes, as far as they exist; with the last one, leave the scheduler."""
         for name in self.states.keys() & set(names):
-            self.states.pop(name).closed = True  # ends the requests that wait
+            state = self.states.pop(name)
+            state.closed = True  # ends the requests that wait
+            state.items.delete()
         self._wake()
         if not self.states:
             self.scheduler.remove_plugin(_PIPES)
@@ -410,6 +423,7 @@ class Pipes(SchedulerPlugin):
             if state.failure:  # the first reason is the cause, later ones are its consequences
                 changes.pop("failure", None)
             vars(state).update(changes)
+            state.publish()
         self._wake()
         return self._replies(states, lambda state: len(state.items))
 
@@ -423,7 +437,7 @@ class Pipes(SchedulerPlugin):
                 return 0
             fitting = items[: room(state)]
             was_empty = not state.items
-            state.items.extend(fitting)
+            state.items.put(fitting)
             if was_empty or state.full:  # else nobody waits for this
                 self._wake()
             return len(fitting)
@@ -459,8 +473,7 @@ class Pipes(SchedulerPlugin):
         def take(state: PipeState) -> list[bytes]:
             if asker not in self.scheduler.clients:
                 return []
-            items = list(state.items)
-            state.items.clear()
+            items = state.items.take()
             if items:
                 self._wake()
             return items

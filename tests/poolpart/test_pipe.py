@@ -7,7 +7,7 @@ from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from distributed import Client
+from distributed import Client, Variable
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.poolpart.helpers import LONG_S
@@ -253,11 +253,28 @@ def test_leaving_its_block_deletes_a_pipe_also_after_an_error(client):
 def test_two_pipes_of_one_name(client, make_pipe):
     pipe = make_pipe(client)
     pipe.put("mine")
-    with pytest.raises(ValueError, match=f"has a pipe {pipe.name!r}"):
+    with pytest.raises(ValueError, match=f"has a queue or variable {pipe.name!r}"):
         again(pipe).create()
     assert pipe.get() == "mine"
     pipe.delete()
     assert again(pipe).create().depth == 0
+
+
+def test_a_pipe_is_a_queue_and_a_variable_of_dask(client, make_pipe):
+    pipe = make_pipe(client, capacity=3)
+    pipe.put_many([1, 2])
+    queues = client.cluster.scheduler.extensions["queues"].queues
+    assert queues[pipe.name].qsize() == 2
+    state = Variable(pipe.name, client=client)
+    assert (state.get()["capacity"], state.get()["closed"]) == (3, False)
+    pipe.close()
+    assert state.get()["closed"] is True
+    pipe.delete()
+    assert pipe.name not in queues
+    Variable(pipe.name, client=client).set("somebody's own")
+    with pytest.raises(ValueError, match="has a queue or variable"):
+        again(pipe).create()
+    state.delete()
 
 
 @pytest.mark.parametrize(

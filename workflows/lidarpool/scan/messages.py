@@ -1,7 +1,6 @@
 """Messages between the four stages and the driver: descriptions, summaries and receipts.
 
-Their size does not depend on the number of points. They are plain data for msgpack, so that
-nothing from a pipe is ever unpickled.
+Their size does not depend on the number of points. They are plain data.
 """
 
 from __future__ import annotations
