@@ -13,8 +13,8 @@ from trimesh.exchange.gltf import export_glb
 
 from lidarpool.base.errors import LidarpoolError
 from lidarpool.base.fingerprint import fingerprint
+from lidarpool.base.yamlfile import read_yaml
 from lidarpool.scenario.scenario import SEED_KEPT, Scenario
-from lidarpool.scenario.yamlfile import read_yaml
 from lidarpool.sensor import Noise, Returns, Sensor, Survey
 from lidarpool.sensor.materials import MaterialTable
 
@@ -242,7 +242,7 @@ BAD = [
     ("poses: [[0, 0, x]]", r"poses\[0\]\.position\[2\] is 'x'; input should be a valid number"),
     ("poses: [{yaw_deg: 0}]", r"poses\[0\]\.position is missing"),
     ("poses: [{position: [0, 0, 0], yaw: 5}]", r"poses\[0\]\.yaw is not.*'yaw_deg'"),
-    ("poses: &a [*a]", r"poses\[0\]\.position\[0\] is \[\[\[\[\.\.\.\]\]\]\]"),
+    ("poses: &a [*a]", r"s\.yaml, line 1: 'a' contains itself"),
     ("scene: {files: [{unit: m}]}", r"scene\.files\[0\]\.file is missing"),
     ("scene: {files: [{file: a.stl, unit: parsec}]}", r"unit is 'parsec'; input should be 'um'"),
     ("scene: {files: [{file: a.stl, scale: 0}]}", "scale must not be 0"),
@@ -264,8 +264,7 @@ BAD = [
     ("1: 2", "1.* is not a field"),
     ("[" * 50_000, "not valid YAML: maximum recursion depth"),
     ("steps: !!python/object/apply:os.getcwd []", "line 1: could not determine a constructor"),
-    (laughs() + "\nposes: *i", r"poses\[0\]"),
-    (laughs() + "\nscene: {files: *i}", r"scene\.files\[0\]"),
+    (laughs() + "\nposes: *i", "would unpack to"),
     ("scene: {files: [!!python/name:os.system ]}", "could not determine a constructor"),
     ("sensor: {layers: " + "9" * 5000 + "}", r"sensor\.layers is 9+\.\.\.|Exceeds the limit"),
     (b"\xff\xfe\x00", "not valid YAML: 'utf-8' codec"),

@@ -18,9 +18,9 @@ from poolpart.clusters import INFORMATION
 from ..base.errors import LidarpoolError
 from ..base.interrupts import deferred_interrupts
 from ..base.words import counted, did_you_mean
+from ..base.yamlfile import read_yaml
 from ..scan import GPU, LIDAR, OTHER
 from ..scenario.validation_errors import validation_errors
-from ..scenario.yamlfile import read_yaml
 
 # A scheduler that SSH has started outlives a driver that was killed: it ends when it has been
 # without tasks for so long. And a host that does not answer is given up after so long.

@@ -15,6 +15,7 @@ from pydantic import Field, PrivateAttr, Strict, ValidationError
 
 from ..base.errors import LidarpoolError, Mistakes
 from ..base.words import did_you_mean
+from ..base.yamlfile import read_yaml
 from ..plan import Planning
 from ..scene.actors import Actor, box, one_mesh
 from ..scene.floor import room_at
@@ -45,7 +46,6 @@ from .sections import (
     scene_in_short,
 )
 from .validation_errors import validation_errors
-from .yamlfile import read_yaml
 
 # Objects lower than this are floors and markings, which a path may cross.
 FLAT_M = 0.2

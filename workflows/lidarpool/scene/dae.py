@@ -13,14 +13,15 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from urllib.parse import unquote
-from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.allowance import Allowance
+from ..base.xmlfile import xml_root
 from .mesh import Mesh
-from .nodes import Content, MeshFileError, Node, fanned, instances, joined, unrolled
+from .nodes import SMALLER, Content, MeshFileError, Node, fanned, instances, joined, unrolled
 from .polygons import triangulated, with_holes
 
 Float = NDArray[np.float64]
@@ -31,13 +32,12 @@ _SURFACES = ("triangles", "polylist", "polygons", "tristrips", "trifans")
 
 def read_dae(data: bytes, path: Path) -> Content:
     """Read the visual scene of a file."""
-    # Drop comments; read no entities from files, and limit their expansion.
-    root = ElementTree.fromstring(data)
+    root = xml_root(data)
     for element in root.iter():
         element.tag = element.tag.rpartition("}")[2]
     if root.tag != "COLLADA":
         raise MeshFileError(f"is XML, but not COLLADA: it begins with <{root.tag[:40]}>")
-    document = _Document(root)
+    document = _Document(root, Allowance(len(data), SMALLER))
     content = instances(document.roots(), document.node, path.stem)
     content.unit_m = _unit_m(root)
     axis = (root.findtext("asset/up_axis") or "").strip()
@@ -59,14 +59,15 @@ def _unit_m(root: Element) -> float | None:
 class _Document:
     """Elements by their ids; each geometry is read once."""
 
-    def __init__(self, root: Element) -> None:
-        self._root = root
+    def __init__(self, root: Element, allowance: Allowance) -> None:
+        self._root, self._allowance = root, allowance
         # By kind, too: some programs give a scene and a node in it the same id.
         self._ids: dict[tuple[str, str], Element] = {}
         for element in root.iter():
             self._ids.setdefault((element.tag, element.get("id", "")), element)
         self._geometry = cache(self._read_geometry)
         self._points = cache(self._read_points)
+        self._floats = cache(_numbers)
 
     def roots(self) -> list[Element]:
         """Visual scene of the file; by default the first."""
@@ -125,7 +126,8 @@ class _Document:
                 points = self._points(vertices)
                 made = [f for f in _faces(primitive, points, offset, stride) if len(f)]
                 faces.setdefault(vertices, []).extend(made)
-        meshes = joined(name, ((self._points(v), np.concatenate(f)) for v, f in faces.items() if f))
+        parts = ((self._points(v), np.concatenate(f)) for v, f in faces.items() if f)
+        meshes = joined(name, parts, self._allowance)
         return meshes[0] if meshes else None
 
     def _inputs(self, primitive: Element) -> tuple[Element, int, int]:
@@ -149,7 +151,7 @@ class _Document:
         accessor = source.find("technique_common/accessor")
         if accessor is None:
             raise ValueError("positions without <accessor>")
-        numbers = _numbers(self._target(accessor, "float_array"))
+        numbers = self._floats(self._target(accessor, "float_array"))
         count, stride = int(accessor.get("count", 0)), int(accessor.get("stride", 1))
         offset = int(accessor.get("offset", 0))
         if min(count, offset, stride - 1) < 0 or offset + count * stride > len(numbers):
@@ -160,7 +162,10 @@ class _Document:
         # Skip a parameter without a name.
         names = [parameter.get("name") for parameter in accessor.findall("param")]
         columns = [names.index(axis) for axis in "XYZ" if axis in names]
-        return rows[:, columns if len(columns) == 3 else slice(3)]
+        if len(columns) != 3:
+            return rows[:, :3]
+        self._allowance.take(24 * count)
+        return rows[:, columns]
 
 
 def _faces(primitive: Element, points: Float, offset: int, stride: int) -> Iterator[Int]:

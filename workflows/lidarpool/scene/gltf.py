@@ -19,8 +19,9 @@ from urllib.parse import unquote, unquote_to_bytes
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.allowance import Allowance
 from .mesh import Mesh
-from .nodes import Content, MeshFileError, Node, fanned, instances, joined, unrolled
+from .nodes import SMALLER, Content, MeshFileError, Node, fanned, instances, joined, unrolled
 
 # Extensions that do not change shapes, or that are supported here.
 _READ = re.compile(
@@ -40,7 +41,7 @@ def read_gltf(data: bytes, path: Path) -> Content:
     """
     header, body = _chunks(data)
     _check(header)
-    reader = _Reader(header, body, path)
+    reader = _Reader(header, body, path, Allowance(len(data), SMALLER))
     content = instances(_roots(header), reader.node, path.stem)
     content.unit_m, content.up_axis = 1.0, "y"
     content.generator = str(header.get("asset", {}).get("generator", ""))
@@ -112,11 +113,16 @@ def _roots(header: dict[str, Any]) -> list[int]:
 
 
 class _Reader:
-    """Nodes, meshes, accessors and buffers by their numbers, each mesh and buffer read once."""
+    """Nodes, meshes, accessors and buffers by their numbers, each read once."""
 
-    def __init__(self, header: dict[str, Any], body: bytes, path: Path) -> None:
+    def __init__(
+        self, header: dict[str, Any], body: bytes, path: Path, allowance: Allowance
+    ) -> None:
         self._header, self._body, self._path = header, body, path
+        self._allowance = allowance
         self._mesh = cache(self._read_mesh)
+        self._accessor = cache(self._read_accessor)
+        self._beside = cache(self._read_beside)
         self._buffer = cache(self._read_buffer)
 
     def node(self, index: int) -> Node[int]:
@@ -133,47 +139,52 @@ class _Reader:
         """One mesh of all primitives, which differ by material only."""
         mesh = self._header["meshes"][_natural(index)]
         surfaces = [p for p in mesh["primitives"] if p.get("mode", 4) >= 4]
-        return joined(str(mesh.get("name") or self._path.stem), map(self._primitive, surfaces))
+        name = str(mesh.get("name") or self._path.stem)
+        return joined(name, map(self._primitive, surfaces), self._allowance)
 
     def _primitive(self, primitive: dict[str, Any]) -> tuple[NDArray[Any], NDArray[np.int64]]:
         """Vertices (v, 3) and faces (f, 3)."""
         position, index = primitive["attributes"].get("POSITION"), primitive.get("indices")
         packed = primitive.get("extensions", {}).get(_DRACO)
         if packed and "bufferView" not in self._header["accessors"][position]:
-            return _unpacked(self._view(packed["bufferView"]))
+            return _unpacked(bytes(self._view(packed["bufferView"])), self._allowance)
         if position is None:
             return np.empty((0, 3)), np.empty((0, 3), np.int64)
         vertices = self._accessor(position)
-        corners = np.arange(len(vertices))
+        mode = primitive.get("mode", 4)
+        # The corners, and the triangles of strips and fans, before they are checked.
+        count = len(vertices if index is None else self._accessor(index))
+        self._allowance.take((8 if mode == 4 else 24) * count)
+        corners = np.arange(count)
         if index is not None:
             corners = self._accessor(index)[:, 0].astype(np.int64)
-        mode = primitive.get("mode", 4)
         if mode == 5:
             return vertices, unrolled(corners)
         if mode == 6:
             return vertices, fanned(corners)
         return vertices, corners[: len(corners) // 3 * 3].reshape(-1, 3)
 
-    def _accessor(self, index: int) -> NDArray[Any]:
-        """Numbers (count, width) of an accessor."""
+    def _read_accessor(self, index: int) -> NDArray[Any]:
+        """Numbers (count, width) of an accessor; those of a buffer are not copied."""
         accessor = self._header["accessors"][_natural(index)]
         count, width = _natural(accessor["count"]), _WIDTHS[accessor["type"]]
         kind = np.dtype(_TYPES[accessor["componentType"]])
         if "bufferView" in accessor:
             numbers = self._array(accessor, kind, count, width)
         elif sparse := accessor.get("sparse"):
-            if count > 2**31:
-                raise ValueError(f"an accessor of {count} elements without content")
+            self._allowance.take(count * width * kind.itemsize)
             numbers = np.zeros((count, width), kind)
         else:
             raise ValueError(f"accessor {index} has no content")
         if sparse := accessor.get("sparse"):
+            self._allowance.take(numbers.size * kind.itemsize)
             changed, values = sparse["indices"], sparse["values"]
             where = np.dtype(_TYPES[changed["componentType"]])
             rows = self._array(changed, where, sparse["count"], 1)[:, 0]
             numbers = numbers.copy()
             numbers[rows] = self._array(values, kind, sparse["count"], width)
         if accessor.get("normalized") and kind.kind in "iu":
+            self._allowance.take(8 * numbers.size)
             # glTF 2.0, 3.6.2.2
             return np.maximum(numbers / np.iinfo(kind).max, -1.0)
         return numbers
@@ -189,10 +200,10 @@ class _Reader:
             raise ValueError(f"{count:,} elements announced, {len(view):,} bytes there")
         return np.ndarray((count, width), kind, view, strides=(stride, kind.itemsize))
 
-    def _view(self, index: int) -> bytes:
+    def _view(self, index: int) -> memoryview:
         view = self._header["bufferViews"][_natural(index)]
         begin = view.get("byteOffset", 0)
-        return self._buffer(view["buffer"])[begin : begin + view["byteLength"]]
+        return memoryview(self._buffer(view["buffer"]))[begin : begin + view["byteLength"]]
 
     def _read_buffer(self, index: int) -> bytes:
         buffer = self._header["buffers"][_natural(index)]
@@ -206,12 +217,17 @@ class _Reader:
             content = unquote_to_bytes(text)
             content = base64.b64decode(content) if kind.endswith(";base64") else content
         else:
-            content = _beside(uri, self._path)
+            content = self._beside(uri)
         if len(content) < buffer["byteLength"]:
             raise MeshFileError(
                 f"takes {buffer['byteLength']:,} bytes from {uri[:80] if uri else 'itself'!r}, "
                 f"which is cut short: it has {len(content):,}"
             )
+        return content
+
+    def _read_beside(self, uri: str) -> bytes:
+        content = _beside(uri, self._path)
+        self._allowance.grow(len(content))
         return content
 
 
@@ -239,7 +255,7 @@ def _matrix(node: dict[str, Any]) -> NDArray[np.float64]:
     return out
 
 
-def _unpacked(data: bytes) -> tuple[NDArray[Any], NDArray[np.int64]]:
+def _unpacked(data: bytes, allowance: Allowance) -> tuple[NDArray[Any], NDArray[np.int64]]:
     """Vertices and faces that are packed with Draco."""
     try:
         import DracoPy
@@ -247,8 +263,33 @@ def _unpacked(data: bytes) -> tuple[NDArray[Any], NDArray[np.int64]]:
         raise MeshFileError(
             f"is packed with {_DRACO}: install DracoPy to read it, or export without it"
         ) from error
+    allowance.take(24 * sum(_draco_counts(data)))
     mesh = DracoPy.decode(data)
     return np.asarray(mesh.points).reshape(-1, 3), np.asarray(mesh.faces, np.int64).reshape(-1, 3)
+
+
+def _draco_counts(data: bytes) -> tuple[int, int]:
+    """Two counts of faces and vertices that a Draco mesh announces, as its format 2.2 stores them.
+
+    The decoder makes them all, though a few bytes can stand for any number.
+    """
+    magic, major, minor, kind, method, flags = struct.unpack_from("<5s4BH", data)
+    if magic != b"DRACO" or kind != 1 or method > 1:
+        raise ValueError("its Draco data are not a mesh")
+    if (major, minor) != (2, 2) or flags & 0x8000:
+        raise MeshFileError(
+            f"has Draco data of version {major}.{minor}{', with metadata' * bool(flags & 0x8000)}; "
+            "2.2 without metadata is read: export it again"
+        )
+    at = 11 + method  # the second method has a byte more
+    counts = []
+    for _ in range(2):
+        count = shift = 0
+        while data[at] & 0x80:
+            count, shift, at = count | (data[at] & 0x7F) << shift, shift + 7, at + 1
+        counts.append(count | data[at] << shift)
+        at += 1
+    return counts[0], counts[1]
 
 
 def _beside(uri: str, path: Path) -> bytes:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..base.allowance import check_fits
 from ..base.errors import LidarpoolError
 from ..base.vocabulary import UNITS_M
 from ..base.words import did_you_mean
@@ -168,7 +169,10 @@ def _bytes_of(path: Path) -> bytes:
             f"can be read; these are: {' '.join(SUFFIXES)}."
         )
     try:
+        check_fits(path)
         data = path.read_bytes()
+    except LidarpoolError as error:
+        raise LidarpoolError(f"{path}: {error}") from error
     except (FileNotFoundError, NotADirectoryError) as error:
         raise LidarpoolError(
             f"{path} does not exist: check the name and the folder.{_like(path)}"

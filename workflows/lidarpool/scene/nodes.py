@@ -10,10 +10,12 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.allowance import Allowance, bytes_of, memory_share
 from .mesh import Mesh
 
 K = TypeVar("K", bound=Hashable)
 
+SMALLER = "export it in parts, or as .ply"  # what helps if a file unpacks to too much
 MOST_NODES = 200_000  # most nodes of a scene, counting every instance
 
 
@@ -64,7 +66,8 @@ def instances(roots: Iterable[K], node_of: Callable[[K], Node[K]], stem: str) ->
     Raises
     ------
     MeshFileError
-        If nodes contain each other without end, or some hundred thousand times.
+        If nodes contain each other without end, or some hundred thousand times, or the placed
+        objects would take more than a quarter of the memory.
     """
     content = Content([])
     node_of = cache(node_of)
@@ -82,29 +85,62 @@ def instances(roots: Iterable[K], node_of: Callable[[K], Node[K]], stem: str) ->
                 f"has nodes that contain each other, more than {MOST_NODES:,} in all: export it "
                 "again"
             )
-    for node, matrix, name in places:
-        for mesh in node.meshes():
-            named = name or mesh.name or stem
-            if not np.isfinite(matrix).all() or not np.array_equal(matrix[3], [0, 0, 0, 1]):
-                raise MeshFileError(
-                    f"places {named[:80]!r} by a matrix that is none of a place: {matrix.tolist()}"
-                )
-            if np.linalg.matrix_rank(matrix[:3, :3]) < 2:
-                content.skipped.append(named)
-            else:
-                content.meshes.append(mesh.moved(named, matrix[:3, :3], matrix[:3, 3]))
+    placed = [(mesh, matrix, name) for node, matrix, name in places for mesh in node.meshes()]
+    total = sum(mesh.vertices.nbytes + mesh.faces.nbytes for mesh, _, _ in placed)
+    if total > memory_share():
+        raise MeshFileError(
+            f"places {len(placed):,} objects, which would take {bytes_of(total)}, of at most "
+            f"{bytes_of(memory_share())}, a quarter of the memory: {SMALLER}"
+        )
+    for mesh, matrix, name in placed:
+        named = name or mesh.name or stem
+        if not np.isfinite(matrix).all() or not np.array_equal(matrix[3], [0, 0, 0, 1]):
+            raise MeshFileError(
+                f"places {named[:80]!r} by a matrix that is none of a place: {matrix.tolist()}"
+            )
+        if np.linalg.matrix_rank(matrix[:3, :3]) < 2:
+            content.skipped.append(named)
+        else:
+            content.meshes.append(mesh.moved(named, matrix[:3, :3], matrix[:3, 3]))
     return content
 
 
-def joined(name: str, parts: Iterable[tuple[NDArray[np.float64], NDArray[np.int64]]]) -> list[Mesh]:
-    """Join several (vertices, faces) to one mesh; none without faces."""
-    kept = [(vertices, faces) for vertices, faces in parts if len(faces)]
+def joined(
+    name: str,
+    parts: Iterable[tuple[NDArray[np.float64], NDArray[np.int64]]],
+    allowance: Allowance,
+) -> list[Mesh]:
+    """Join several (vertices, faces) to one mesh; none without faces.
+
+    Raises
+    ------
+    ValueError
+        If a face refers to a missing vertex; LidarpoolError if it takes more than allowed.
+    """
+    kept = [_own(vertices, faces, allowance) for vertices, faces in parts if len(faces)]
     if not kept:
         return []
     first = np.cumsum([0] + [len(vertices) for vertices, _ in kept[:-1]])
     vertices = np.concatenate([vertices for vertices, _ in kept])
     faces = [faces + at for (_, faces), at in zip(kept, first, strict=True)]
     return [Mesh(name, vertices, np.concatenate(faces))]
+
+
+def _own(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64], allowance: Allowance
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Vertices and faces, without unused vertices if many parts may share all of them."""
+    if not 0 <= faces.min() <= faces.max() < len(vertices):
+        raise ValueError(
+            f"faces refer to vertices {faces.min()} to {faces.max()}, counted from 0, of "
+            f"{len(vertices)}"
+        )
+    allowance.take(faces.nbytes)
+    if faces.size < len(vertices):
+        used, faces = np.unique(faces, return_inverse=True)
+        vertices, faces = vertices[used], faces.reshape(-1, 3)
+    allowance.take(24 * len(vertices))  # in double precision
+    return vertices, faces
 
 
 def unrolled(strip: NDArray[np.int64]) -> NDArray[np.int64]:

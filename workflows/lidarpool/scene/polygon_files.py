@@ -322,14 +322,15 @@ def _element_rows(
         lists = [name for name in names if element.properties[name][1]]
         if all((table[f"{name} length"][:, 0] == found[name][1]).all() for name in lists):
             return found, at + (end - at) * count
-    rows = []
+    spans = array("q")  # tuples would take ten times as much
     for _ in range(count):
         each, at = _ply_row(element, kinds, order, body, at)
-        rows.append(each)
+        spans.extend(chain.from_iterable(each))
     raw = np.frombuffer(body, np.uint8)
     found = {}
-    for (name, kind), column in zip(kinds.items(), zip(*rows, strict=True), strict=True):
-        starts, sizes = np.array(column).T
+    columns = np.frombuffer(spans, np.int64).reshape(count, len(names), 2)
+    for column, (name, kind) in enumerate(kinds.items()):
+        starts, sizes = columns[:, column].T
         # Bytes of all numbers, in order.
         within = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
         places = np.repeat(starts, sizes) + kind.itemsize * within
@@ -363,8 +364,12 @@ _CODES = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "f4"
 
 def _ply_strips(numbers: Int, sizes: Int) -> Int:
     """Corners of the triangles of strips, which end with each row and at each -1 in it."""
-    faces = [np.empty((0, 3), np.int64)]
-    for row in np.split(numbers, np.cumsum(sizes)[:-1]):
-        strips = np.split(row, np.flatnonzero(row < 0))
-        faces += [unrolled(strip[strip >= 0]) for strip in strips]
-    return np.concatenate(faces).reshape(-1)
+    ends = np.zeros(len(numbers) + 1, np.int64)
+    np.add.at(ends, np.cumsum(sizes), 1)
+    strip = np.cumsum(ends[:-1] + (numbers < 0))[numbers >= 0]
+    faces = unrolled(numbers[numbers >= 0])
+    # From the beginning of its own strip each second one is turned, not from that of all.
+    first = np.searchsorted(strip, strip)[: len(faces)]
+    odd = first % 2 == 1
+    faces[odd] = faces[odd][:, [1, 0, 2]]
+    return faces[strip[: len(faces)] == strip[2:]].reshape(-1)

@@ -11,7 +11,9 @@ import io
 import re
 import zipfile
 from array import array
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 from xml.parsers import expat
@@ -19,8 +21,10 @@ from xml.parsers import expat
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.allowance import Allowance
+from ..base.xmlfile import refuse_entity
 from .mesh import Mesh
-from .nodes import Content, MeshFileError, Node, instances
+from .nodes import SMALLER, Content, MeshFileError, Node, instances
 
 _UNITS_M = {
     "micron": 1e-6,
@@ -33,6 +37,9 @@ _UNITS_M = {
 # Required extensions that do not change shapes, or that are supported here.
 _READ = re.compile(r"/(material|production|securecontent)/")
 
+_PIECE = 1 << 20
+_OBJECT_BYTES = 1000  # of an object or its placement, which a few letters make
+
 _Key = tuple[str, str]  # inner file and number of an object
 
 
@@ -42,6 +49,14 @@ class _Object:
     vertices: array[float] = field(default_factory=lambda: array("d"))
     faces: array[int] = field(default_factory=lambda: array("q"))
     components: list[_Placement] = field(default_factory=list)
+
+    @cached_property
+    def meshes(self) -> list[Mesh]:
+        """The mesh; none without triangles."""
+        if not self.faces:
+            return []
+        vertices = np.frombuffer(self.vertices, np.float64).reshape(-1, 3)
+        return [Mesh(self.name, vertices, np.frombuffer(self.faces, np.int64).reshape(-1, 3))]
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,53 +69,55 @@ class _Placement:
 def read_3mf(data: bytes, path: Path) -> Content:
     """Read the build items of a file."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        package = _Package(archive)
-        root = package.model(_start(archive))
+        package = _Package(archive, Allowance(len(data), SMALLER))
+        root = package.model(package.start())
 
         def node(place: _Placement) -> Node[_Placement]:
             made = package.object(place.key)
-            return Node(
-                place.name or made.name, place.matrix, lambda: _meshes(made), made.components
-            )
+            return Node(place.name or made.name, place.matrix, lambda: made.meshes, made.components)
 
         content = instances(root.items, node, path.stem)
     content.unit_m, content.up_axis = _UNITS_M[root.unit], "z"
     return content
 
 
-def _start(archive: zipfile.ZipFile) -> str:
-    """Inner file of the model that is to be built."""
-    names = archive.namelist()
-    relations = archive.read("_rels/.rels").decode() if "_rels/.rels" in names else ""
-    for relation in re.findall(r"<Relationship\b[^>]*", relations):
-        target = re.search(r'\bTarget\s*=\s*["\']/?([^"\']+)', relation)
-        if target and re.search(r'/3dmodel["\']', relation):
-            return target[1]
-    for name in names:
-        if name.lower() == "3d/3dmodel.model":
-            return name
-    raise ValueError("a ZIP archive without 3D/3dmodel.model")
-
-
-def _meshes(made: _Object) -> list[Mesh]:
-    if not made.faces:
-        return []
-    vertices = np.frombuffer(made.vertices, np.float64).reshape(-1, 3)
-    return [Mesh(made.name, vertices, np.frombuffer(made.faces, np.int64).reshape(-1, 3))]
-
-
 class _Package:
     """The inner files of an archive, each read when an object of it is placed."""
 
-    def __init__(self, archive: zipfile.ZipFile) -> None:
-        self._archive = archive
+    def __init__(self, archive: zipfile.ZipFile, allowance: Allowance) -> None:
+        self._archive, self._allowance = archive, allowance
         self._models: dict[str, _Model] = {}
+
+    def start(self) -> str:
+        """Inner file of the model that is to be built."""
+        names = self._archive.namelist()
+        relations = ""
+        if "_rels/.rels" in names:
+            relations = b"".join(self._pieces("_rels/.rels")).decode()
+        for relation in re.findall(r"<Relationship\b[^>]*", relations):
+            target = re.search(r'\bTarget\s*=\s*["\']/?([^"\']+)', relation)
+            if target and re.search(r'/3dmodel["\']', relation):
+                return target[1]
+        for name in names:
+            if name.lower() == "3d/3dmodel.model":
+                return name
+        raise ValueError("a ZIP archive without 3D/3dmodel.model")
 
     def model(self, name: str) -> _Model:
         name = name.lstrip("/")
         if name not in self._models:
-            self._models[name] = _Model(name, self._archive.read(name))
+            self._models[name] = _Model(name, self._pieces(name), self._allowance)
         return self._models[name]
+
+    def _pieces(self, name: str) -> Iterator[bytes]:
+        """Content of an inner file, which is never longer than announced."""
+        entry = self._archive.getinfo(name)
+        if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise MeshFileError("is packed by a method other than Deflate: export it again")
+        self._allowance.take(entry.file_size)
+        with self._archive.open(entry) as file:
+            while piece := file.read(_PIECE):
+                yield piece
 
     def object(self, key: _Key) -> _Object:
         objects = self.model(key[0]).objects
@@ -112,20 +129,22 @@ class _Package:
 class _Model:
     """Objects of an inner file, and its build items.
 
-    The parser makes no tree, which would take ten times the file's size, and limits the expansion
-    of entities.
+    The parser makes no tree, which would take ten times the file's size.
     """
 
-    def __init__(self, name: str, text: bytes) -> None:
+    def __init__(self, name: str, text: Iterable[bytes], allowance: Allowance) -> None:
         self.unit = "millimeter"
         self.objects: dict[str, _Object] = {}
         self.items: list[_Placement] = []
-        self._name = name
+        self._name, self._allowance = name, allowance
         self._object = _Object("")
         # Without namespaces, because slicers omit the declaration of some.
         parser = expat.ParserCreate()
         parser.StartElementHandler = self._begin
-        parser.Parse(text, True)
+        parser.EntityDeclHandler = refuse_entity
+        for piece in text:
+            parser.Parse(piece)
+        parser.Parse(b"", True)
 
     def _begin(self, tag: str, attributes: dict[str, str]) -> None:
         tag = tag.rpartition(":")[2]
@@ -134,6 +153,7 @@ class _Model:
         elif tag == "triangle":
             self._object.faces.extend([int(attributes[corner]) for corner in ("v1", "v2", "v3")])
         elif tag == "object":
+            self._allowance.take(_OBJECT_BYTES)
             self._object = _Object(attributes.get("name", ""))
             self.objects[attributes["id"]] = self._object
         elif tag == "component":
@@ -150,6 +170,7 @@ class _Model:
             raise MeshFileError(f"has a <{tag}>, which is not supported: export it as triangles")
 
     def _placement(self, attributes: dict[str, Any]) -> _Placement:
+        self._allowance.take(_OBJECT_BYTES)
         path = next((v for k, v in attributes.items() if k.rpartition(":")[2] == "path"), "")
         matrix = np.eye(4)
         if "transform" in attributes:

@@ -13,7 +13,9 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from ..base.allowance import check_fits
 from ..base.errors import LidarpoolError
+from ..base.yamlfile import load_yaml
 from .beams import Beams
 
 
@@ -62,15 +64,19 @@ def read_calibration(path: Path) -> Calibration:
         If it is none of these, or numbers are missing, not finite or in the wrong order.
     """
     try:
+        check_fits(path)
         text = path.read_text("utf-8-sig")
         if not text.strip():
             raise ValueError("it is empty")
         if path.suffix.lower() in (".yaml", ".yml"):
-            return _velodyne(path.name, yaml.safe_load(text))
+            return _velodyne(path.name, load_yaml(text))
         if path.suffix.lower() == ".json":
             return _ouster(path.name, json.loads(text))
         return _table(path.name, text)
-    except (OSError, ValueError, TypeError, KeyError, yaml.YAMLError, LidarpoolError) as error:
+    except (
+        OSError, ValueError, TypeError, KeyError, ArithmeticError, MemoryError, RecursionError,
+        yaml.YAMLError, LidarpoolError,
+    ) as error:  # fmt: skip
         raise LidarpoolError(f"{path} is not a usable calibration: {said(error)}") from error
 
 
@@ -87,7 +93,7 @@ def _velodyne(name: str, data: Any) -> Calibration:
         raise ValueError("it has no list of lasers, as Velodyne's calibrations have")
     lasers = sorted(data["lasers"], key=lambda laser: laser["laser_id"])
     count = data.get("num_lasers", len(lasers))
-    if [laser["laser_id"] for laser in lasers] != list(range(count)):
+    if len(lasers) != count or any(laser["laser_id"] != i for i, laser in enumerate(lasers)):
         raise ValueError(f"it must have lasers 0 to {count - 1}, each once")
     elevation, azimuth, up, left = np.array(
         [

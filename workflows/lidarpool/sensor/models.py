@@ -14,9 +14,11 @@ import yaml
 from numpy.typing import NDArray
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
+from ..base.allowance import check_fits
 from ..base.arguments import checked
 from ..base.errors import LidarpoolError
 from ..base.words import did_you_mean
+from ..base.yamlfile import load_yaml
 from .beams import Beams, Mirror, Spin
 from .calibrations import Calibration, read_calibration, said
 from .optics import Optics
@@ -30,9 +32,15 @@ class _Part(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
+_BEAMS_MOST = 1_000_000
+
+
 def _numbers(value: Any) -> Any:
     """Expand {first, last, count} to evenly spaced numbers, both ends included."""
     if isinstance(value, dict):
+        count = value.get("count")
+        if isinstance(count, int) and count > _BEAMS_MOST:
+            raise ValueError(f"count is {count:,}; a sensor has {_BEAMS_MOST:,} beams at most")
         try:
             return np.linspace(value["first"], value["last"], value["count"]).tolist()
         except (KeyError, TypeError, ValueError):
@@ -196,7 +204,9 @@ def _built_in(name: str) -> SensorModel:
 
 def _read(path: Path | Traversable) -> SensorModel:
     try:
-        return SensorModel.model_validate(yaml.safe_load(path.read_text("utf-8")))
+        if isinstance(path, Path):
+            check_fits(path)
+        return SensorModel.model_validate(load_yaml(path.read_text("utf-8-sig")))
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"])) or "as a whole"

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.allowance import check_fits
 from ..base.arguments import checked
 from ..base.errors import LidarpoolError
 from .calibrations import said
@@ -66,6 +67,8 @@ def load_trajectory(
     path = Path(path)
     kind = format or ("kitti" if times else "csv" if path.suffix.lower() == ".csv" else "tum")
     try:
+        for file in (path, Path(times)) if times else (path,):
+            check_fits(file)
         text = path.read_text("utf-8-sig")
         if not text.strip():
             raise ValueError("it is empty")

@@ -12,8 +12,10 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import NDArray
 
+from ...base.allowance import check_fits
 from ...base.errors import LidarpoolError
 from ...base.words import did_you_mean
+from ...base.xmlfile import xml_root
 
 Float = NDArray[np.float64]
 
@@ -75,8 +77,7 @@ class Assets:
 def _root(path: Path) -> Element:
     """Return the <document> of a file; LidarpoolError if it is none."""
     try:
-        # Entities are neither read from files nor expanded without end.
-        root = ElementTree.fromstring(path.read_bytes())
+        root = xml_root(read(path))
     except OSError as error:
         raise LidarpoolError(f"{path} cannot be read: {error.strerror}.") from error
     except (ElementTree.ParseError, ValueError, LookupError) as error:
@@ -86,6 +87,15 @@ def _root(path: Path) -> Element:
             f"{path} is XML, but not of HELIOS++: it begins with <{root.tag[:40]}>, not <document>."
         )
     return root
+
+
+def read(path: Path) -> bytes:
+    """Content of a file; LidarpoolError if it is larger than the memory."""
+    try:
+        check_fits(path)
+    except LidarpoolError as error:
+        raise LidarpoolError(f"{path}: {error}") from error
+    return path.read_bytes()
 
 
 def number(values: Element | dict[str, str], name: str, default: float) -> float:

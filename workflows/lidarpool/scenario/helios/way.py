@@ -13,7 +13,7 @@ import numpy as np
 
 from ...base.errors import LidarpoolError
 from ...sensor.trajectory import quaternions_of
-from .files import Assets, Float, about, clean, flag, number
+from .files import Assets, Float, about, clean, flag, number, read
 
 _SPEED = 70.0  # metres a second, where nothing is said
 _BETWEEN_S = 0.001  # of legs, in which the carrier turns on the spot or goes to its next one
@@ -166,7 +166,7 @@ def read_way(survey: Element, legs: Legs, assets: Assets) -> Way:
     settings: dict[str, str] = {}
     for leg in reversed(legs.all):
         settings |= leg.platform
-    table, names = _table(path.read_text("utf-8", "replace"), settings)
+    table, names = _table(read(path).decode("utf-8", "replace"), settings)
     if "t" not in names or len(table) < 2:
         raise LidarpoolError(f"{path} is no trajectory: it has no column t, or one row.")
     table = table[np.unique(table[:, names.index("t")], return_index=True)[1]]

@@ -1,0 +1,266 @@
+"""Files that unpack to far more than they are: refused in one line, before memory is taken."""
+
+import base64
+import itertools
+import json
+import struct
+import subprocess
+import sys
+import zipfile
+
+import pytest
+import trimesh
+
+from lidarpool.base import allowance
+from lidarpool.base.allowance import Allowance, memory_share
+from lidarpool.base.errors import LidarpoolError
+from lidarpool.base.yamlfile import read_yaml
+from lidarpool.scene.meshfile import load_meshes
+
+VERTEX = b'<vertex x="0" y="0" z="0"/>'
+MODEL = (
+    b"<model><resources><object id='1'><mesh><vertices>%s</vertices><triangles>"
+    b"<triangle v1='0' v2='1' v3='2'/></triangles></mesh></object>%s</resources>"
+    b"<build><item objectid='1'/></build></model>"
+)
+PLY = (
+    "ply\nformat binary_little_endian 1.0\nelement vertex {}\nproperty uchar x\n"
+    "property uchar y\nproperty uchar z\nelement {} {}\nproperty list {} vertex_indices\n"
+    "end_header\n"
+)
+CORNERS = b"\0\0\0\1\0\0\0\1\0"
+
+
+def model(more=b"", thousands=0, method=zipfile.ZIP_DEFLATED):
+    """Write a .3mf with so many vertices."""
+
+    def write(path):
+        before, after = (MODEL % (b"|", more)).split(b"|")
+        with (
+            zipfile.ZipFile(path, "w", method) as archive,
+            archive.open("3D/3dmodel.model", "w") as file,
+        ):
+            file.write(before)
+            for _ in range(thousands):
+                file.write(VERTEX * 1000)
+            file.write(after)
+
+    return write
+
+
+def gltf(accessor, primitives=1, nodes=({"mesh": 0},), roots=(0,)):
+    """All vertices of the accessor are the twelve bytes of its buffer."""
+    uri = "data:;base64," + base64.b64encode(bytes(12)).decode()
+    header = {
+        "asset": {"version": "2.0"},
+        "scenes": [{"nodes": list(roots)}],
+        "nodes": list(nodes),
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}] * primitives}],
+        "buffers": [{"byteLength": 12, "uri": uri}],
+        "bufferViews": [{"buffer": 0, "byteLength": 12, "byteStride": 0}],
+        "accessors": [{"componentType": 5126, "type": "VEC3"} | accessor],
+    }
+    return json.dumps(header).encode()
+
+
+def draco():
+    """Two thousand million triangles, by the header of packed data."""
+    data = b"DRACO\2\2\1\0\0\0" + b"\x80\x94\xeb\xdc\7" + b"\3" + bytes(100)
+    header = json.loads(gltf({"count": 3}))
+    header["buffers"] = [
+        {
+            "byteLength": len(data),
+            "uri": "data:;base64," + base64.b64encode(data).decode(),
+        }
+    ]
+    header["bufferViews"] = [{"buffer": 0, "byteLength": len(data)}]
+    packed = {"KHR_draco_mesh_compression": {"bufferView": 0, "attributes": {"POSITION": 0}}}
+    header["meshes"][0]["primitives"][0]["extensions"] = packed
+    return json.dumps(header).encode()
+
+
+def entities(inside):
+    nested = "".join(
+        f'<!ENTITY {name} "{f"&{of};" * 10}">' for of, name in itertools.pairwise("abcdef")
+    )
+    return f'<!DOCTYPE a [<!ENTITY a "{"<n/>" * 10}">{nested}]><{inside}>&f;</{inside}>'.encode()
+
+
+def sharing_dae():
+    """Two shapes of one triangle, at either end of a long list of vertices."""
+    shapes = "".join(
+        f"<geometry id='g{i}'><mesh><vertices id='v{i}'><input semantic='POSITION' source='#s'/>"
+        f"</vertices><triangles><input semantic='VERTEX' source='#v{i}' offset='0'/>"
+        "<p>0 1 59999</p></triangles></mesh></geometry>"
+        for i in range(2)
+    )
+    source = (
+        f"<source id='s'><float_array id='f'>{'0 0 0 ' * 60000}</float_array><technique_common>"
+        "<accessor source='#f' count='60000' stride='3'/></technique_common></source>"
+    )
+    placed = "".join(f"<node><instance_geometry url='#g{i}'/></node>" for i in range(2))
+    return (
+        f"<COLLADA><library_geometries><geometry id='g'><mesh>{source}</mesh></geometry>{shapes}"
+        f"</library_geometries><library_visual_scenes><visual_scene>{placed}</visual_scene>"
+        "</library_visual_scenes></COLLADA>"
+    ).encode()
+
+
+LAUGHS = b"a: &a [1,1,1,1,1,1,1,1,1,1]\n" + b"".join(
+    f"{name}: &{name} [{','.join([f'*{of}'] * 10)}]\n".encode()
+    for of, name in itertools.pairwise("abcdefg")
+)
+# {name of the file: (its content or what writes it, what is said of it)}
+BOMBS = {
+    "vertices.3mf": (model(thousands=12_000), "would unpack to 308.99 MiB"),
+    "objects.3mf": (model(b"<object id='2'/>" * 300_000), "would unpack to 256"),
+    "lzma.3mf": (model(b" " * 10_000_000, method=zipfile.ZIP_LZMA), "a method other than Deflate"),
+    "entities.3mf": (None, "declares an XML entity"),
+    "count.gltf": (gltf({"bufferView": 0, "count": 60_000_000}), "would unpack to 457.76 MiB"),
+    "sparse.gltf": (
+        gltf({"count": 2_000_000_000, "sparse": {"count": 0}}),
+        "would unpack to 22.35 GiB",
+    ),
+    "parts.gltf": (gltf({"bufferView": 0, "count": 30_000}, 3000), "would unpack to 256"),
+    "placed.gltf": (
+        gltf(
+            {"bufferView": 0, "count": 1_500_000},
+            nodes=[{"mesh": 0}, *({"children": [i] * 11} for i in range(5))],
+            roots=[5],
+        ),
+        "places 161,051 objects, which would take",
+    ),
+    "draco.gltf": (draco(), "would unpack to 46.35 GiB"),
+    "entities.dae": (entities("COLLADA"), "declares an XML entity"),
+    "long.ply": (PLY.format(10**9, "face", 1, "uchar int").encode() + bytes(10**6), "fewer"),
+    "rows.ply": (
+        PLY.format(3, "face", 10**5, "uchar uchar").encode()
+        + CORNERS
+        + b"\3\0\1\2"
+        + bytes(10**5)
+        + b"\1",
+        "more than announced",
+    ),
+    "strips.ply": (
+        PLY.format(3, "tristrips", 1, "uint char").encode()
+        + CORNERS
+        + struct.pack("<I", 10**6)
+        + b"\xff" * 10**6,
+        "no triangles",
+    ),
+    "laughs.yaml": (LAUGHS, "would unpack to"),
+    "merged.yaml": (LAUGHS.replace(b"[1,1,1,1,1,1,1,1,1,1]", b"{x: 1}").replace(b"[*", b"{<<: [*")
+                    .replace(b"]\n", b"]}\n"), "would unpack to"),
+    "sensor.yaml": (
+        b"name: x\nfiring_us: 1\nbeams: {elevation_deg: {first: 0, last: 1, count: 300000000}}\n",
+        "1,000,000 beams at most",
+    ),
+    "lasers.yaml": (
+        b"num_lasers: 300000000\nlasers: [{laser_id: 0, vert_correction: 0, rot_correction: 0}]\n",
+        "it must have lasers 0 to 299999999",
+    ),
+}  # fmt: skip
+READ = """
+import re, sys
+from pathlib import Path
+import distributed, DracoPy
+from lidarpool import LidarpoolError, Scene, load_sensor
+from lidarpool.scenario.scenario import Scenario
+
+READERS = {
+    "sensor.yaml": load_sensor,
+    "lasers.yaml": lambda path: load_sensor(calibration=path),
+    ".yaml": Scenario.load,
+}
+def peak():  # ru_maxrss would be at least that of the process that started this one
+    return int(re.search(r"VmHWM:\\s*(\\d+)", Path("/proc/self/status").read_text())[1])
+
+first = peak()
+for name in sys.argv[1:]:
+    path = Path(name)
+    try:
+        READERS.get(path.name, READERS.get(path.suffix, Scene.load))(path)
+        print("read")
+    except LidarpoolError as error:
+        print(str(error).replace(chr(10), chr(9)))
+print((peak() - first) * 1024)
+"""
+MOST = 400 * 2**20  # bytes; before there was a limit, any of these took more, or minutes
+
+
+@pytest.fixture
+def bombs(tmp_path):
+    """Write the files."""
+    for name, (content, _) in BOMBS.items():
+        path = tmp_path / name
+        if callable(content):
+            content(path)
+        elif content is not None:
+            path.write_bytes(content)
+    with zipfile.ZipFile(tmp_path / "entities.3mf", "w") as archive:
+        archive.writestr("3D/3dmodel.model", entities("model"))
+    return [tmp_path / name for name in BOMBS]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs /proc")
+def test_bombs_take_little_memory_and_say_what_they_are(bombs):
+    pytest.importorskip("DracoPy", reason="the decoder of packed glTF is an extra")
+    run = subprocess.run(
+        [sys.executable, "-c", READ, *bombs], capture_output=True, text=True, check=True
+    )
+    *told, grown = run.stdout.splitlines()
+    assert run.stderr == ""
+    assert all(path.stat().st_size < 2.2e6 for path in bombs)
+    for path, line, (_, message) in zip(bombs, told, BOMBS.values(), strict=True):
+        assert line.startswith(str(path)) and message in line, line
+        assert len(line) < 500 + len(str(path)) and "\t" not in line
+    assert int(grown) < MOST, grown
+
+
+def test_vertices_that_parts_share_are_kept_where_they_are_used(tmp_path):
+    path = tmp_path / "shared.dae"
+    path.write_bytes(sharing_dae())
+    assert [len(mesh.vertices) for mesh in load_meshes(path)] == [3, 3]
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".3mf"])
+def test_honest_files_are_far_below_the_limit(tmp_path, monkeypatch, suffix):
+    monkeypatch.setattr(allowance, "LEAST", 0)
+    monkeypatch.setattr(allowance, "TIMES", 50)
+    ball = trimesh.creation.icosphere(5)
+    path = tmp_path / f"ball{suffix}"
+    ball.export(path)
+    (mesh,) = load_meshes(path)
+    assert len(mesh.faces) == len(ball.faces) == 20480
+
+
+def test_a_large_mesh_is_read_though_memory_is_short(tmp_path, monkeypatch):
+    ball = trimesh.creation.icosphere(6)
+    path = tmp_path / "ball.ply"
+    ball.export(path)
+    monkeypatch.setattr(allowance, "memory", lambda: 1 + path.stat().st_size)
+    assert len(load_meshes(path)[0].faces) == 81920
+    monkeypatch.setattr(allowance, "memory", lambda: path.stat().st_size - 1)
+    with pytest.raises(LidarpoolError, match=r"ball\.ply: it has .* more than the memory"):
+        load_meshes(path)
+
+
+def test_values_of_yaml_count_as_what_python_makes_of_them(tmp_path, monkeypatch):
+    path = tmp_path / "values.yaml"
+    path.write_text("poses: [" + "1," * 3000 + "]")
+    assert len(read_yaml(path)["poses"]) == 3000
+    monkeypatch.setattr(allowance, "LEAST", 0)
+    with pytest.raises(LidarpoolError, match=r"values\.yaml: it has .* would unpack to 586"):
+        read_yaml(path)
+
+
+def test_the_limit_is_of_the_file_and_of_the_memory(monkeypatch):
+    monkeypatch.setattr(allowance, "memory", lambda: 2**40)
+    assert Allowance(1, "").limit == 2**28
+    assert Allowance(2**30, "").limit == 100 * 2**30
+    assert Allowance(2**35, "").limit == memory_share() == 2**38
+    grown = Allowance(2**25, "")
+    grown.grow(2**25)
+    grown.take(100 * 2**26)
+    with pytest.raises(LidarpoolError, match=r"it has 64\.00 MiB and would unpack to 6\.25 GiB"):
+        grown.take(1)
