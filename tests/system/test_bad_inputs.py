@@ -15,8 +15,8 @@ import pytest
 import trimesh
 from tests.clusters import import_jobqueue, thread_cluster
 
-import lidarpool.run.checks as lidarpool_checks
 import lidarpool.run.connection
+import lidarpool.run.waiting as lidarpool_waiting
 from raybeam import available_backends
 
 BOX = trimesh.creation.box((2, 4, 6))
@@ -94,7 +94,10 @@ OPTIONS: dict[str, tuple[list[str], str]] = {
     "malformed address": (["run", "good.yaml", "--scheduler", "tcp://::1:x"], "tcp://host:8786"),
     "no port": (["info", "--scheduler", "localhost"], "has no port"),
     "scene that is there": (["scene", "city", "good.ply"], "exists: give another"),
-    "no scheduler": (["run", "good.yaml", "--scheduler", "tcp://127.0.0.1:1"], "No Dask scheduler"),
+    "no scheduler": (
+        ["run", "good.yaml", "--wait", "0s", "--scheduler", "tcp://127.0.0.1:1"],
+        "No Dask scheduler",
+    ),
 }
 
 
@@ -183,9 +186,8 @@ def test_out_is_in_use_by_another_run(place, refused):
 
 
 def test_no_folder_is_left_behind_by_a_run_that_was_refused(place, refused, impatient):
-    refused(
-        ["run", "good.yaml", "--out", "new/deep", "--scheduler", "tcp://127.0.0.1:1"], "No Dask"
-    )
+    command = ["run", "good.yaml", "--wait", "0s", "--out", "new/deep"]
+    refused([*command, "--scheduler", "tcp://127.0.0.1:1"], "No Dask")
 
 
 # -- clusters -----------------------------------------------------------------------------------
@@ -194,7 +196,8 @@ def test_no_folder_is_left_behind_by_a_run_that_was_refused(place, refused, impa
 def test_a_listener_that_is_no_scheduler(refused, impatient):
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
-        refused(["run", "good.yaml", "--scheduler", f"tcp://127.0.0.1:{port}"], "No Dask scheduler")
+        command = ["run", "good.yaml", "--wait", "0s"]
+        refused([*command, "--scheduler", f"tcp://127.0.0.1:{port}"], "No Dask scheduler")
 
 
 CLUSTERS: dict[str, tuple[list[dict[str, int]], str]] = {
@@ -217,7 +220,7 @@ def test_a_cluster_that_lacks_something(case, refused):
 
 
 def test_workers_that_are_waited_for_are_named_meanwhile(place, lidarpool, monkeypatch):
-    monkeypatch.setattr(lidarpool_checks, "TELL_EVERY_S", 0.0)
+    monkeypatch.setattr(lidarpool_waiting, "TELL_EVERY_S", 0.0)
     with thread_cluster({"GPU": 1}, {"OTHER": 1}) as cluster:
         address = cluster.scheduler_address
         outcome = lidarpool("run", "good.yaml", "--scheduler", address, "--wait", "1s")

@@ -1,17 +1,23 @@
-"""A local cluster starts whole and stops whole, whenever its user interrupts."""
+"""A local cluster starts and stops whole, whenever its user interrupts; others are waited for."""
 
 from __future__ import annotations
 
 import os
+import re
 import signal
+import socket
 import subprocess
 import sys
 import time
 
 import psutil
 import pytest
+from tests.clusters import cluster_of
 
-from lidarpool.run.connection import local_client
+from lidarpool import LidarpoolError
+from lidarpool.run import waiting
+from lidarpool.run.connection import connected, local_client
+from lidarpool.run.waiting import Waiting
 
 SCRIPT = """
 from lidarpool import Scene, Survey, simulate
@@ -66,3 +72,76 @@ def test_workers_are_forked_from_one_process_also_in_place_of_others():
         modules = client.run(lambda: {"lidarpool.scan.stages", "open3d"} & sys.modules.keys())
         assert list(modules.values()) == [{"lidarpool.scan.stages"}] * 2
     assert set(psutil.Process(server).children()) <= others
+
+
+@pytest.fixture
+def address():
+    """An address where nobody is."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return f"tcp://127.0.0.1:{server.getsockname()[1]}"
+
+
+@pytest.fixture
+def waiting_run(tmp_path, address):
+    """A run that waits for its scheduler, and has said so."""
+    (tmp_path / "s.yaml").write_text(
+        "sensor: {layers: 2, step_deg: 90}\nsteps: 2\nplanning: {enabled: false}\n"
+    )
+    command = ["run", "s.yaml", "--scheduler", address, "--wait", "10m", "--only", "cloud"]
+    with subprocess.Popen(
+        [sys.executable, "-m", "lidarpool", *command],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    ) as run:
+        try:
+            assert run.stderr
+            said = run.stderr.readline()
+            assert re.match(rf"note: waiting for the scheduler at {address}, for another 59\d s: ",
+                            said), said + run.stderr.read()  # fmt: skip
+            yield run
+        finally:
+            run.kill()
+
+
+def test_a_scheduler_that_starts_later_is_waited_for(waiting_run, address, tmp_path):
+    workers = {name: {"resources": {name: slots}} for name, slots in (("GPU", 1), ("LIDAR", 4))}
+    with cluster_of(workers, {"port": int(address.rpartition(":")[2])}, host="127.0.0.1"):
+        _, err = waiting_run.communicate(timeout=300)
+    assert waiting_run.returncode == 0, err
+    assert (tmp_path / "lidarpool-out" / "cloud.ply").exists()
+
+
+def test_waiting_for_a_scheduler_ends_with_an_interrupt(waiting_run, tmp_path):
+    waiting_run.send_signal(signal.SIGINT)
+    _, err = waiting_run.communicate(timeout=60)
+    assert waiting_run.returncode == 130
+    assert err.splitlines()[-1].startswith("lidarpool: interrupted"), err
+
+
+def test_a_scheduler_that_never_starts_is_named_with_the_time(address, monkeypatch):
+    monkeypatch.setattr(waiting, "TELL_EVERY_S", 0.0)
+    told: list[str] = []
+    with (
+        pytest.raises(LidarpoolError, match=rf"answers at '{address}' within 1.5 s \(Connection"),
+        connected(address, waiting=Waiting(1.5, told.append)),
+    ):
+        pytest.fail("it is connected")
+    assert told[0] == f"waiting for the scheduler at {address}, for another 1 s: nobody answers"
+
+
+@pytest.mark.parametrize(
+    ("address", "message"),
+    [
+        ("foo://127.0.0.1:8786", "unknown address scheme 'foo'"),
+        ("tcp://::1:x", "ipv6 needs brackets"),
+        ("tcp://127.0.0.1", "has no port"),
+        ("tcp://:8786", "has no host"),
+        ("tcp://127.0.0.1:87860", "has the port 87860: ports are 1 to 65535"),
+    ],
+)
+def test_waiting_does_not_mend_a_malformed_address(address, message):
+    with pytest.raises(LidarpoolError, match=message), connected(address, waiting=Waiting(3600)):
+        pytest.fail("it is connected")

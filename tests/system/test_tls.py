@@ -14,6 +14,7 @@ from tests.clusters import thread_cluster
 from lidarpool import LidarpoolError
 from lidarpool.run.connection import TlsFiles, connected
 from lidarpool.run.local import local_cluster
+from lidarpool.run.waiting import Waiting
 from poolpart import Pool
 
 
@@ -37,7 +38,9 @@ def encrypted(tmp_path_factory) -> Iterator[tuple[str, TlsFiles]]:
 
 
 def told(address: str, files: TlsFiles | None = None) -> str:
-    with pytest.raises(LidarpoolError) as refused, connected(address, files):
+    # Waiting would mend none of it, and is not done.
+    waiting = Waiting(3600)
+    with pytest.raises(LidarpoolError) as refused, connected(address, files, waiting):
         pytest.fail("it let us in")
     assert "\n" not in str(refused.value)
     return str(refused.value)

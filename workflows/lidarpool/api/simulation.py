@@ -88,7 +88,8 @@ def simulate(
         Encrypt the traffic of a local cluster, with a certificate made for it.
     wait_s, patience_s
         How long to wait for partitions that are empty at the start, and for those that become
-        empty later, seconds.
+        empty later, seconds. A client waits for its scheduler by itself:
+        ``Client(address, timeout=600)``.
     folder
         A folder to keep the run in, so that nothing is lost if this process or its machine dies;
         its parent must exist. The run stays there at the end: remove it with `remove_run` once
@@ -123,7 +124,7 @@ def simulate(
     >>> from lidarpool import Scene, Survey, simulate
     >>> result = simulate(Scene.seed(), Survey(poses=[(0, 0, 1)]))    # doctest: +SKIP
     >>> print(len(result.cloud), "points")                            # doctest: +SKIP
-    327 points
+    1613 points
     """
     job = Job(
         scene,

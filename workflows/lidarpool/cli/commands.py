@@ -136,8 +136,8 @@ def demo(out: Path | Storage, **shown: Any) -> None:
     "wait_s",
     callback=_seconds,
     metavar="TIME",
-    help="How long to wait for partitions that are empty at the start, such as 90s or 10m; by "
-    f"default {WAIT_S:g}s, with --cluster {QUEUE_S / 3600:g}h.",
+    help="How long to wait at the start for the scheduler and for empty partitions, such as 90s "
+    f"or 10m; by default {WAIT_S:g}s, with --cluster {QUEUE_S / 3600:g}h.",
 )
 @click.option(
     "--patience",

@@ -31,6 +31,7 @@ from ..run.ranges import LidarWorkers
 from ..run.result import RunResult
 from ..run.run import Run, make_result
 from ..run.store import RUN_FOLDER, RunStore, remove_run
+from ..run.waiting import Waiting
 from ..scan import LIDAR
 from ..scan.database import FILE
 from ..scenario.scenario import Scenario
@@ -236,16 +237,19 @@ def _drive(
     stack: ExitStack,
 ) -> tuple[RunResult, LidarWorkers]:
     """Run on a cluster, a local one if none is given, which lasts as long as the stack."""
+    waiting = None
+    if options.scheduler is not None:  # for scheduler and workers together
+        waiting = Waiting(options.wait_s, _teller(options))
     if options.cluster is not None:
         cluster = _started_client(options.cluster, options)
     elif options.scheduler is not None:
-        cluster = connected(options.scheduler, options.files)
+        cluster = connected(options.scheduler, options.files, waiting)
     else:
         check_backend_here(store.backend or store.job.backend, store.advice)
         cluster = _local_client(scenario, options, store.job.planning is not None)
     client = stack.enter_context(cluster)
     with shown_progress(options.quiet) as show:
-        run = Run(client, store, _teller(options))
+        run = Run(client, store, _teller(options), waiting)
         # The cluster of one run has no dashboard.
         with nullcontext() if options.here else run.partitions_page():
             on_frame = None if live is None else live.on_frame

@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,10 +22,10 @@ from ..base.words import did_you_mean
 from ..scan import COLLECT, GENERATE, GPU, LIDAR, OTHER, SORT
 from ..scene.scene import Scene
 from ..sensor import Survey
+from .waiting import Waiting
 
 AUTO_TAKES = "Backend 'auto' takes one that works."
 LOOK_EVERY_S = 0.2
-TELL_EVERY_S = 5.0  # and less often in a long wait
 _ALL_LEFT = "The workers of partition 'GPU' left before the run started: their logs say why."
 
 
@@ -72,9 +72,7 @@ def find_workers(
     wanted: str,
     advice: str = AUTO_TAKES,
     earlier: Mapping[str, str] | None = None,
-    *,
-    wait_s: float = 0.0,
-    tell: Callable[[str], None] = lambda words: None,
+    waiting: Waiting | None = None,
 ) -> tuple[Pool, list[WorkerInfo], str, dict[str, str]]:
     """Find all workers, the casting ones among them, their backend and their software.
 
@@ -90,10 +88,8 @@ def find_workers(
         End of the message if it is not available.
     earlier
         Software that a resumed run was cast with.
-    wait_s
-        How long to wait for missing workers, or ones that just died, seconds.
-    tell
-        Called every few seconds with a message while it waits.
+    waiting
+        How long to wait for missing workers, or ones that just died; by default not at all.
 
     Raises
     ------
@@ -102,8 +98,9 @@ def find_workers(
     """
     if client.asynchronous:
         raise LidarpoolError("The client is asynchronous: give one made without asynchronous=True.")
-    began = told = looked = time.monotonic()
+    waiting = waiting or Waiting()
     while True:
+        looked = time.monotonic()
         try:
             pool = _survey_pool(client, slots_needed(collectors, planning))
             casting = [worker for worker in pool if worker.resources.get(GPU)]
@@ -113,16 +110,11 @@ def find_workers(
         except TooFewWorkersError as error:
             # One that has just died takes half a minute not to answer, which is no waiting: what
             # counts is when the last look began.
-            if looked >= began + wait_s:
+            if not waiting.left(looked):
                 raise
-            now = time.monotonic()
-            if now - told >= max(TELL_EVERY_S, (now - began) / 10):
-                told = now
-                lacking = str(error).partition(": start ")[0]  # who waits has started them
-                left = max(0, began + wait_s - now)
-                tell(f"waiting for workers, for another {left:.0f} s: {lacking}")
+            # Who waits has started them.
+            waiting.tell("workers", str(error).partition(": start ")[0])
         time.sleep(LOOK_EVERY_S)
-        looked = time.monotonic()
 
 
 def _survey_pool(client: Client, needed: Mapping[str, int]) -> Pool:

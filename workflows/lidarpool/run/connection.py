@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import errno
+import socket
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -17,10 +19,13 @@ from poolpart.internals import forked_workers
 from ..base.errors import LidarpoolError
 from ..base.fork_server import start_fork_server
 from ..base.interrupts import children_spared, deferred_interrupts
+from .checks import LOOK_EVERY_S
 from .cluster_file import ClusterFile
 from .local import local_cluster
+from .waiting import Waiting
 
 CONNECT_TIMEOUT_S = 10
+_UNREACHABLE = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN)  # a host that is starting
 
 # What Dask watches many times a second in each process, for a dashboard that a cluster of one run
 # does not have: idle, a worker took 3 % of a core, and now takes a fifth of that.
@@ -114,8 +119,10 @@ def started_client(file: ClusterFile, tell: Callable[[str], object]) -> Iterator
 
 
 @contextmanager
-def connected(scheduler: str, files: TlsFiles | None = None) -> Iterator[Client]:
-    """Client of a cluster that is running already.
+def connected(
+    scheduler: str, files: TlsFiles | None = None, waiting: Waiting | None = None
+) -> Iterator[Client]:
+    """Client of a cluster that is running already, or will be soon.
 
     Parameters
     ----------
@@ -123,17 +130,18 @@ def connected(scheduler: str, files: TlsFiles | None = None) -> Iterator[Client]
         Address, ``tcp://host:8786`` or ``tls://host:8786``.
     files
         Certificates for the latter; by default those of Dask's configuration.
+    waiting
+        How long to wait for a scheduler that nobody has started yet; by default some seconds, for
+        a slow one.
 
     Raises
     ------
     LidarpoolError
         If no scheduler answers at this address, or the certificates are wrong.
     """
-    if ":" not in scheduler.rpartition("//")[2] and not scheduler.startswith("inproc"):
-        raise LidarpoolError(
-            f"The address {scheduler!r} has no port: give that of the scheduler, such as "
-            f"{scheduler}:8786."
-        )
+    if not scheduler.startswith("inproc"):
+        _check_address(scheduler)
+    waiting = waiting or Waiting()
     try:
         security = Security()
         if files and any(files):
@@ -141,28 +149,77 @@ def connected(scheduler: str, files: TlsFiles | None = None) -> Iterator[Client]
             security = Security(
                 require_encryption=True, tls_ca_file=ca, tls_client_cert=cert, tls_client_key=key
             )
-        asyncio.run(asyncio.wait_for(_knock(scheduler, security), CONNECT_TIMEOUT_S))
+        asyncio.run(_reach(scheduler, security, waiting))
         client = Client(
             scheduler, security=security, timeout=CONNECT_TIMEOUT_S, set_as_default=False
         )
     except Exception as error:
-        # Another program may listen there, and its answer may cause any error.
-        cause: BaseException = error
-        while cause.__cause__ or cause.__context__:
-            cause = cause.__cause__ or cause.__context__  # type: ignore[assignment]
-        reason = " ".join(f"{type(cause).__name__}: {cause}".split())[:200].rstrip(": ")
+        waited = f" within {waiting.seconds:g} s" if waiting.seconds and _absent(error) else ""
         raise LidarpoolError(
-            f"No Dask scheduler answers at {scheduler!r} ({reason}): start one with dask "
-            "scheduler, and give its address as tcp://host:8786; of an encrypted one as "
+            f"No Dask scheduler answers at {scheduler!r}{waited} ({_reason(error)}): start one "
+            "with dask scheduler, and give its address as tcp://host:8786; of an encrypted one as "
             "tls://host:8786, with --tls-ca, --tls-cert and --tls-key."
         ) from error
     with client:
         yield client
 
 
+def _check_address(address: str) -> None:
+    """Refuse an address at which nothing can ever be."""
+    host, _, port = address.rpartition("//")[2].partition("/")[0].rpartition(":")
+    if not host:
+        raise LidarpoolError(
+            f"The address {address!r} has no {'host' if port.isdigit() else 'port'}: give that of "
+            f"the scheduler, such as {'tcp://host' if port.isdigit() else address}:8786."
+        )
+    if port.isdigit() and not 0 < int(port) < 1 << 16:
+        raise LidarpoolError(
+            f"The address {address!r} has the port {port}: ports are 1 to 65535; a scheduler's is "
+            "8786 if nothing else is said, tcp://host:8786."
+        )
+
+
+async def _reach(address: str, security: Security, waiting: Waiting) -> None:
+    """Return when a scheduler answers; a client waits for ever for a silent one."""
+    why = "nobody answers"
+    while True:
+        timeout: float = CONNECT_TIMEOUT_S
+        if waiting.seconds:
+            timeout = min(timeout, max(waiting.left(), 1.0))
+        knock = asyncio.ensure_future(asyncio.wait_for(_knock(address, security), timeout))
+        while not (await asyncio.wait({knock}, timeout=LOOK_EVERY_S))[0]:
+            waiting.tell(f"the scheduler at {address}", why)
+        if (error := knock.exception()) is None:
+            return
+        if not waiting.left() or not _absent(error):
+            raise error
+        why = _reason(error)
+        waiting.tell(f"the scheduler at {address}", why)
+        await asyncio.sleep(LOOK_EVERY_S)
+
+
 async def _knock(address: str, security: Security) -> None:
-    """Check that a scheduler answers; a client waits for ever for a silent one."""
+    """Check that a scheduler answers."""
     comm = await connect(
         address, timeout=CONNECT_TIMEOUT_S, **security.get_connection_args("client")
     )
     comm.abort()
+
+
+def _root(error: BaseException) -> BaseException:
+    """First cause of an error. Another program may listen there, and its answer may cause any."""
+    while error.__cause__ or error.__context__:
+        error = error.__cause__ or error.__context__  # type: ignore[assignment]
+    return error
+
+
+def _absent(error: BaseException) -> bool:
+    """Whether nothing was there, not even a name, so that it may come; not a refusal."""
+    root = _root(error)
+    absent = (ConnectionRefusedError, TimeoutError, asyncio.CancelledError, socket.gaierror)
+    return isinstance(root, absent) or getattr(root, "errno", None) in _UNREACHABLE
+
+
+def _reason(error: BaseException) -> str:
+    root = _root(error)
+    return " ".join(f"{type(root).__name__}: {root}".split())[:200].rstrip(": ")

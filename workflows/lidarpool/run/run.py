@@ -37,6 +37,7 @@ from .progress import Progress
 from .result import RunResult
 from .store import RunStore
 from .trials import TrialPump
+from .waiting import Waiting
 
 T = TypeVar("T")
 
@@ -60,6 +61,8 @@ class Run:
         Store of parts and receipts, with what an earlier run has left.
     tell
         Called every few seconds with a message while the run waits.
+    waiting
+        How long to wait for workers at the start; by default as long as the job says.
 
     Raises
     ------
@@ -72,6 +75,7 @@ class Run:
         client: Client,
         store: RunStore,
         tell: Callable[[str], None] = lambda words: None,
+        waiting: Waiting | None = None,
     ) -> None:
         job = store.job
         self.client, self.job, self.store = client, job, store
@@ -86,8 +90,7 @@ class Run:
                 store.backend or job.backend,
                 store.advice,
                 store.casting if store.resumed else {},
-                wait_s=job.wait_s,
-                tell=tell,
+                waiting or Waiting(job.wait_s, tell),
             )
             store.backend, store.casting = backend, software
             assign_devices(
