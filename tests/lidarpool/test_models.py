@@ -256,6 +256,37 @@ def test_ousters_metadata_old_and_new(tmp_path, new):
     assert (quick.period, quick.head.rate_hz, quick.max_range_m) == (1024, 5, 9)
 
 
+OLD = {"beam_altitude_angles": [10.5, 1.0, -10.25], "beam_azimuth_angles": [4.0, 0.0, -1.5]}
+
+
+@pytest.mark.parametrize(
+    ("data", "origin_mm"),
+    [
+        ({**OLD, "prod_line": "OS-0-128"}, 27.67),
+        ({**OLD, "prod_line": "OS-1-16-A0", "lidar_mode": "1024x10"}, 15.806),
+        ({**OLD, "prod_line": "OS-2-32-U0"}, 13.762),
+        (OLD, 12.163),
+        (
+            {
+                "beam_intrinsics": OLD,
+                "sensor_info": {"prod_line": "OS-1-64"},
+                "lidar_data_format": "error: Command not recognized.",
+                "config_params": {"lidar_mode": "1024x10"},
+            },
+            15.806,
+        ),
+        ({"beam_intrinsics": OLD, "sensor_info": "error", "lidar_intrinsics": "error"}, 12.163),
+    ],
+    ids=str,
+)
+def test_ousters_metadata_of_firmware_before_2(tmp_path, data, origin_mm):
+    """What they lack is as in ouster-sdk; where a command was unknown, they have its error."""
+    path = write(tmp_path, "os.json", json.dumps(data))
+    sensor = load_sensor(calibration=path)
+    assert sensor.period == 1024
+    np.testing.assert_allclose(sensor.beams.origin, [[origin_mm / 1000, 0, 0.03618]] * 3)
+
+
 def test_a_list_of_rays_of_livox(tmp_path):
     """The list of a Mid-40 gives its rays back; Livox's own number the rows of a Mid-360."""
     prisms = load_sensor("livox/mid40")
@@ -330,6 +361,8 @@ BAD = {
     "prose.csv": ("dear reader\n1,2", "'dear reader', has no known format"),
     "prose.json": ("{", "Expecting property name"),
     "other.json": ('{"format": 3}', "no beam_altitude_angles"),
+    "text.json": ('{"beam_intrinsics": "error"}', "no beam_altitude_angles"),
+    "mode.json": (json.dumps({**OLD, "lidar_mode": 7}), "not enough values"),
     "half.json": ('{"beam_altitude_angles": [1, 2]}', "'beam_azimuth_angles' is missing"),
     "rows.json": ('{"beam_altitude_angles": [1], "beam_azimuth_angles": [1, 2]}', "1 altitude and"),
     "zeros.json": ('{"beam_altitude_angles": [0], "beam_azimuth_angles": [0]}', "beams, not 0"),

@@ -113,6 +113,12 @@ def _velodyne(name: str, data: Any) -> Calibration:
     return Calibration(name, "velodyne", beams)
 
 
+# From the axis to where the beams leave, by product line, and else that of the first generation:
+# default_lidar_origin_to_beam_origin in ouster_core/src/sensor_info.cpp of ouster-sdk 1.0.
+_OUSTER_ORIGINS_MM = {"OS-0-": 27.67, "OS-1-": 15.806, "OS-2-": 13.762}
+_OUSTER_FIRST_MM = 12.163
+
+
 def _ouster(name: str, data: Any) -> Calibration:
     """Beams of Ouster's metadata, old and new; geometry as in its sensor manual.
 
@@ -120,12 +126,18 @@ def _ouster(name: str, data: Any) -> Calibration:
     """
     if not isinstance(data, dict):
         raise ValueError("it is not Ouster metadata")
-    beam = data.get("beam_intrinsics", data)
+
+    def section(name: str, old: Any = data) -> Any:
+        """Return a section of the new layout; firmware before 1.14 writes an error in its place."""
+        found = data.get(name, old)
+        return found if isinstance(found, dict) else {}
+
+    beam = section("beam_intrinsics")
     if "beam_altitude_angles" not in beam:
         raise ValueError("it has no beam_altitude_angles, as Ouster's metadata have")
     elevation = np.array(beam["beam_altitude_angles"], np.float64)
     azimuth = np.array(beam["beam_azimuth_angles"], np.float64)
-    layout = data.get("lidar_data_format") or data.get("data_format") or {}
+    layout = section("lidar_data_format", None) or section("data_format", None)
     rows = layout.get("pixels_per_column", len(elevation))
     if elevation.shape != azimuth.shape or len(elevation) != rows:
         raise ValueError(
@@ -135,14 +147,17 @@ def _ouster(name: str, data: Any) -> Calibration:
     beam_at = np.reshape(beam.get("beam_to_lidar_transform", np.eye(4)), (4, 4))[:3, 3].copy()
     if "lidar_origin_to_beam_origin_mm" in beam:
         beam_at[0] = beam["lidar_origin_to_beam_origin_mm"]
-    lidar = data.get("lidar_intrinsics", data)
+    elif "beam_to_lidar_transform" not in beam:  # firmware before 2.0
+        line = str(section("sensor_info").get("prod_line", ""))
+        beam_at[0] = _OUSTER_ORIGINS_MM.get(line[:5], _OUSTER_FIRST_MM)
+    lidar = section("lidar_intrinsics")
     turned = np.diag([-1.0, -1.0, 1.0, 1.0])
     turned[2, 3] = 36.18
     pose = np.reshape(lidar.get("lidar_to_sensor_transform", turned), (4, 4))
     if not np.allclose(pose[:3, :3], turned[:3, :3]) or pose[:2, 3].any():
         raise ValueError("its lidar_to_sensor_transform is not half a turn and a height")
     beam_at[2] += pose[2, 3]
-    mode = data.get("config_params", data).get("lidar_mode", "1024x10")
+    mode = str(section("config_params").get("lidar_mode", "1024x10"))
     columns, rate = (int(number) for number in mode.split("x"))
     count = int(there.sum())
     return Calibration(
