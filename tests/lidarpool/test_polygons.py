@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidarpool.scene.polygons import MOST_CORNERS, triangulated
+from lidarpool.scene.polygons import MOST_CORNERS, triangulated, with_holes
 
 # A wall with a door in it, an arrow, a comb and a spiral, anticlockwise.
 SHAPES = {
@@ -101,6 +101,44 @@ def test_a_warped_quadrangle_keeps_both_triangles():
     # Seen from above its outline crosses itself.
     vertices = np.array([[0, 0, 0], [2, 0, 0], [0.1, 1, 3], [2, 1, 0]], dtype=float)
     assert len(cut(vertices)) == 2
+
+
+def all_ways(corners):
+    """All triangulations of a polygon."""
+    if len(corners) < 3:
+        yield []
+    for k in range(1, len(corners) - 1):
+        for left in all_ways(corners[: k + 1]):
+            for right in all_ways(corners[k:]):
+                yield [*left, *right, (corners[0], corners[k], corners[-1])]
+
+
+@pytest.mark.parametrize("count", [5, 6, 7])
+def test_warped_polygons_lose_no_triangle(count):
+    rng = np.random.default_rng(count)
+    lost = 0
+    for _ in range(200):
+        angles = np.sort(rng.uniform(0, 2 * np.pi, count))
+        radii = rng.uniform(0.2, 1, count)
+        heights = rng.normal(0, 2, count)
+        vertices = np.stack([radii * np.cos(angles), radii * np.sin(angles), heights], axis=1)
+        faces = cut(vertices)
+        assert len(faces) == count - 2
+        parts = area_vectors(vertices, faces)
+        np.testing.assert_allclose(parts.sum(axis=0), area_vector(vertices), atol=1e-9)
+        ways = [area_vectors(vertices, np.array(way)) for way in all_ways(range(count))]
+        areas = [np.linalg.norm(way, axis=1).sum() for way in ways]
+        assert min(areas) <= np.linalg.norm(parts, axis=1).sum() * (1 + 1e-9)
+        assert np.linalg.norm(parts, axis=1).sum() <= max(areas) * (1 + 1e-9)
+        lost += len(with_holes(vertices, [np.arange(count)])) < count - 2
+    assert lost > 20, "the clipper alone fills them"
+
+
+def test_a_plane_polygon_is_clipped_though_its_numbers_are_rounded():
+    shape, area = UNUSUAL["slit to a hole"]
+    vertices = np.round(placed(np.array(shape) / 3, turn=0.3), 6)
+    parts = area_vectors(vertices, cut(vertices))
+    np.testing.assert_allclose(np.linalg.norm(parts, axis=1).sum(), area / 9, rtol=1e-4)
 
 
 def test_corners_that_are_not_there():

@@ -6,10 +6,13 @@ import mapbox_earcut
 import numpy as np
 from numpy.typing import NDArray
 
+Float = NDArray[np.float64]
+
 # For an outline that crosses itself everywhere, the clipper's time grows with their cube: 20 s for
 # so many. Larger outlines are probably broken files.
 MOST_CORNERS = 5000
 
+_WARPED = 1e-5  # a polygon is plane if its corners lie this near a plane, over its size
 _FLAT = 1e-12  # a corner turns back if its sine, of a plane polygon, is below minus this
 
 
@@ -33,8 +36,8 @@ def triangulated(
     Returns
     -------
     int64 (t, 3), in the order of the polygons: of each two triangles less than it has corners.
-    There are fewer if an outline crosses or touches itself or runs back on itself, such as around
-    a hole: the enclosed area is filled, and parts without area are left out.
+    There are fewer if a plane outline crosses or touches itself or runs back on itself, such as
+    around a hole: the enclosed area is filled, and parts without area are left out.
 
     Raises
     ------
@@ -57,6 +60,8 @@ def triangulated(
         if size > 4:
             for i in np.flatnonzero(_turns(vertices[rows]).any(axis=1)).tolist():
                 clipped = with_holes(vertices, [rows[i]])
+                if len(clipped) < size - 2 and _lost(vertices[rows[i]], vertices[clipped]):
+                    clipped = rows[i][_all_triangles(vertices[rows[i]])]
                 if len(clipped):  # else it has no area, nor has the fan
                     out[places[i]] = -1
                     out[places[i, : len(clipped)]] = clipped
@@ -91,7 +96,7 @@ def with_holes(vertices: NDArray[np.float64], rings: list[NDArray[np.int64]]) ->
         vertices[corners] - vertices[corners[0]]
     )  # local coordinates, so that far ones lose no digits
     outline = points[: len(rings[0])]
-    normal = np.cross(outline, np.roll(outline, -1, axis=0)).sum(axis=0)  # Newell
+    normal = _newell(outline)
     drop = int(np.abs(normal).argmax())
     across, up = (drop + 1) % 3, (drop + 2) % 3
     if normal[drop] < 0:  # the clipper's triangles run anticlockwise, whatever the polygon does
@@ -100,6 +105,54 @@ def with_holes(vertices: NDArray[np.float64], rings: list[NDArray[np.int64]]) ->
     flat = np.ascontiguousarray(points[:, [across, up]])
     found = mapbox_earcut.triangulate_float64(flat, ends).astype(np.int64)
     return corners[found].reshape(-1, 3)
+
+
+def _lost(points: Float, triangles: Float) -> bool:
+    """Whether a polygon (k, 3) is warped, and triangles (t, 3, 3) of it do not fill it.
+
+    The projection of a warped polygon may cross itself, where the clipper leaves triangles out.
+    All triangles together have the polygon's area vector, however it is cut.
+    """
+    points = points - points[0]
+    size = np.abs(points).max()
+    normal = _newell(points)
+    off = np.ptp(points @ normal)
+    a, b, c = np.moveaxis(triangles, 1, 0)
+    missing = normal - np.cross(b - a, c - a).sum(axis=0)
+    return bool(
+        off > _WARPED * size * np.linalg.norm(normal)
+        and np.linalg.norm(missing) > _WARPED * size**2
+    )
+
+
+def _all_triangles(points: Float) -> NDArray[np.int64]:
+    """Triangles (k - 2, 3) of a warped polygon (k, 3): clipped as seen along its normal, or a fan.
+
+    The fan is the one with the least area, which of a polygon with one reflex corner begins there.
+    """
+    count = len(points)
+    points = points - points[0]
+    normal = _newell(points)
+    normal = normal / np.linalg.norm(normal)
+    across = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+    flat = np.ascontiguousarray(points @ np.stack([across, np.cross(normal, across)], axis=1))
+    found = mapbox_earcut.triangulate_float64(flat, np.array([count], np.uint32))
+    if len(found) == 3 * (count - 2):
+        return found.astype(np.int64).reshape(-1, 3)
+    area = np.inf
+    for begin in range(count):
+        rest = np.roll(points, -begin, axis=0) - points[begin]
+        own = np.linalg.norm(np.cross(rest[1:-1], rest[2:]), axis=1).sum()
+        if own < area:
+            area, best = own, begin
+    corners = (best + np.arange(count)) % count
+    first = np.full(count - 2, corners[0])
+    return np.stack([first, corners[1:-1], corners[2:]], axis=1)
+
+
+def _newell(points: Float) -> Float:
+    """Twice the area vector of a polygon (k, 3) (Newell)."""
+    return np.asarray(np.cross(points, np.roll(points, -1, axis=0)).sum(axis=0))
 
 
 def _check(vertices: NDArray[np.float64], corners: NDArray[np.int64]) -> None:
