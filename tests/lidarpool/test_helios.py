@@ -212,6 +212,38 @@ def test_a_head_turns_from_start_to_stop_while_its_mirror_draws_lines(imported):
     assert of.begins_ns(3) == pytest.approx((25 / 12 + 0.001) * 1e9)
 
 
+def test_lines_over_the_zenith_go_down_behind(imported):
+    """As those of HELIOS++'s panoramic scanner, from -150 to 150 degrees."""
+    device = scanner(
+        "rotating",
+        "",
+        scanAngleMax_deg=180,
+        scanAngleEffectiveMax_deg=150,
+        headRotatePerSecMax_deg=60,
+    )
+    head = 'headRotatePerSec_deg="12" headRotateStart_deg="0" headRotateStop_deg="36"'
+    _, _, of = imported(
+        device, legs(f'pulseFreq_hz="1000" scanFreq_hz="20" {head}', (0, 0)), platform="tripod"
+    )
+    kept = [e for e in (-180 + 7.2 * k for k in range(50)) if -150 < e <= 150]
+    made = fired(of, 0, [3])[0]
+    assert len(made) == len(kept) == 41
+    there = [about(Z, 12 * (150 + k) / 1000) @ about(X, e) @ Y for k, e in enumerate(kept)]
+    order = [np.abs(made - one).sum(axis=1).argmin() for one in there]
+    assert sorted(order) == list(range(41))
+    assert np.allclose(made[order], there)
+
+
+def test_parts_that_move_are_told_in_one_line(imported):
+    part = GROUND.partition("<part>")[2].partition("</part>")[0]
+    moving = f'<part>{part}<dmotion id="m"/></part>'
+    scene = f'<scene id="field">{f"<part>{part}</part>"}{moving * 30}</scene>'
+    made, _, _ = imported(LASER, FLY, scene)
+    assert made.left_out == [
+        "<dmotion> of 30 parts, part 1 to part 30: they stand as they are at first"
+    ]
+
+
 def test_channels_of_a_mirror_that_stands_are_the_beams_of_a_head_that_turns(imported):
     origin = '<beamOrigin><rot axis="x" angle_deg="{}"/></beamOrigin>'
     beams = "".join(f'<channel id="{e}">{origin.format(e)}</channel>' for e in (-15, 15))

@@ -245,13 +245,11 @@ class _Line:
     def turning(self, head: float, tilt: float) -> dict[str, Any]:
         """Return a head whose firings are lines."""
         between_us = 1e6 / self.pulse_hz
-        ends = (self.first_deg + tilt, self.first_deg + tilt + (self.count - 1) * self.step_deg)
-        first, last = (clean(end) for end in ends)
         data = {
             "firing_us": _us(self.of_all, self.pulse_hz),
             "rate_hz": abs(head) / 360,
             "beams": {
-                "elevation_deg": {"first": first, "last": last, "count": self.count},
+                **self._elevations(tilt),
                 "time_us": {
                     "first": 0,
                     "last": clean((self.count - 1) * between_us),
@@ -260,6 +258,20 @@ class _Line:
             },
         }
         return data if head > 0 else {"clockwise": True, **data}
+
+    def _elevations(self, tilt: float) -> dict[str, Any]:
+        """Return the angles of the pulses; those beyond the zenith go down on the other side."""
+        angles = self.first_deg + tilt + self.step_deg * np.arange(self.count)
+        if np.abs(angles).max() <= 90 + _SLACK:
+            first, last = (clean(end) for end in angles[[0, -1]].clip(-90, 90))
+            return {"elevation_deg": {"first": first, "last": last, "count": self.count}}
+        angles = (angles + 180) % 360 - 180
+        behind = np.abs(angles) > 90
+        elevations = np.where(behind, np.copysign(180, angles) - angles, angles)
+        return {
+            "elevation_deg": clean(elevations),
+            "azimuth_deg": clean(np.where(behind, 180.0, 0.0)),
+        }
 
 
 def _mirror(

@@ -104,6 +104,7 @@ class Surroundings:
         self._assets = assets
         self.unread: list[str] = []
         self._missing: set[str] = set()
+        self._moving: dict[str, list[str]] = {"dmotion": [], "swap": []}  # parts by their motion
         self.parts: list[Part] = []
         name = f"scene {element.get('id')!r}"
         for index, part in enumerate(element.findall("part")):
@@ -120,9 +121,9 @@ class Surroundings:
                 self._let_fall(one)
 
     def _read(self, part: Element, name: str, assets: Assets) -> Iterator[Part]:
-        for tag in ("dmotion", "swap"):
+        for tag, moving in self._moving.items():
             if part.find(tag) is not None:
-                self.unread.append(f"<{tag}> of {name}: it stands as it is at first")
+                moving.append(name)
         files: list[Path] = []
         up, turn, scale, offset, falls = None, np.eye(3), 1.0, np.zeros(3), False
         for step in part.findall("filter"):
@@ -204,7 +205,16 @@ class Surroundings:
     def left_out(self) -> list[str]:
         """List the unsupported features, after everything was read."""
         missing = "; ".join(sorted(self._missing))
-        return self.unread + [f"onGround at {missing}: no ground there, so z is 0"] * bool(missing)
+        ground = [f"onGround at {missing}: no ground there, so z is 0"] if missing else []
+        return [*self._standing(), *self.unread, *ground]
+
+    def _standing(self) -> Iterator[str]:
+        for tag, parts in self._moving.items():
+            if len(parts) == 1:
+                yield f"<{tag}> of {parts[0]}: it stands as it is at first"
+            elif parts:
+                several = f"{len(parts)} parts, {parts[0]} to {parts[-1]}"
+                yield f"<{tag}> of {several}: they stand as they are at first"
 
 
 def _files(text: dict[str, str], assets: Assets) -> list[Path]:

@@ -81,7 +81,8 @@ def import_survey(
         partial.chmod(0o755)  # temporary folders are their owner's alone
         partial.rename(out)
     except LidarpoolError as error:
-        raise LidarpoolError(str(error).replace(str(partial), str(out))) from error
+        told = str(error).replace(str(partial), str(out))
+        raise LidarpoolError(f"{survey} makes no scenario: {told}") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return Imported(out / SCENARIO_FILE, Scenario.load(out / SCENARIO_FILE), made.left_out)
