@@ -622,8 +622,8 @@ def test_an_interrupt_leaves_nothing_of_what_threads_write(sweeps, cloud, tmp_pa
 
 
 def test_a_cloud_becomes_a_dataframe_of_a_library(cloud, monkeypatch):
-    assert list(cloud.to_dataframe().columns[:5]) == ["x", "y", "z", "scan", "ring"]
+    assert list(cloud.to_dataframe().columns[:5]) == ["x", "y", "z", "scan", "channel"]
     made = types.SimpleNamespace(DataFrame=dict)
     monkeypatch.setitem(sys.modules, "polars", made)  # which is not installed for one test
     frame = cloud.to_dataframe("polars")
-    np.testing.assert_array_equal(frame["ring"], cloud.channel)
+    np.testing.assert_array_equal(frame["channel"], cloud.channel)

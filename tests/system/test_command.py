@@ -329,3 +329,21 @@ def test_help_and_completion_load_nothing_of_a_run(words):
     loaded = {line.split("|")[-1].strip().split(".")[0] for line in done.stderr.splitlines()}
     assert "click" in loaded
     assert not {"numpy", "dask", "distributed", "pydantic", "rich", "trimesh"} & loaded
+
+
+@pytest.mark.parametrize("arguments", [["sensors"], ["run", "s.yaml", "--only", "cloud", "-q"]])
+def test_a_reader_that_leaves_ends_the_printing_only(tmp_path, arguments):
+    (tmp_path / "s.yaml").write_text("sensor: {layers: 2}\nplanning: {enabled: false}\n")
+    with subprocess.Popen(
+        [sys.executable, "-m", "lidarpool", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    ) as command:
+        assert command.stdout and command.stderr
+        command.stdout.close()  # as `head` does after its last line
+        assert command.stderr.read() == ""
+    assert command.returncode == 0
+    assert (tmp_path / "lidarpool-out" / "cloud.ply").exists() == (arguments[0] == "run")

@@ -7,6 +7,7 @@ can be looked at without running it is. Files, links and tests that documents na
 from __future__ import annotations
 
 import ast
+import doctest
 import importlib.util
 import re
 import runpy
@@ -307,3 +308,15 @@ def test_files_that_the_architecture_names_exist():
     assert [
         name for name in sorted(named) if not any(f"/{f}".endswith(f"/{name}") for f in tree)
     ] == []
+
+
+def test_the_docstring_of_simulate_says_what_is_printed(in_threads, capsys):
+    examples = doctest.DocTestParser().get_examples(lidarpool.simulate.__doc__ or "")
+    names: dict[str, Any] = {}
+    for example in examples:
+        exec(example.source, names)
+    assert capsys.readouterr().out == "".join(example.want for example in examples) != ""
+
+
+def test_completion_offers_what_is_public():
+    assert dir(lidarpool) == sorted(lidarpool.__all__)

@@ -98,11 +98,13 @@ def test_a_column_of_ones_own_is_what_its_function_makes(result):
 def test_a_result_tells_of_itself_and_its_points_become_frames_and_clouds(result):
     told = repr(result)
     assert told.startswith("survey: 60 scans, 28,800 rays")
-    assert f"cloud: {len(result.cloud):,} points: x, y, z, scan, ring, object, brightness" in told
+    assert (
+        f"cloud: {len(result.cloud):,} points: x, y, z, scan, channel, object, brightness" in told
+    )
     assert result._repr_html_().count("<tr>") == len(told.splitlines())
     cloud = result.cloud
     frame, lazy = cloud.to_dataframe(), result.points.to_dask()
-    assert list(frame) == [*"xyz", "scan", "ring", "object", "brightness", *frame.columns[7:]]
+    assert list(frame) == [*"xyz", "scan", "channel", "object", "brightness", *frame.columns[7:]]
     np.testing.assert_array_equal(frame["z"], cloud.positions[:, 2])
     assert lazy.npartitions == sum(rows > 0 for rows in result.points.rows)
     np.testing.assert_array_equal(lazy.compute()["time"], cloud["time"])

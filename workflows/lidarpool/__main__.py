@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NoReturn
+import sys
+from typing import NoReturn, TextIO, cast
 
 from .base.interrupts import end_on_signals
 
@@ -11,8 +12,11 @@ def main() -> NoReturn:
     """Run the command, see `cli.main`."""
     end_on_signals()
     # A second of imports, during which an interrupt would print Python's traceback.
+    from .base.streams import Unheard
     from .cli.commands import main as command
 
+    if sys.stdout is not None:  # `lidarpool run … | head -3` runs to its end
+        sys.stdout = cast(TextIO, Unheard(sys.stdout, BrokenPipeError))
     command()
 
 

@@ -184,7 +184,7 @@ class Result(RunResult):
             f"{counted(len(self.objects), 'object')} ({self.backend}, "
             f"{self.survey_seconds:.1f} s)",
         )
-        names = ", ".join(("x", "y", "z", *(column.in_files for column in self.points.table)))
+        names = ", ".join(("x", "y", "z", *(column.name for column in self.points.table)))
         yield "cloud", f"{counted(len(self.points), 'point')}{self.thinned}: {names}"
         if self.plan is not None:
             free = "free of collisions" if self.plan.collision_free else "not free of collisions"

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from typing import Any, TextIO, cast
 
 from rich.console import Console
 
+from ..base.streams import Unheard
 from ..run.bars import Pace, bars, standing_still
 from ..run.progress import STAGES, Progress, Show
 
@@ -32,7 +32,7 @@ def shown_progress(quiet: bool = False) -> Iterator[Show]:
         with bars(console) as show:
             yield show
     else:
-        yield PlainLines(_Unheard(sys.stderr))
+        yield PlainLines(Unheard(sys.stderr))
 
 
 @contextmanager
@@ -45,42 +45,20 @@ def shown_status(text: str, quiet: bool = False, logged: bool = True) -> Iterato
             yield
     else:
         if logged:
-            _tell(_Unheard(sys.stderr), text)
+            _tell(Unheard(sys.stderr), text)
         yield
 
 
 def tell(words: str) -> None:
     """Print a line on stderr; ignore a closed stream."""
     if sys.stderr is not None:
-        _Unheard(sys.stderr).write(f"{words}\n")
+        Unheard(sys.stderr).write(f"{words}\n")
 
 
 def _terminal() -> Console | None:
     """Console of a terminal that can move its cursor; None without one."""
-    console = Console(file=cast(TextIO, _Unheard(sys.stderr)))
+    console = Console(file=cast(TextIO, Unheard(sys.stderr)))
     return console if console.is_terminal and not console.is_dumb_terminal else None
-
-
-class _Unheard:
-    """A stream whose writes do not fail: a terminal may be closed during a run."""
-
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._stream, name)
-
-    def write(self, text: str) -> int:
-        try:
-            self._stream.write(text)
-            self._stream.flush()
-        except OSError:  # its buffer would fail again when Python exits
-            with suppress(OSError):
-                os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
-        return len(text)
-
-    def flush(self) -> None:
-        """Do nothing: `write` flushes."""
 
 
 def _tell(stream: Any, line: str) -> None:

@@ -180,9 +180,9 @@ class Cloud(Savable):
 
     @checked
     def to_dataframe(self, library: Literal["pandas", "polars"] = "pandas") -> Any:
-        """Return a DataFrame of pandas or polars with all columns, by their names in files."""
+        """Return a DataFrame of pandas or polars with all columns."""
         columns = dict(zip("xyz", self.positions.T, strict=True))
-        columns |= {column.in_files: self[column.name] for column in self.table}
+        columns |= {column.name: self[column.name] for column in self.table}
         return import_module(library).DataFrame(columns)
 
     def to_open3d(self) -> Any:

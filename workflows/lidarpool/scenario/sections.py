@@ -317,7 +317,7 @@ class CloudSection(Section):
         tuple[Literal[COLUMN_NAMES], ...],  # type: ignore[valid-type]
         Strict(False),
         Field(
-            description="columns in addition to x, y, z, scan, ring and object: "
+            description="columns in addition to x, y, z, scan, channel and object: "
             + ", ".join(COLUMN_NAMES),
             examples=[["time", "range", "intensity"]],
         ),
