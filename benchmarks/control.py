@@ -2,7 +2,8 @@
 
 Bytes: a survey on a cluster of this machine, whose scheduler is in the driver's process, so that
 all that either sends or receives passes here and is counted by kind of message. It is run with
-every fifth point kept and with all of them: what grows with points would show.
+every fifth point kept and with all of them: what grows with points would show. And it is run in
+batches of one scan: what comes with each batch.
 
 Receipts: a cluster of workers in this process whose casting and storage answer at once, so that
 what is left is what driver, scheduler, pipes and database take for each part.
@@ -55,6 +56,13 @@ class Counted:
     def scheduler(self) -> Counter[str]:
         """What the scheduler sent and received: all of its connections end at one address."""
         return max(self._bytes.values(), key=lambda counts: sum(counts.values()))
+
+
+    def work(self, *, driver: bool = False) -> int:
+        """Bytes that came with work: at the scheduler, or at all other ends in this process."""
+        ends = self._bytes.values()
+        counted = [counts for counts in ends if (counts is not self.scheduler) == driver]
+        return sum(n for counts in counted for kind, n in counts.items() if kind not in UPKEEP)
 
 
 def _kind(message: Any) -> str:
@@ -139,6 +147,20 @@ def count_bytes(scans: int) -> None:
     )
 
 
+def count_batches(batches: int) -> None:
+    """Print bytes a batch: what more batches of one scan add at the scheduler and at the driver."""
+    ends = {}
+    for count in (batches, 3 * batches):
+        with counting() as counted, patch.object(lidarpool.scan.driver, "BATCH_RAYS", 1):
+            simulate(Scene.seed(), small_survey(count, 5))
+        ends[count] = counted.work(), counted.work(driver=True)
+    scheduler, driver = (np.array(ends[3 * batches]) - ends[batches]) / (2 * batches)
+    print(
+        f"a further batch of one scan adds {scheduler:,.0f} bytes at the scheduler and "
+        f"{driver:,.0f} at the driver"
+    )
+
+
 def sustain(parts: int) -> None:
     """Print what one driver sustains where everything else answers at once."""
     sensor = Sensor.grid(rays_per_revolution=360, layers=1, step_deg=360)
@@ -195,6 +217,7 @@ def main() -> None:
     parser.add_argument("--parts", type=int, default=2_000)
     given = parser.parse_args()
     count_bytes(given.scans)
+    count_batches(min(360, given.scans))
     sustain(given.parts)
 
 
