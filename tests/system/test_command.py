@@ -174,7 +174,7 @@ def test_without_planning_an_earlier_path_is_removed(run, tmp_path):
     (tmp_path / "out").mkdir()
     for name in ("path.png", "mine.txt"):
         (tmp_path / "out" / name).write_text("earlier")
-    outcome = run("--no-plan", "--quiet")
+    outcome = run("--no-plan", "--quiet", "--overwrite")
     assert (outcome.code, outcome.err) == (0, "")
     assert names_in(tmp_path / "out") == {*FILES, "mine.txt"} - {"path.png"}
     assert "path of" not in outcome.out and "path.png" not in outcome.out
