@@ -25,6 +25,7 @@ from .workers import on_scheduler
 
 PATIENCE_S = 60.0  # for a worker to answer
 _RETURN_S = 10.0  # for workers to declare their former resources, at least
+_STAY_S = 1.0  # for workers that could not be moved to be members again
 _LOOK_EVERY_S = 0.05  # between looks for tasks that have not ended
 _UNFINISHED = ("waiting", "queued", "no-worker", "processing")
 
@@ -208,7 +209,7 @@ async def _move(
         steward.resize(origin, 1)
         steward.put(seat, origin, slots)
     if late:
-        steward.settle(late)
+        await steward.arrive(late, _STAY_S)  # so that they can be moved again at once
         raise PoolError(
             f"{len(late)} of {len(seats)} workers could not be moved within "
             f"{timeout_s:g} s, because their tasks have not ended: {names_of(late)} stay."

@@ -475,9 +475,16 @@ def tell_of_plugin(scheduler: Any, name: str, plugin: bytes | None) -> list[asyn
 
     Returns the requests under way. A worker that does not answer is in the log.
     """
+
+    # Nested, so that it is sent by value. A worker that is closing has taken it off already, for
+    # which Dask's own `plugin-remove` would write a traceback into its log.
+    def remove(dask_worker: Any = None) -> None:
+        if found := dask_worker.plugins.pop(name, None):
+            found.teardown(dask_worker)
+
     if plugin is None:
         scheduler.worker_plugins.pop(name, None)
-        message: dict[str, Any] = {"op": "plugin-remove", "name": name}
+        message: dict[str, Any] = {"op": "run", "function": dumps(remove)}
     else:
         scheduler.worker_plugins[name] = plugin
         message = {"op": "plugin-add", "name": name, "plugin": plugin}
