@@ -68,6 +68,8 @@ def make_plan(
         *chain.from_iterable(others),
         *((chance.choice(KINDS), point, "LIDAR") for point in driver_points),
     ]
+    # Where a stage starts there may be no part yet.
+    at = [one for one in at if one[0] != DAMAGE or not one[1].endswith(".start")]
     while len(at) < count:
         at.append((KINDS[len(at) % len(KINDS)], RANDOM, chance.choice(PARTITIONS)))
     at = at[:count]
