@@ -73,7 +73,7 @@ def test_summaries_that_kill_the_sorter_end_the_run(client, sabotage, monkeypatc
 
 @pytest.mark.slow
 def test_a_scene_that_kills_its_workers_ends_the_run(client, monkeypatch, left_over):
-    monkeypatch.setattr(lidarpool.scan.workers, "_preparation", lambda _: _deadly())
+    monkeypatch.setattr(lidarpool.scan.workers, "_preparation", lambda *_: _deadly())
     with pytest.raises(LidarpoolError, match="preparing the scene on the GPU workers has killed"):
         simulate(Scene.seed(), SURVEY, client=client)
     assert left_over(client) == ([], [], [])
