@@ -4,8 +4,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lidarpool.run.checks import gpu_note
 from lidarpool.run.local import default_workers, local_cluster
-from poolpart import PoolError
+from poolpart import PoolError, WorkerInfo
 
 
 @given(cores=st.integers(1, 256), gpus=st.integers(0, 16))
@@ -22,3 +23,18 @@ def test_counts_that_cannot_be(given):
     (count,) = given.values()
     with pytest.raises(PoolError, match=f"is {count}; give a whole number"):
         local_cluster(**given)
+
+
+@pytest.mark.parametrize(
+    ("gpus", "backend", "says"),
+    [
+        (((), ()), "embree", ""),
+        ((("GPU-1",), ()), "cuda", ""),
+        ((("GPU-1",), ()), "embree", "the GPUs of partition GPU are not used"),
+        (((), ("GPU-1",)), "embree", "no GPU in partition GPU: CPU workers cast the rays"),
+    ],
+)
+def test_of_gpus_is_spoken_only_where_there_is_one_that_stays_idle(gpus, backend, says):
+    casting, other = (WorkerInfo(str(i), str(i), "host", 1, gpus=g) for i, g in enumerate(gpus))
+    note = gpu_note([casting, other], [casting], backend)
+    assert note.startswith(says) and bool(note) == bool(says)

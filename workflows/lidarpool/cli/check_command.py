@@ -127,7 +127,10 @@ def told(job: Job, found: dict[str, Any]) -> Iterator[str]:
             f"from {estimate['rays']:,} rays cast here"
         )
     yield f"planning    {f'{job.trials:,} trials' if job.trials else 'none'}"
-    yield f"backend     {found['backend'] or 'none yet'}{' (auto)' * (job.backend == 'auto')}"
+    backend = found["backend"]
+    kind = {None: "", "cuda": "GPU "}.get(backend, "CPU ")
+    workers = counted(found["casters"], f"{kind}worker")
+    yield f"cast by     {workers} ({backend or 'backend not known yet'})"
     for name, slots in found["slots"].items():
         yield f"{name:<10}  {counted(slots['there'], 'slot')}, at least {slots['needed']:,} needed"
     there = found["memory"]["there"]

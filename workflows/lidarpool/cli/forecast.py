@@ -25,7 +25,7 @@ from ..columns.cloud import CHUNK_POINTS
 from ..columns.storage import Storage
 from ..export.formats import Format
 from ..report.output import ROOM_BYTES, refuse_to_replace
-from ..run.checks import check_backend_here, find_workers, slots_needed
+from ..run.checks import check_backend_here, find_workers, gpu_note, slots_needed
 from ..run.cluster_file import ClusterFile
 from ..run.identity import identity_of
 from ..run.job import Job
@@ -115,7 +115,7 @@ def forecast(
         except LidarpoolError as error:
             reasons.append(str(error))
     slots = _slots(job, pool, client, file)
-    backend, memory = None, MEMORY_LIMIT
+    backend, memory, casters = None, MEMORY_LIMIT, slots[GPU]["there"]
     try:
         if file is not None:
             memory = 0  # of machines that are not there yet
@@ -124,10 +124,13 @@ def forecast(
             backend = _backend_here(job.backend)
         else:
             planning = job.planning is not None
-            _, casting, backend, _ = find_workers(client, job.collectors, planning, job.backend)
+            pool_there, casting, backend, _ = find_workers(
+                client, job.collectors, planning, job.backend
+            )
             memory = min((worker.memory for worker in casting if worker.memory), default=0)
-            if not any(worker.gpus for worker in casting):
-                notes.append(f"no GPU in partition GPU: CPU workers cast the rays with {backend}")
+            casters = len(casting)
+            if note := gpu_note(pool_there, casting, backend):
+                notes.append(note)
     except (LidarpoolError, PoolError) as error:
         reasons.append(str(error))
     sample = None
@@ -171,6 +174,7 @@ def forecast(
         "estimate": asdict(sample) if sample else None,
         "trials": job.trials,
         "backend": backend,
+        "casters": casters,
         "slots": slots,
         "memory": {"needed": needed, "there": memory or None},
         "disk": {"parts": parts, "result": result, "free": free, "folder": str(folder)},

@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -199,6 +199,15 @@ def common_software(
     counts = Counter(tuple(answer.items()) for answer in answers.values())
     most = max(counts, key=lambda one: (counts[one], one))
     return dict(earlier) if earlier else dict(most)
+
+
+def gpu_note(pool: Iterable[WorkerInfo], casting: Sequence[WorkerInfo], backend: str) -> str:
+    """Say that GPUs of a cluster stay idle; empty if it has none, or they are used."""
+    if backend == "cuda" or not any(worker.gpus for worker in pool):
+        return ""
+    if any(worker.gpus for worker in casting):
+        return f"the GPUs of partition GPU are not used: the rays are cast with {backend}"
+    return f"no GPU in partition GPU: CPU workers cast the rays with {backend}"
 
 
 def common_backend(

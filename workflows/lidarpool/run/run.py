@@ -32,7 +32,7 @@ from ..scan import (
     SurveyDriver,
     Watch,
 )
-from .checks import find_workers
+from .checks import find_workers, gpu_note
 from .progress import Progress
 from .result import RunResult
 from .store import RunStore
@@ -105,9 +105,8 @@ class Run:
         self._pool = pool
         names = sorted({name for worker in pool for name in worker.partitions})
         self.partitions = {name: Partition(name, client) for name in names}
-        self.notes: list[str] = []
-        if not any(worker.gpus for worker in casting):
-            self.notes.append(f"no GPU in partition GPU: CPU workers cast the rays with {backend}")
+        note = gpu_note(pool, casting, backend)
+        self.notes: list[str] = [note] if note else []
         self.callers_error: BaseException | None = None  # raised by a callback
 
     def _told_lost(self) -> LidarpoolError:
