@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections import namedtuple
 from collections.abc import Callable, Iterator
@@ -10,6 +11,7 @@ from typing import Any
 
 import pytest
 import trimesh
+import yaml
 from distributed import Client
 from tests.clusters import thread_cluster
 
@@ -133,13 +135,29 @@ def test_a_backend_that_is_not_here(check, monkeypatch):
         pytest.skip("there is a GPU")
     outcome = check("--backend", "cuda")
     assert outcome.code == 2 and "it cannot run. Backend 'cuda' cannot be used" in outcome.err
-    assert "backend     none yet" in outcome.out
+    assert re.search(r"^cast by     \d+ workers? \(backend not known yet\)$", outcome.out, re.M)
 
 
 def test_a_survey_that_hits_nothing_is_told_of(check):
     outcome = check("--json", text=json.dumps(SHORT | {"poses": [[0, 0, 1000]]}))
     assert outcome.code == 0
-    assert "no ray hit anything" in json.loads(outcome.out)["notes"][0]
+    note = json.loads(outcome.out)["notes"][0]
+    assert "no ray hit anything" in note
+    poses = yaml.safe_load(note.partition("poses: ")[2])
+    seen = check("--json", text=json.dumps(SHORT | {"poses": poses}))
+    assert json.loads(seen.out)["estimate"]["hits"] > 0
+
+
+def test_an_object_is_looked_at_from_around_it_and_no_gpu_is_spoken_of(tmp_path, lidarpool):
+    (tmp_path / "ball.stl").write_bytes(trimesh.creation.icosphere(3, 0.5).export(file_type="stl"))
+    outcome = lidarpool("check", tmp_path / "ball.stl")
+    assert outcome.code == 0
+    assert "from 5 poses" in outcome.out and "points      about 0 " not in outcome.out
+    assert "note: this looks like an object of 1 x 1 x 1 m, not a place to stand in" in outcome.out
+    assert "no GPU" not in outcome.out
+    backend = next(name for name, missing in available_backends().items() if not missing)
+    kind = "GPU" if backend == "cuda" else "CPU"
+    assert re.search(rf"^cast by     \d+ {kind} workers? \({backend}\)$", outcome.out, re.M)
 
 
 def test_an_unfinished_run_is_told_of(check, tmp_path):
@@ -154,7 +172,7 @@ def test_a_cluster_that_can_do_it(check, cluster):
     outcome = check("--scheduler", cluster, "--no-plan")
     assert outcome.code == 0, outcome.err
     assert "LIDAR       4 slots, at least 4 needed" in outcome.out
-    assert "no GPU in partition GPU" in outcome.out
+    assert "no GPU in partition GPU" not in outcome.out, "nobody expects one"
     assert f"--scheduler {cluster} --no-plan" in outcome.out.splitlines()[-1]
 
 

@@ -49,7 +49,8 @@ def test_init_with_meshes_names_them_as_seen_from_the_scenario(tmp_path, lidarpo
     ]
     assert len(made.build_scene().names) == 2
     assert (made.cloud.keep_every, made.cloud.precision_m) == (None, 0.001)
-    rest = {"scene": {"files", "preset"}, "cloud": True}
+    assert made.poses is not None and len(made.poses) == 5, "around boxes of a millimetre"
+    rest = {"scene": {"files", "preset"}, "cloud": True, "poses": True}
     assert made.model_dump(exclude=rest) == Scenario().model_dump(exclude=rest)
 
 

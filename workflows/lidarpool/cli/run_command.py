@@ -34,6 +34,7 @@ from ..run.store import RUN_FOLDER, RunStore, remove_run
 from ..run.waiting import Waiting
 from ..scan import LIDAR
 from ..scan.database import FILE
+from ..scenario.placing import seen_from
 from ..scenario.scenario import Scenario
 from .logs import set_logs
 from .terminal import shown_progress, shown_status, tell
@@ -180,7 +181,8 @@ def no_hits(job: Job) -> str:
     """Return advice for a survey without hits."""
     (x, y, z) = job.survey.pose(0).position + job.scene.origin
     where = f"the sensor begins at ({x:,.3f}, {y:,.3f}, {z:,.3f})"
-    return f"no ray hit anything: check poses, ranges and units; {where}"
+    seen = seen_from(job.scene, job.survey.carried[0])
+    return f"no ray hit anything: check poses, ranges and units; {where}; {seen}"
 
 
 def formats_of(scenario: Scenario) -> list[Format]:

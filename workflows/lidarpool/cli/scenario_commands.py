@@ -45,6 +45,7 @@ def init(folder: Path, meshes: tuple[Path, ...], unit: str | None, up_axis: str 
       lidarpool init
       lidarpool init surveys/hall --mesh hall.stl --unit mm
     """  # noqa: D301 - click wants the character, not its name
+    from ..scenario.scenario import Scenario
     from ..scenario.schema import SCHEMA_FILE, schema_text
     from ..scenario.template import SCENARIO_FILE, scenario_template
 
@@ -52,10 +53,16 @@ def init(folder: Path, meshes: tuple[Path, ...], unit: str | None, up_axis: str 
         raise click.UsageError("--unit and --up-axis say how to read a mesh: name it with --mesh.")
     target = folder / SCENARIO_FILE
     entries = [_entry(path, folder, unit, up_axis) for path in meshes]
+    placing, notes = None, []
+    if meshes and not target.exists():
+        there = [e | {"file": str(p.absolute())} for e, p in zip(entries, meshes, strict=True)]
+        read = Scenario.from_data({"scene": {"files": there}}, source=str(target))
+        scene = read.build_scene()
+        placing, notes = read.placing(scene), read.advice(scene)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with target.open("x", encoding="utf-8", newline="\n") as file:
-            file.write(scenario_template(entries))
+            file.write(scenario_template(entries, placing))
         (folder / SCHEMA_FILE).write_text(schema_text(), encoding="utf-8", newline="\n")
     except FileExistsError as error:
         raise LidarpoolError(
@@ -66,6 +73,8 @@ def init(folder: Path, meshes: tuple[Path, ...], unit: str | None, up_axis: str 
     if meshes:
         listed = ", ".join(click.format_filename(path) for path in meshes)
         click.echo(f"{name} is a survey of {listed}: change what you like.")
+        for note in notes:
+            click.echo(f"note: {note}")
     else:
         click.echo(f"{name} is the default survey: change what you like.")
         click.echo("for a mesh of your own: lidarpool init DIR --mesh FILE [--unit mm]")

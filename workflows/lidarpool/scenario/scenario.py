@@ -14,18 +14,18 @@ import numpy as np
 from pydantic import Field, PrivateAttr, Strict, ValidationError
 
 from ..base.errors import LidarpoolError, Mistakes
-from ..base.words import did_you_mean
+from ..base.words import counted, did_you_mean
 from ..base.yamlfile import read_yaml
 from ..plan import Planning
 from ..scene.actors import Actor, box, one_mesh
-from ..scene.floor import room_at
 from ..scene.mesh import Mesh
-from ..scene.meshfile import SUFFIXES, UNITLESS, load_meshes
+from ..scene.meshfile import SUFFIXES, UNITLESS, load_meshes, wrote_it
 from ..scene.scene import Scene
 from ..scene.shapes import seed_objects
 from ..sensor import Material, Mounted, Noise, Pose, Returns, Survey
 from ..sensor.survey import SENSORS_MOST, STEPS_MOST
 from .moving import ActorSection, CarriedSection, MountSection, TrajectoryEntry
+from .placing import Placing, inside_note, place
 from .sections import (
     CloudSection,
     Ground,
@@ -50,13 +50,14 @@ from .validation_errors import validation_errors
 # Objects lower than this are floors and markings, which a path may cross.
 FLAT_M = 0.2
 
-# Sizes of scenes in metres are between these. An .stl is mostly a part, in millimetres.
-LARGE_M, LARGE_STL_M, SMALL_M = 500.0, 20.0, 0.2
+# Sizes of scenes in metres are between these. An .stl is mostly a part, in millimetres; an object
+# to look at from outside is rarely longer than a bus.
+LARGE_M, LARGE_STL_M, LARGE_OBJECT_M, SMALL_M = 500.0, 20.0, 10.0, 0.2
 
 SEED_START = (25.0, 25.0)
 SEED_TARGET = (-30.0, -20.0)
-# Heights of the sensor, if no poses are given; and its least distance from the ceiling.
-_HEIGHTS_M, _BELOW_M = (1.0, 2.0, 3.0), 0.2
+SEED_POSES = tuple(Pose((0.0, 0.0, height)) for height in (1.0, 2.0, 3.0))
+_LOOKED_FROM = 8  # positions, if poses or a trajectory are given
 
 # Of the hits in a scene with the default objects, every so many are kept.
 SEED_KEPT = 5
@@ -76,9 +77,8 @@ class Scenario(Section):
         See `lidarpool.scenario.sections`.
     poses
         Poses of the sensor, in world coordinates. By default it stands at the origin (default
-        objects) or in the middle of the scene (mesh files), 1, 2 and 3 metres above the ground
-        or floor there, or at a quarter, half and three quarters of the height of a lower room;
-        see `room_at`.
+        objects), 1, 2 and 3 metres above the ground; in mesh files where `place` puts it: in the
+        middle of a room or landscape, or around an object.
     steps
         Time steps from each pose.
 
@@ -98,7 +98,7 @@ class Scenario(Section):
             max_length=1_000_000,
             description="poses of the sensor, world metres, Z-up; by default 1, 2 and 3 m "
             "above the origin (default objects) or the middle of the floor (files), below the "
-            "ceiling",
+            "ceiling, or around an object that is no place to stand in",
             examples=[[[0, 0, 1], [0, 0, 2], {"position": [0, 0, 3], "yaw_deg": 90}]],
         ),
     ] = None
@@ -167,7 +167,8 @@ class Scenario(Section):
     _folder: Path = PrivateAttr(default=Path())  # that relative file names start from
     _source: str = PrivateAttr(default="the default survey")  # for messages
     _notes: list[str] = PrivateAttr(default_factory=list)  # about objects left out of the scene
-    _remarks: list[str] = PrivateAttr(default_factory=list)  # about files rotated to Z-up
+    _remarks: list[str] = PrivateAttr(default_factory=list)  # about axes of files
+    _placing: Placing | None = PrivateAttr(default=None)  # if no poses are given
 
     @classmethod
     def load(cls, path: str | Path) -> Scenario:
@@ -263,28 +264,49 @@ class Scenario(Section):
     def advice(self, scene: Scene) -> list[str]:
         """Return notes on likely mistakes, such as a size that suggests another unit.
 
-        Also on objects that `build_scene` left out, and on files that it turned to Z-up.
+        Also on objects that `build_scene` left out, on files whose axes it guessed, and on where
+        the sensor is.
         """
         notes = [*self._notes, *self._remarks[:1]]
         if self._remarks[1:]:
-            notes[-1] += f"; {len(self._remarks) - 1:,} more files were turned, too"
+            notes[-1] += f"; {counted(len(self._remarks) - 1, 'more file')}, too"
+        poses = self._of_poses(scene)  # first, because that finds out whether it is an object
+        return [*notes, *filter(None, (self._of_size(scene), poses))]
+
+    def _of_size(self, scene: Scene) -> str:
         unitless = [
             entry.file
             for entry in self.scene.files
-            if entry.unit is None and Path(entry.file).suffix.lower() in UNITLESS
+            if entry.unit is None
+            and Path(entry.file).suffix.lower() in UNITLESS
+            and not wrote_it(self._path(entry.file))
         ]
         side = float(np.ptp(scene.bounds, axis=0).max())
         parts = any(file.lower().endswith(".stl") for file in unitless)
-        large = LARGE_STL_M if parts else LARGE_M
-        if not unitless or SMALL_M <= side <= large:
-            return notes
+        least, large = SMALL_M, LARGE_STL_M if parts else LARGE_M
+        if self._placing is not None and self._placing.around:
+            least, large = 0.0, LARGE_OBJECT_M
+        if not unitless or least <= side <= large:
+            return ""
         unit = "mm" if side > large else "km"
-        return [
-            *notes,
+        return (
             f"{unitless[0]} states no unit, and in metres the scene is {side:,.5g} m long. If that "
             f"is wrong, give the file's unit ({unit}?) in scene.files (lidarpool init DIR --mesh "
-            f"FILE --unit {unit} writes such a scenario)",
-        ]
+            f"FILE --unit {unit} writes such a scenario)"
+        )
+
+    def _of_poses(self, scene: Scene) -> str:
+        if self.poses is None and self.trajectory is None:
+            return "" if self.scene.has_seed else self.placing(scene).note
+        if self.scene.has_seed:
+            return ""
+        if self.trajectory is not None:
+            track = self.trajectory.track(self._folder, scene.origin)
+            at, _ = track.poses(0, np.linspace(0, track.duration_ns, _LOOKED_FROM))
+        else:
+            positions = [pose.position for pose in self._world_poses(scene)]
+            at = np.array(positions[:: -(-len(positions) // _LOOKED_FROM)]) - scene.origin
+        return inside_note(scene, at, self._carried())
 
     def build_scene(self) -> Scene:
         """Read the mesh files and build the scene.
@@ -296,6 +318,7 @@ class Scenario(Section):
         """
         self._notes.clear()
         self._remarks.clear()
+        self._placing = None
         meshes: list[Mesh] = list(seed_objects()) if self.scene.has_seed else []
         mistakes = Mistakes()
         for entry in self.scene.files:
@@ -340,20 +363,19 @@ class Scenario(Section):
         LidarpoolError
             If fields are valid by themselves and do not fit together.
         """
-        x0, y0, z0 = scene.origin
         with self._named():
-            track, poses = None, []
+            track, poses, sensors = None, [], self._sensors()
             if self.trajectory is not None:
                 track = self.trajectory.track(self._folder, scene.origin)
             else:
                 poses = [
-                    Pose((x - x0, y - y0, z - z0), yaw, pitch, roll)
-                    for (x, y, z), yaw, pitch, roll in self._world_poses(scene)
+                    replace(pose, position=tuple(np.subtract(pose.position, scene.origin)))
+                    for pose in self._world_poses(scene)
                 ]
             return Survey(
                 poses=poses,
                 trajectory=track,
-                **self._sensors(),
+                **sensors,
                 coordinates=self.cloud.coordinates,
                 steps=self.steps,
                 keep_every=self.cloud.keep_every or (SEED_KEPT if self.scene.has_seed else 1),
@@ -414,37 +436,37 @@ class Scenario(Section):
 
     def _read(self, entry: MeshFile) -> tuple[Mesh, ...]:
         with self._named():
-            try:
-                path = self._folder / Path(entry.file).expanduser()
-            except RuntimeError as error:  # ~name of an unknown user
-                raise LidarpoolError(f"the file {entry.file!r} cannot be found: {error}") from error
-            transform = entry.transform()
+            path, transform = self._path(entry.file), entry.transform()
         return load_meshes(
             path,
             unit=entry.unit,
             up_axis=entry.up_axis,
             transform=transform,
             tell=self._notes.append,
-            remark=self._remarks.append,
+            axes=self._remarks.append,
         )
 
-    def _world_poses(
-        self, scene: Scene
-    ) -> Iterator[tuple[tuple[float, float, float], float, float, float]]:
-        """Position and angles of each pose, in world coordinates."""
+    def _path(self, file: str) -> Path:
+        try:
+            return self._folder / Path(file).expanduser()
+        except RuntimeError as error:  # ~name of an unknown user
+            raise LidarpoolError(f"the file {file!r} cannot be found: {error}") from error
+
+    def _world_poses(self, scene: Scene) -> tuple[Pose, ...]:
         if self.poses is not None:
-            for pose in self.poses:
-                yield pose.position, pose.yaw_deg, pose.pitch_deg, pose.roll_deg
-            return
-        x, y, floor, heights = 0.0, 0.0, 0.0, [*_HEIGHTS_M]
-        if not self.scene.has_seed:
-            low, high = scene.bounds + scene.origin
-            x, y = (low[:2] + high[:2]) / 2
-            floor, ceiling = room_at(scene, x, y)
-            if floor + heights[-1] > ceiling - _BELOW_M:
-                heights = [(ceiling - floor) * share for share in (0.25, 0.5, 0.75)]
-        for height in heights:
-            yield (float(x), float(y), float(floor + height)), 0.0, 0.0, 0.0
+            return tuple(pose.pose() for pose in self.poses)
+        return SEED_POSES if self.scene.has_seed else self.placing(scene).poses
+
+    def placing(self, scene: Scene) -> Placing:
+        """Where the sensor is put in a scene from mesh files, if no poses are given."""
+        if self._placing is None:
+            self._placing = place(scene, self._carried())
+        return self._placing
+
+    def _carried(self) -> Mounted:
+        """Return the first sensor."""
+        sensors = self._sensors()
+        return sensors["sensors"][0] if "sensors" in sensors else Mounted(sensors["sensor"])
 
     def _discs(self, scene: Scene) -> tuple[np.ndarray[Any, np.dtype[np.float64]], list[str]]:
         """Obstacles as local x, y, radius (m, 3), and a label for each."""

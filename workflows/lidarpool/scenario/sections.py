@@ -12,7 +12,7 @@ from ..base.arguments import shown
 from ..base.vocabulary import BACKENDS, FORMATS, LAYOUTS, columns_needed
 from ..columns.table import COORDINATES, OPTIONAL
 from ..scene.transform import Transform
-from ..sensor import Sensor
+from ..sensor import Pose, Sensor
 from ..sensor.disc import SUBRAYS
 from ..sensor.models import load_sensor
 from ..sensor.optics import MODES
@@ -272,6 +272,10 @@ class PoseSection(Section):
     yaw_deg: Annotated[Angle, Field(description="rotation about z, first")] = 0.0
     pitch_deg: Annotated[Angle, Field(description="rotation about the new y, second")] = 0.0
     roll_deg: Annotated[Angle, Field(description="rotation about the new x, last")] = 0.0
+
+    def pose(self) -> Pose:
+        """Return the pose, world coordinates."""
+        return Pose(self.position, self.yaw_deg, self.pitch_deg, self.roll_deg)
 
 
 def _pose(value: Any) -> Any:

@@ -10,6 +10,7 @@ import yaml
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
+from .placing import Placing, as_entry
 from .scenario import MESH_CLOUD, Scenario
 from .schema import SCHEMA_FILE
 
@@ -29,20 +30,25 @@ _HEAD = f"""\
 """
 
 
-def scenario_template(files: Sequence[dict[str, str]] = ()) -> str:
+def scenario_template(files: Sequence[dict[str, str]] = (), placing: Placing | None = None) -> str:
     """Return a commented scenario in YAML that holds all defaults.
 
     Parameters
     ----------
     files
         Mesh files to survey, as in `scene.files`.
+    placing
+        Where the sensor is put in them; its poses are written if they are around an object.
     """
     lines = [_HEAD]
     given: dict[str, dict[str, Any]] = {}
     if files:
         given = {"scene": {"files": list(files)}, "cloud": MESH_CLOUD}
     for name, field in Scenario.model_fields.items():
-        lines += ["\n", *(f"{line}\n" for line in _top(name, field, given.get(name, {})))]
+        body = [*_top(name, field, given.get(name, {}))]
+        if name == "poses" and placing is not None:
+            body = [*_placed(placing), *body] if not placing.around else [*_placed(placing)]
+        lines += ["\n", *(f"{line}\n" for line in body)]
     return "".join(lines)
 
 
@@ -62,6 +68,20 @@ def _top(name: str, field: FieldInfo, given: dict[str, Any]) -> Iterator[str]:
             yield from _beside(f"{inner}: {_flow(given[inner])}", content.description or "", "  ")
         else:
             yield from _lines(inner, content, "  ")
+
+
+def _placed(placing: Placing) -> Iterator[str]:
+    """Return the poses around an object, or a remark on where the sensor is."""
+    if placing.note:
+        note = f"{placing.note[:1].upper()}{placing.note[1:]}."
+        # A pose stays on one line, to be copied.
+        text, mark, poses = note.partition("poses: ")
+        yield from textwrap.wrap(text, _WIDTH, initial_indent="# ", subsequent_indent="# ")
+        if mark:
+            yield f"# poses: {poses.removesuffix('.')}"
+    if placing.around:
+        yield "poses:"
+        yield from (f"  - {_flow(as_entry(pose))}" for pose in placing.poses)
 
 
 def _lines(name: str, field: FieldInfo, indent: str) -> Iterator[str]:

@@ -38,10 +38,13 @@ SUFFIXES = tuple(_READERS)
 UNITLESS = (".obj", ".stl", ".ply", ".off")  # formats without a unit
 
 _Y_UP = (".glb", ".gltf")  # by their standard
-GENERATOR = "lidarpool"  # that files of our own name, which are Y-up
+_NO_AXES = (".obj",)  # of formats without axes, the one that is Y-up as often as not
+GENERATOR = "lidarpool"  # that files of our own name, .glb as Y-up, others as Z-up
+OWN = "lidarpool: metres, Z-up"  # comment that files of our own without such a name begin with
 
 # Nothing on Earth is farther from the origin of its map; see also `sections.Coordinate`.
 FARTHEST_M = 1e8
+_HEAD = 200  # bytes of a file that such a comment is in
 _LETTERS = 200  # of a name, or of what a reader says
 
 _log = logging.getLogger(__name__)
@@ -54,7 +57,7 @@ def load_meshes(
     up_axis: str | None = None,
     transform: Transform | None = None,
     tell: Callable[[str], None] = _log.warning,
-    remark: Callable[[str], None] = _log.info,
+    axes: Callable[[str], None] | None = None,
 ) -> tuple[Mesh, ...]:
     """Read all objects of a mesh file.
 
@@ -73,10 +76,10 @@ def load_meshes(
     transform
         Placement in the world, in metres, after unit and up axis.
     tell
-        Called with a line on objects left out, or a scene that seems to lie on its side; by default
-        this module's logger warns.
-    remark
-        Called with a line on correct but possibly surprising results.
+        Called with a line on objects left out; by default this module's logger warns.
+    axes
+        Called with a line on axes that a file did not state, or that were turned; by default this
+        module's logger has it, as a warning if the scene seems to lie on its side.
 
     Returns
     -------
@@ -110,14 +113,35 @@ def load_meshes(
     if content.skipped:
         names = ", ".join(content.skipped[:3]) + ", …" * (len(content.skipped) > 3)
         tell(f"{path} scales {names} to zero: left out")
-    if up_axis is None and path.suffix.lower() in _Y_UP and content.generator != GENERATOR:
-        why = _lies(content, meshes)
-        (tell if why else remark)(
-            f"{path} was turned from Y-up to Z-up, as glTF asks{why}. If it lies on its side now, "
-            "say up_axis: z in scene.files (lidarpool init --mesh … --up-axis z writes such a "
-            "scenario), or up_axis='z' in Python; y there confirms it, and ends this note"
-        )
+    if up_axis is None and content.generator != GENERATOR and OWN.encode() not in data[:_HEAD]:
+        _tell_axes(path, content, meshes, axes)
     return meshes
+
+
+def wrote_it(path: Path) -> bool:
+    """Whether lidarpool wrote a mesh file of a format without a unit: it is in metres."""
+    with path.open("rb") as file:
+        return OWN.encode() in file.read(_HEAD)
+
+
+def _tell_axes(
+    path: Path,
+    content: Content,
+    meshes: Sequence[Mesh],
+    axes: Callable[[str], None] | None,
+) -> None:
+    suffix, why, other = path.suffix.lower(), "", "y"
+    if suffix in _Y_UP:
+        why, other = _lies(content, meshes), "z"
+        done = f"was turned from Y-up to Z-up, as glTF asks{why}"
+    elif suffix in _NO_AXES:
+        done = "states no axes and is taken as Z-up"
+    else:
+        return
+    (axes or (_log.warning if why else _log.info))(
+        f"{path.name} {done}; if it lies on its side, set up_axis: {other} in scene.files "
+        f"(lidarpool init --mesh FILE --up-axis {other}); any up_axis ends this note"
+    )
 
 
 def _lies(content: Content, meshes: Sequence[Mesh]) -> str:

@@ -13,7 +13,7 @@ from trimesh.exchange.obj import export_obj
 from trimesh.exchange.ply import export_ply
 
 from ..base.errors import LidarpoolError
-from .meshfile import GENERATOR
+from .meshfile import GENERATOR, OWN
 from .scene import Scene
 from .transform import UP_AXES
 
@@ -28,7 +28,8 @@ def write_scene(path: str | Path, scene: Scene) -> Path:
     path
         One of `SUFFIXES`. A .ply holds one object without a name; .glb and .obj keep objects
         and names. All store metres; .glb is Y-up, by its standard, the others are Z-up.
-        Coordinates are those of the world; .ply and .glb have single precision.
+        Coordinates are those of the world; .ply and .glb have single precision. A comment, or the
+        generator of .glb, tells `load_meshes` who wrote it.
     scene
         The scene.
 
@@ -78,7 +79,9 @@ def _encoded(suffix: str, scene: Scene) -> bytes:
     """Content of a file of one of `SUFFIXES`."""
     if suffix == ".ply":
         whole = trimesh.Trimesh(scene.vertices + scene.origin, scene.faces, process=False)
-        return bytes(export_ply(whole, vertex_normal=False))
+        data = bytes(export_ply(whole, vertex_normal=False))
+        head, _, rest = data.partition(b"\ncomment ")
+        return head + f"\ncomment {OWN}\n".encode() + rest.partition(b"\n")[2]
     if suffix == ".glb":
         # UP_AXES["y"] turns Y-up to Z-up; its transpose turns back.
         objects = _objects(scene, UP_AXES["y"].T)
@@ -86,7 +89,8 @@ def _encoded(suffix: str, scene: Scene) -> bytes:
             export_glb(objects, include_normals=False, tree_postprocessor=_name_the_writer)
         )
     objects = _objects(scene, np.eye(3))
-    return str(export_obj(objects, include_normals=False, include_texture=False)).encode()
+    text = export_obj(objects, include_normals=False, include_texture=False)
+    return f"# {OWN}\n{text}".encode()
 
 
 def _name_the_writer(tree: dict[str, Any]) -> None:

@@ -1,0 +1,179 @@
+"""Default poses: on the floor of a place, around an object."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from trimesh import creation
+
+from lidarpool.scan.rig import Rig, RigPlan
+from lidarpool.scenario.placing import inside_note, place, poses_around
+from lidarpool.scenario.scenario import Scenario
+from lidarpool.scene.city import city
+from lidarpool.scene.mesh import Mesh
+from lidarpool.scene.scene import Scene
+from lidarpool.scene.scene_file import write_scene
+from lidarpool.scene.surroundings import Surroundings, is_open
+from lidarpool.scene.terrain import terrain
+from lidarpool.sensor import Mounted, Sensor, Survey
+from lidarpool.sensor.models import load_sensor
+
+GRID = Mounted(Sensor.grid())
+
+
+def scene_of(*meshes, at=(0.0, 0.0, 0.0)):
+    return Scene.from_meshes(
+        Mesh(f"mesh{i}", mesh.vertices + at, mesh.faces) for i, mesh in enumerate(meshes)
+    )
+
+
+def inverted(mesh):
+    mesh.invert()
+    return mesh
+
+
+def gear(radius):
+    """A flat body with 24 upright teeth."""
+    angles = np.arange(96) * 2 * np.pi / 96
+    reach = np.where(np.arange(96) // 2 % 2, 1.0, 0.85) * radius
+    ring = np.stack([reach * np.cos(angles), reach * np.sin(angles)], axis=1)
+    low, high = (np.c_[ring, np.full(96, z)] for z in (0, 0.2 * radius))
+    i, j = np.arange(96), np.roll(np.arange(96), -1)
+    sides = [np.c_[i, j, 96 + j], np.c_[i, 96 + j, 96 + i]]
+    caps = [np.c_[np.full(96, 192), j, i], np.c_[np.full(96, 193), 96 + i, 96 + j]]
+    middles = [[0, 0, 0], [0, 0, 0.2 * radius]]
+    return trimesh.Trimesh(np.vstack([low, high, middles]), np.vstack(sides + caps), process=False)
+
+
+OBJECTS = {
+    "ball": (creation.icosphere(3, 0.5),),
+    "large ball": (creation.icosphere(3, 5.0),),
+    "casing": (creation.box((0.8, 0.6, 0.5)), inverted(creation.box((0.7, 0.5, 0.4)))),
+    "round casing": (creation.icosphere(3, 4.0), inverted(creation.icosphere(3, 3.8))),
+    "torus": (creation.torus(1, 0.3),),
+    "large torus": (creation.torus(10, 3),),
+    "capsule": (creation.capsule(12, 2.5),),
+    "gear": (gear(1.0),),
+    "gear in millimetres": (gear(80.0),),
+    "two balls": (
+        creation.icosphere(3, 0.5),
+        creation.icosphere(3, 0.5).apply_translation([3, 0, 0]),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", OBJECTS)
+@pytest.mark.parametrize("far", [0.0, 4_000_000.0])
+def test_an_object_is_seen_from_around_it_and_only_from_outside(name, far):
+    scene = scene_of(*OBJECTS[name], at=(far, far, 0))
+    placed = place(scene, GRID)
+    assert placed.around and "looks like an object" in placed.note and len(placed.poses) == 5
+    poses = [np.subtract(pose.position, scene.origin) for pose in placed.poses]
+    middle, diagonal = scene.bounds.mean(axis=0), np.linalg.norm(np.ptp(scene.bounds, axis=0))
+    far_m = np.linalg.norm(poses - middle, axis=1)
+    np.testing.assert_allclose(far_m, 1.5 * diagonal, rtol=0.01)
+    local = [
+        replace(pose, position=tuple(at)) for pose, at in zip(placed.poses, poses, strict=True)
+    ]
+    survey = Survey(Sensor.grid(), local)
+    rig = Rig(RigPlan(scene, survey, "auto"))
+    points = []
+    for number in range(5):
+        returns = list(rig.cast(36 * number, 36 * (number + 1)))
+        assert sum(map(len, returns)) > 100, "each pose sees the object"
+        points += [one.positions for one in returns]
+    low, high = np.concatenate(points).min(axis=0), np.concatenate(points).max(axis=0)
+    sides = np.ptp(scene.bounds, axis=0)
+    # No pose sees the underside.
+    assert ((high - low)[:2] > 0.9 * sides[:2]).all() and high[2] > scene.bounds[
+        1, 2
+    ] - 0.1 * sides[2]
+    assert not Surroundings(scene).views(poses).back.any()
+
+
+BOX = (8, 6, 2.5)
+PLACES = {
+    "room": lambda: scene_of(inverted(creation.box(BOX))),
+    "room with walls of some thickness": lambda: scene_of(
+        creation.box((8.6, 6.6, 3.1)), inverted(creation.box(BOX))
+    ),
+    "box hall": lambda: scene_of(creation.box(BOX)),
+    "ground": lambda: terrain(20_000, 0, 100.0),
+    "ground that faces down": lambda: flipped(terrain(20_000, 0, 100.0)),
+    "large ground": lambda: terrain(300_000, 0, 1000.0),
+    "city": lambda: city(20_000, 0),
+    "another city": lambda: city(20_000, 7),
+    "things on a slab": lambda: scene_of(
+        creation.box((30, 20, 0.3)), creation.box((1, 1, 2)).apply_translation([5, 3, 1.15])
+    ),
+}
+
+
+def flipped(scene):
+    return Scene(scene.vertices, scene.faces[:, ::-1], scene.face_object, scene.names, scene.origin)
+
+
+@pytest.mark.parametrize("name", PLACES)
+def test_in_a_place_the_sensor_stands_in_the_middle(name):
+    scene = PLACES[name]()
+    placed = place(scene, GRID)
+    assert len(placed.poses) == 3 and not placed.around
+    middle = (scene.bounds + scene.origin).mean(axis=0)
+    assert all(pose.position[:2] == pytest.approx(middle[:2]) for pose in placed.poses)
+    assert ("only the backs" in placed.note) == (name == "box hall")
+
+
+def test_open_surfaces_are_known_without_rays():
+    assert is_open(terrain(2_000, 0, 100.0)) and not is_open(scene_of(creation.icosphere(3)))
+
+
+def test_a_narrow_sensor_is_farther_away_and_tilted():
+    scene = scene_of(creation.icosphere(3, 0.5))
+    carried = Mounted(load_sensor("velodyne/vlp32c"))  # from -25 to 15 degrees
+    for pose in poses_around(scene, carried):
+        towards = scene.vertices - pose.position
+        x, _, z = (towards / np.linalg.norm(towards, axis=1, keepdims=True) @ pose.rotation).T
+        assert (x > 0).all()
+        elevations = np.degrees(np.arcsin(z))
+        assert elevations.min() > -25 and elevations.max() < 15
+
+
+def test_poses_within_a_closed_body_are_told_of_with_some_that_see_it(tmp_path):
+    ball = scene_of(creation.icosphere(3, 5.0))
+    assert "from outside it is seen by poses: [{position: [" in inside_note(ball, [0, 0, 0], GRID)
+    assert inside_note(ball, [0, 0, 9], GRID) == ""
+    (tmp_path / "b.stl").write_bytes(creation.icosphere(3, 5.0).export(file_type="stl"))
+    data = {"scene": {"files": ["b.stl"]}, "poses": [[0, 0, 0]]}
+    given = Scenario.from_data(data, folder=tmp_path)
+    assert "only the backs of its surfaces" in given.advice(given.build_scene())[-1]
+
+
+@pytest.mark.parametrize(("length", "noted"), [(13.0, True), (4.0, False), (0.05, False)])
+def test_the_unit_of_a_long_object_is_asked_for(tmp_path, length, noted):
+    capsule = creation.capsule(length * 0.8, length * 0.1)
+    (tmp_path / "screw.stl").write_bytes(capsule.export(file_type="stl"))
+    read = Scenario.load(tmp_path / "screw.stl")
+    scene = read.build_scene()
+    read.survey(scene)
+    notes = " ".join(read.advice(scene))
+    assert "looks like an object" in notes and ("states no unit" in notes) == noted
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".obj"])
+def test_files_of_our_own_need_no_unit_and_no_axes(tmp_path, suffix):
+    scene = terrain(2_000, 0, 1000.0)
+    write_scene(tmp_path / f"own{suffix}", scene)
+    read = Scenario.load(tmp_path / f"own{suffix}")
+    assert read.advice(read.build_scene()) == []
+
+
+def test_the_axes_of_several_objs_are_one_note(tmp_path):
+    for name in "ab":
+        (tmp_path / f"{name}.obj").write_text(creation.icosphere(2).export(file_type="obj"))
+    read = Scenario.from_data({"scene": {"files": ["a.obj", "b.obj"]}}, folder=tmp_path)
+    (note,) = [note for note in read.advice(read.build_scene()) if "axes" in note]
+    assert note.startswith("a.obj states no axes and is taken as Z-up") and "\n" not in note
+    assert "set up_axis: y" in note and note.endswith("; 1 more file, too")

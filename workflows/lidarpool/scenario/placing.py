@@ -1,0 +1,165 @@
+"""Where a sensor goes if nobody says: on the floor of a place, or around an object."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import yaml
+from numpy.typing import ArrayLike, NDArray
+
+from ..base.words import counted
+from ..scene.floor import room_at
+from ..scene.scene import Scene
+from ..scene.surroundings import Surroundings, is_open
+from ..sensor import Mounted, Pose
+
+# Heights above a floor; and the least distance from the ceiling.
+_HEIGHTS_M, _BELOW_M = (1.0, 2.0, 3.0), 0.2
+
+# Poses around an object: azimuths, which see two sides of a box each; degrees above its middle; and
+# distance from its middle, in its diagonals, the least and the most.
+_AZIMUTHS_DEG, _ABOVE_DEG, _FAR = (45, 135, 225, 315), 20.0, (1.5, 3.0)
+_LOOKED_AT = 1000  # firings that tell a sensor's field of view
+_FACING_DEG = 45.0  # rays of that field
+
+# Larger scenes are not looked at, nor sheets such as terrains of more triangles than the second: a
+# tree takes 300 bytes and some microseconds a triangle.
+_TRIANGLES_MOST, _SHEETS_MOST = 5_000_000, 200_000
+
+
+@dataclass(frozen=True)
+class Placing:
+    """Poses of a sensor in a scene.
+
+    Parameters
+    ----------
+    poses
+        In world coordinates.
+    note
+        For users, on poses that they may not expect; empty if there is nothing to say.
+    around
+        Whether the poses are around an object.
+    """
+
+    poses: tuple[Pose, ...]
+    note: str = ""
+    around: bool = False
+
+
+def place(scene: Scene, carried: Mounted) -> Placing:
+    """Choose poses in a scene from mesh files.
+
+    In a room or a landscape they are in the middle, 1, 2 and 3 m above the floor or ground, or at
+    a quarter, half and three quarters of the height of a lower room. Around an object they are on
+    four sides and above it.
+
+    Parameters
+    ----------
+    scene
+        The scene from mesh files.
+    carried
+        The sensor and its mount.
+    """
+    low, high = scene.bounds + scene.origin
+    x, y = (low[:2] + high[:2]) / 2
+    floor, ceiling = room_at(scene, x, y)
+    heights = [*_HEIGHTS_M]
+    if floor + heights[-1] > ceiling - _BELOW_M:
+        heights = [(ceiling - floor) * share for share in (0.25, 0.5, 0.75)]
+    standing = tuple(Pose((float(x), float(y), float(floor + height))) for height in heights)
+    looker = _looker(scene)
+    if looker is None:
+        return Placing(standing)
+    positions = [np.subtract(pose.position, scene.origin) for pose in standing]
+    if not looker.is_object(positions):
+        if not looker.views(positions).only_backs:
+            return Placing(standing)
+        return Placing(standing, f"{_INSIDE}; {seen_from(scene, carried)}")
+    poses = poses_around(scene, carried)
+    far = np.linalg.norm(poses[-1].position - (low + high) / 2)
+    sides = " x ".join(f"{side:,.3g}" for side in high - low)
+    note = (
+        f"this looks like an object of {sides} m, not a place to stand in: "
+        f"{counted(len(poses), 'pose')} around and above it, {far:,.3g} m from its middle"
+    )
+    return Placing(poses, note, around=True)
+
+
+_INSIDE = "the sensor is inside a closed body, and hits only the backs of its surfaces"
+
+
+def inside_note(scene: Scene, positions: ArrayLike, carried: Mounted) -> str:
+    """Say that only backs of surfaces are seen from local positions (k, 3); else empty."""
+    looker = _looker(scene)
+    if looker is None or not looker.views(positions).only_backs:
+        return ""
+    return f"{_INSIDE}; {seen_from(scene, carried)}"
+
+
+def seen_from(scene: Scene, carried: Mounted) -> str:
+    """Name two poses that see a scene from outside, as a scenario has them."""
+    text = yaml.safe_dump(
+        [as_entry(pose) for pose in poses_around(scene, carried)[0:4:2]],
+        default_flow_style=True,
+        sort_keys=False,
+        width=10_000,
+    )
+    return f"from outside it is seen by poses: {text.strip()}"
+
+
+def as_entry(pose: Pose) -> dict[str, object]:
+    """Return a pose as a scenario has it."""
+    return {
+        "position": list(pose.position),
+        "yaw_deg": pose.yaw_deg,
+        "pitch_deg": pose.pitch_deg,
+    }
+
+
+def poses_around(scene: Scene, carried: Mounted) -> tuple[Pose, ...]:
+    """Poses on four sides of a scene and above it that look at its middle, world coordinates.
+
+    They are at 1.5 times the diagonal from the middle, farther if the sensor's field of view is
+    too narrow for the whole scene.
+    """
+    low, high = scene.bounds + scene.origin
+    middle, diagonal = (low + high) / 2, float(np.linalg.norm(high - low))
+    down, up = _field_deg(carried)
+    half = np.radians(max(up - down, 1e-3) / 2)
+    far = diagonal * float(np.clip(0.5 / np.sin(half), *_FAR))
+    far = max(far, carried.sensor.min_range_m + diagonal)
+    digits = max(0, 3 - int(np.floor(np.log10(diagonal))))
+    poses = []
+    for azimuth, above in (*((a, _ABOVE_DEG) for a in _AZIMUTHS_DEG), (180, 90.0)):
+        (ca, ce), (sa, se) = (
+            np.cos(np.radians([azimuth, above])),
+            np.sin(np.radians([azimuth, above])),
+        )
+        at = np.round(middle + far * np.array([ca * ce, sa * ce, se]), digits) + 0.0
+        x, y, z = at.tolist()
+        pitch = round(above + (down + up) / 2, 1)
+        poses.append(Pose((x, y, z), (azimuth + 180.0) % 360.0, pitch))
+    return tuple(poses)
+
+
+def _field_deg(carried: Mounted) -> tuple[float, float]:
+    """Lowest and highest elevation of the rays that go forward, in the carrier's axes."""
+    sensor, turn = carried.sensor, carried.mount.rotation
+    count = min(sensor.period or _LOOKED_AT, _LOOKED_AT)
+    firings = np.linspace(0, sensor.period or count, count, endpoint=False).astype(np.int64)
+    rays: NDArray[np.float64] = sensor.directions(firings).reshape(-1, 3)
+    rays = rays if turn is None else rays @ turn.T
+    facing = np.abs(np.degrees(np.arctan2(rays[:, 1], rays[:, 0]))) <= _FACING_DEG
+    if not facing.any():
+        return 0.0, 0.0
+    elevations = np.degrees(np.arcsin(np.clip(rays[facing, 2], -1, 1)))
+    return float(elevations.min()), float(elevations.max())
+
+
+def _looker(scene: Scene) -> Surroundings | None:
+    """Return what looks around in a scene; None if that takes too long."""
+    count = len(scene.faces)
+    if count > _TRIANGLES_MOST or (count > _SHEETS_MOST and is_open(scene)):
+        return None
+    return Surroundings(scene)

@@ -1,0 +1,161 @@
+"""Whether a scene is a place to stand in, or an object to look at from outside."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from raybeam import RayCaster, available_backends
+
+from .scene import Scene
+
+Real = NDArray[np.float64]
+
+RAYS = 1000  # from each position, and from outside
+HAND_M = 0.1  # surfaces nearer than this are in the way
+BLOCK_FACES = 1 << 18  # triangles whose areas are added up at a time
+
+# Shares of rays. Of those that look down from 1, 2 and 3 m above a patch of ground, 0.4 meet it if
+# it is 5 m wide.
+_GROUND, _ENCLOSED, _CLOSED, _UPRIGHT, _FLOOR = 0.4, 0.95, 0.8, 0.9, 0.3
+# A closed body whose inside has a floor and upright walls is a room of these sizes.
+_WIDE_M, _HIGH_M = 2.0, 15.0
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """What rays in all directions meet from some positions.
+
+    Parameters
+    ----------
+    directions
+        (n, 3), unit vectors.
+    distance
+        (n,), metres; infinite where there is nothing.
+    back
+        (n,), whether the back of a triangle was hit.
+    normals
+        (n, 3), unit normals of the triangles hit; 0 where there is nothing.
+    heights
+        (n,), local z of the hits.
+    """
+
+    directions: Real
+    distance: Real
+    back: NDArray[np.bool_]
+    normals: Real
+    heights: Real
+
+    @property
+    def hit(self) -> NDArray[np.bool_]:
+        """Which rays meet a surface that is not within a hand's breadth: (n,)."""
+        return np.isfinite(self.distance) & (self.distance > HAND_M)
+
+    @property
+    def only_backs(self) -> bool:
+        """Whether all that there is to see is the backs of surfaces."""
+        return bool(self.hit.any() and np.mean(self.back[self.hit]) > 1 - 1 / RAYS)
+
+
+class Surroundings:
+    """Casts a few thousand rays to see what is around a position.
+
+    Parameters
+    ----------
+    scene
+        Without its actors.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        # Never CUDA, whose context would stay in this process.
+        backend = "numpy" if available_backends()["embree"] else "embree"
+        self._caster = RayCaster(scene.vertices, scene.faces, backend)
+
+    def views(self, positions: ArrayLike) -> Views:
+        """Look in all directions from local positions (k, 3)."""
+        at = np.asarray(positions, np.float64).reshape(-1, 3)
+        around = directions_around(RAYS)
+        return self._cast(np.repeat(at, RAYS, axis=0), np.tile(around, (len(at), 1)))
+
+    def outside(self) -> Views:
+        """Look at the scene from all around it."""
+        low, high = self._scene.bounds
+        across = float(np.linalg.norm(high - low))
+        towards = -directions_around(RAYS)
+        # Parallel rays would meet thin things seldom: aim at a grid of points in the box.
+        shares = np.stack([np.arange(RAYS) * step % 1.0 for step in (0.755, 0.57, 0.431)], axis=1)
+        return self._cast(low + shares * (high - low) - 2 * across * towards, towards)
+
+    def is_object(self, positions: ArrayLike) -> bool:
+        """Whether a scene is an object, judged from where a sensor would stand in it.
+
+        It is one if almost nothing is seen from there, or if all sides of the scene look outward
+        and the positions are within it: not on ground, and not in a room with a floor.
+
+        Parameters
+        ----------
+        positions
+            Local, (k, 3), metres.
+        """
+        seen = self.views(positions)
+        down, hit, front = seen.directions[:, 2] < 0, seen.hit, seen.hit & ~seen.back
+        if float(np.mean(hit[down])) < _GROUND and float(np.mean(hit[~down])) < _GROUND:
+            return True
+        outside = self.outside()
+        if float(np.mean(outside.back[outside.hit])) > 1 - _CLOSED:
+            return False  # a terrain from below, or the walls of a room
+        if float(np.mean(np.isfinite(seen.distance))) < _ENCLOSED:
+            return float(np.mean(front[down])) < _GROUND
+        return not self._is_room(seen)
+
+    def _is_room(self, seen: Views) -> bool:
+        """Whether what encloses some positions is a room, though all sides look outward."""
+        steep = (seen.directions[:, 2] < -0.7) & np.isfinite(seen.distance)
+        level = np.abs(seen.normals[:, 2]) > 0.99
+        heights = seen.heights[steep & level]
+        floor = np.sum(np.abs(heights - np.median(heights)) < 0.3) if len(heights) else 0
+        if int(floor) < _FLOOR * int(np.sum(steep)):
+            return False
+        if float(np.mean(seen.back)) < 1 - _CLOSED:  # walls of some thickness
+            return True
+        upright = np.abs(seen.normals[:, 2]) < 0.01
+        sides = np.ptp(self._scene.bounds, axis=0)
+        fits = sides[:2].min() >= _WIDE_M and sides[2] <= _HIGH_M
+        return bool(fits and float(np.mean(level | upright)) >= _UPRIGHT)
+
+    def _cast(self, origins: Real, directions: Real) -> Views:
+        hits = self._caster.cast(origins, directions)
+        a, b, c = self._scene.vertices[self._scene.faces[hits.triangle]].transpose(1, 0, 2)
+        normals = np.cross(b - a, c - a)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+        normals[~hits.hit] = 0.0
+        heights = origins[:, 2] + np.where(hits.hit, hits.distance, 0.0) * directions[:, 2]
+        back = (normals * directions).sum(axis=1) > 0
+        return Views(directions, hits.distance, back, normals, heights)
+
+
+def is_open(scene: Scene) -> bool:
+    """Whether a scene's surfaces are far from closed, as a terrain's; needs no rays.
+
+    The areas of a closed surface, as vectors along the normals, add up to nothing.
+    """
+    total, area = np.zeros(3), 0.0
+    for begin in range(0, len(scene.faces), BLOCK_FACES):
+        a, b, c = scene.vertices[scene.faces[begin : begin + BLOCK_FACES]].transpose(1, 0, 2)
+        areas = np.cross(b - a, c - a)
+        total += areas.sum(axis=0)
+        area += float(np.linalg.norm(areas, axis=1).sum())
+    return bool(np.linalg.norm(total) > 0.1 * area)
+
+
+def directions_around(count: int) -> Real:
+    """Make unit vectors (count, 3), evenly spread over a sphere: Fibonacci's spiral."""
+    numbers: Any = np.arange(count) + 0.5
+    z = 1 - 2 * numbers / count
+    turn = np.pi * (1 + np.sqrt(5)) * numbers
+    flat = np.sqrt(1 - z * z)
+    return np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1)
