@@ -25,7 +25,7 @@ _FACING_DEG = 45.0  # rays of that field
 
 # Larger scenes are not looked at, nor sheets such as terrains of more triangles than the second: a
 # tree takes 300 bytes and some microseconds a triangle.
-_TRIANGLES_MOST, _SHEETS_MOST = 5_000_000, 200_000
+_TRIANGLES_MOST, _SHEETS_MOST = 2_000_000, 200_000
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ def _field_deg(carried: Mounted) -> tuple[float, float]:
     rays = rays if turn is None else rays @ turn.T
     facing = np.abs(np.degrees(np.arctan2(rays[:, 1], rays[:, 0]))) <= _FACING_DEG
     if not facing.any():
-        return 0.0, 0.0
+        return -90.0, -90.0  # an airborne scanner, which looks down
     elevations = np.degrees(np.arcsin(np.clip(rays[facing, 2], -1, 1)))
     return float(elevations.min()), float(elevations.max())
 
