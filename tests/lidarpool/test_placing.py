@@ -58,6 +58,7 @@ OBJECTS = {
     "capsule": (creation.capsule(12, 2.5),),
     "gear": (gear(1.0),),
     "gear in millimetres": (gear(80.0),),
+    "machine with an opening": (creation.torus(6, 4.5), creation.icosphere(3, 2.0)),
     "two balls": (
         creation.icosphere(3, 0.5),
         creation.icosphere(3, 0.5).apply_translation([3, 0, 0]),
@@ -103,6 +104,7 @@ PLACES = {
     "box hall": lambda: scene_of(creation.box(BOX)),
     "ground": lambda: terrain(20_000, 0, 100.0),
     "ground that faces down": lambda: flipped(terrain(20_000, 0, 100.0)),
+    "ground of some thickness": lambda: thick(terrain(20_000, 0, 100.0)),
     "large ground": lambda: terrain(300_000, 0, 1000.0),
     "city": lambda: city(20_000, 0),
     "another city": lambda: city(20_000, 7),
@@ -110,6 +112,20 @@ PLACES = {
         creation.box((30, 20, 0.3)), creation.box((1, 1, 2)).apply_translation([5, 3, 1.15])
     ),
 }
+
+
+def thick(scene):
+    """Ground as the top of a closed body, 0.3 m thick."""
+    ground = trimesh.Trimesh(scene.vertices, scene.faces, process=False)
+    edges, count = np.unique(ground.edges_sorted, axis=0, return_counts=True)
+    known = {tuple(edge) for edge in edges[count == 1]}
+    rim = np.array([edge for edge in ground.edges if tuple(sorted(edge)) in known])
+    below = scene.vertices - [0, 0, 0.3]
+    a, b = rim.T
+    c, d = rim.T + len(below)
+    walls = np.vstack([np.c_[b, a, c], np.c_[b, c, d]])
+    faces = np.vstack([scene.faces, walls, scene.faces[:, ::-1] + len(below)])
+    return scene_of(trimesh.Trimesh(np.vstack([scene.vertices, below]), faces, process=False))
 
 
 def flipped(scene):

@@ -20,7 +20,7 @@ BLOCK_FACES = 1 << 18  # triangles whose areas are added up at a time
 
 # Shares of rays. Of those that look down from 1, 2 and 3 m above a patch of ground, 0.4 meet it if
 # it is 5 m wide.
-_GROUND, _ENCLOSED, _CLOSED, _UPRIGHT, _FLOOR = 0.4, 0.95, 0.8, 0.9, 0.3
+_GROUND, _SKY, _ENCLOSED, _CLOSED, _UPRIGHT, _FLOOR = 0.4, 0.3, 0.95, 0.8, 0.9, 0.3
 # A closed body whose inside has a floor and upright walls is a room of these sizes.
 _WIDE_M, _HIGH_M = 2.0, 15.0
 
@@ -109,20 +109,18 @@ class Surroundings:
         if float(np.mean(outside.back[outside.hit])) > 1 - _CLOSED:
             return False  # a terrain from below, or the walls of a room
         if float(np.mean(np.isfinite(seen.distance))) < _ENCLOSED:
-            return float(np.mean(front[down])) < _GROUND
+            ground = float(np.mean(front[down])) >= _GROUND
+            # Of a machine with openings there is something above the sensor, too.
+            return not (ground and (float(np.mean(hit[~down])) < _SKY or _has_floor(seen)))
         return not self._is_room(seen)
 
     def _is_room(self, seen: Views) -> bool:
         """Whether what encloses some positions is a room, though all sides look outward."""
-        steep = (seen.directions[:, 2] < -0.7) & np.isfinite(seen.distance)
-        level = np.abs(seen.normals[:, 2]) > 0.99
-        heights = seen.heights[steep & level]
-        floor = np.sum(np.abs(heights - np.median(heights)) < 0.3) if len(heights) else 0
-        if int(floor) < _FLOOR * int(np.sum(steep)):
+        if not _has_floor(seen):
             return False
         if float(np.mean(seen.back)) < 1 - _CLOSED:  # walls of some thickness
             return True
-        upright = np.abs(seen.normals[:, 2]) < 0.01
+        level, upright = _is_level(seen), np.abs(seen.normals[:, 2]) < 0.01
         sides = np.ptp(self._scene.bounds, axis=0)
         fits = sides[:2].min() >= _WIDE_M and sides[2] <= _HIGH_M
         return bool(fits and float(np.mean(level | upright)) >= _UPRIGHT)
@@ -136,6 +134,18 @@ class Surroundings:
         heights = origins[:, 2] + np.where(hits.hit, hits.distance, 0.0) * directions[:, 2]
         back = (normals * directions).sum(axis=1) > 0
         return Views(directions, hits.distance, back, normals, heights)
+
+
+def _is_level(seen: Views) -> NDArray[np.bool_]:
+    return np.asarray(np.abs(seen.normals[:, 2]) > 0.99)
+
+
+def _has_floor(seen: Views) -> bool:
+    """Whether rays that go steeply down meet level surfaces of about one height."""
+    steep = (seen.directions[:, 2] < -0.7) & np.isfinite(seen.distance)
+    heights = seen.heights[steep & _is_level(seen)]
+    floor = np.sum(np.abs(heights - np.median(heights)) < 0.3) if len(heights) else 0
+    return int(floor) >= _FLOOR * int(np.sum(steep))
 
 
 def is_open(scene: Scene) -> bool:
