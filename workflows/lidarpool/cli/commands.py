@@ -33,6 +33,7 @@ from .plot_command import plot
 from .scenario_commands import init, schema
 from .scene_commands import scene
 from .sensor_command import sensors
+from .stations_command import stations
 from .view_command import view
 
 if TYPE_CHECKING:
@@ -99,7 +100,7 @@ def cli() -> None:
     """Simulate lidar surveys on a partitioned Dask cluster."""
 
 
-for _command in (init, import_, check, schema, scene, sensors, view, plot, export):
+for _command in (init, import_, check, schema, scene, sensors, stations, view, plot, export):
     cli.add_command(_command)
 
 

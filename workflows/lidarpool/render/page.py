@@ -163,6 +163,21 @@ class Page:
             )  # fmt: skip
             text.set_parse_math(False)  # names come from files
 
+    def numbers(self, axes: Axes, shot: Shot) -> None:
+        """Write numbers from 1 on the sensors' markers; on white for those that are hidden."""
+        pixels, seen = shot.visible(shot.sensors)
+        for rank, k in enumerate(np.argsort(pixels[:, 1]).tolist()):  # those in front last
+            x, y, above = float(pixels[k, 0]), float(pixels[k, 1]), 8 + rank / len(pixels)
+            face, ink = (theme.SENSOR, theme.PAGE) if seen[k] else (theme.PAGE, theme.SENSOR)
+            axes.scatter(
+                [x], [y], s=62 * self.unit**2, facecolors=face, edgecolors=ink,
+                linewidths=0.7 * self.unit, zorder=above,
+            )  # fmt: skip
+            axes.text(
+                x, y, str(k + 1), ha="center", va="center_baseline", color=ink, family=FONT,
+                fontsize=(5.6 if k < 99 else 4.4) * self.unit, weight="bold", zorder=above,
+            )  # fmt: skip
+
     def lines(self, axes: Axes, shot: Shot, segments: Floats, width: float, alpha: float) -> None:
         """Draw the visible parts of segments (n, 2, 3), in the sensors' colour."""
         runs = shot.runs(segments, shot.visible)

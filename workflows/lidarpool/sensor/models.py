@@ -171,6 +171,12 @@ def model_names() -> tuple[str, ...]:
     ))  # fmt: skip
 
 
+def full_name(name: str) -> str:
+    """Name of a model with its maker, where the name alone says which: riegl-vz400."""
+    found = [model for model in model_names() if model.partition("/")[2] == name]
+    return found[0] if len(found) == 1 else name
+
+
 def read_model(name: str | Path) -> SensorModel:
     """Read a model: one that comes with the package by name, or a data file (.yaml).
 

@@ -1,0 +1,150 @@
+"""Stations for terrestrial scans: areas that are known by hand, and where nobody can stand."""
+
+import numpy as np
+import pytest
+
+from lidarpool import LidarpoolError, Mesh, Scene, Sensor, load_sensor
+from lidarpool.plan.stations import plan_stations
+from lidarpool.scene.actors import box
+
+EVERYWHERE = Sensor.grid(vertical_fov_deg=180)
+
+
+def placed(name, size, place):
+    """Put a box of a size with the middle of its underside at a place."""
+    mesh = box(name, size)
+    return Mesh(name, mesh.vertices + np.array(place, float), mesh.faces)
+
+
+def rooms(*partitions):
+    """Return two rooms, 12 x 6 x 3 m, without a ceiling, parted by walls along y."""
+    return [
+        placed("Floor", (12.4, 6.4, 0.2), (0, 0, -0.2)),
+        placed("North", (12.4, 0.2, 3), (0, 3.1, 0)),
+        placed("South", (12.4, 0.2, 3), (0, -3.1, 0)),
+        placed("West", (0.2, 6, 3), (-6.1, 0, 0)),
+        placed("East", (0.2, 6, 3), (6.1, 0, 0)),
+        *(
+            placed("Partition", (0.2, end - start, 3), (x, (start + end) / 2, 0))
+            for x, start, end in partitions
+        ),
+    ]
+
+
+POLES = [placed(f"Pole-{x}", (0.2, 0.2, 3), (x, 0, 0)) for x in (-10, 10)]
+
+
+def areas(plan, scene):
+    return {
+        name: (visible, covered)
+        for name, visible, covered in zip(
+            scene.names, plan.visible_m2, plan.covered_m2, strict=True
+        )
+    }
+
+
+def test_two_closed_rooms_need_two_stations_each_of_which_sees_its_own():
+    scene = Scene.from_meshes(rooms((2, -3, 3)))
+    plan = plan_stations(scene, EVERYWHERE, slant_deg=90)
+    assert len(plan.stations) == 2
+    west, east = (x * 6 + 2 * (x + 6) * 3 for x in (7.9, 3.9))  # floor and walls, m²
+    assert plan.coverage == pytest.approx([west / (west + east), 1], abs=0.01)
+    assert plan.visible_m2.sum() == pytest.approx(west + east, rel=0.01)
+    assert plan.stations[0, 0] < 1.9 and plan.stations[1, 0] > 2.1
+    assert plan.stations[:, 2] == pytest.approx([1.7, 1.7])
+    # The floor's upper side alone, and both faces of the partition.
+    found = areas(plan, scene)
+    assert found["Floor"] == pytest.approx((11.8 * 6, 11.8 * 6), rel=0.02)
+    assert found["Partition"] == pytest.approx((36, 36), rel=0.05)
+    one = areas(plan_stations(scene, EVERYWHERE, count=1, slant_deg=90), scene)
+    assert one["Partition"] == pytest.approx((36, 18), rel=0.05)
+    assert one["East"][1] == 0 < one["East"][0]
+
+
+def test_a_hall_with_a_column_and_a_door():
+    column = placed("Column", (0.6, 0.6, 3), (3, 0, 0))
+    scene = Scene.from_meshes([*rooms((0, -3, -0.5), (0, 0.5, 3)), column])
+    plans = {n: plan_stations(scene, EVERYWHERE, count=n, slant_deg=90) for n in (1, 2, 40)}
+    found = {n: areas(plan, scene) for n, plan in plans.items()}
+    sides = 4 * 0.6 * 3
+    assert found[1]["Floor"][0] == pytest.approx(72 - 1 - 0.36, rel=0.02)
+    assert found[1]["Column"][0] == pytest.approx(sides, rel=0.1)
+    assert found[1]["Column"][1] <= sides / 2 * 1.1  # two of four sides at most
+    assert found[40]["Column"] == (found[1]["Column"][0],) * 2
+    # Through the door the first sees some of the other room; the second sees more.
+    assert 0.6 < plans[1].coverage[0] < plans[2].coverage[1] < 1
+    assert plans[40].coverage[-1] == 1 and 3 <= len(plans[40].stations) < 40
+    assert (np.diff(plans[40].coverage) > 0).all()
+    for n in (1, 2):  # each is the beginning of the longer one, and always the same
+        np.testing.assert_array_equal(plans[n].stations, plans[40].stations[:n])
+    enough = plan_stations(scene, EVERYWHERE, coverage=plans[2].coverage[1], slant_deg=90)
+    assert len(enough.stations) == 2
+    left = np.abs(plans[1].candidates[:, :2] - (3, 0)).max(axis=1)
+    assert left.min() >= 0.3  # none in the column
+
+
+def test_what_is_inside_closed_things_or_under_them_does_not_count():
+    house = placed("House", (4, 4, 4), (0, 0, 0))
+    table = placed("Table", (2, 2, 0.1), (5, 5, 1))
+    scene = Scene.from_meshes([placed("Ground", (20, 20, 0.2), (0, 0, -0.2)), house, table])
+    plan = plan_stations(scene, EVERYWHERE, slant_deg=90)
+    found = areas(plan, scene)
+    assert found["House"][0] == pytest.approx(4 * 16, rel=0.03)  # its sides, not its roof
+    assert found["Table"][0] == pytest.approx(4 + 8 * 0.1, rel=0.1)  # its top and edges
+    within = np.abs(plan.candidates[:, :2])
+    assert len(plan.candidates) > 300 and not (within < 2).all(axis=1).any()
+    assert not (np.abs(within - 5) < 1).all(axis=1).all()
+
+
+def test_range_field_of_view_and_slant_limit_what_is_seen():
+    far = placed("Far", (2, 2, 5), (60, 0, 0))
+    scene = Scene.from_meshes([placed("Ground", (10, 10, 0.2), (0, 0, -0.2)), far])
+
+    def seen(sensor, slant_deg=90):
+        return plan_stations(scene, sensor, count=1, spacing_m=1, slant_deg=slant_deg)
+
+    assert seen(EVERYWHERE).visible_m2[1] > 9
+    assert seen(Sensor.grid(vertical_fov_deg=180, max_range_m=50)).visible_m2[1] == 0
+    # Below 30 degrees, or within 60 degrees of upright: a disc around the one place in the middle.
+    middle = Scene.from_meshes([placed("Ground", (10, 10, 0.2), (0, 0, -0.2))])
+    for sensor, slant_deg, expected in (
+        (EVERYWHERE, 60, np.pi * 3 * 1.7**2),
+        (Sensor.grid(vertical_fov_deg=60), 90, 100 - np.pi * 3 * 1.7**2),
+    ):
+        plan = plan_stations(middle, sensor, spacing_m=10, slant_deg=slant_deg)
+        assert plan.stations.tolist() == [[0, 0, 1.7]]
+        assert plan.visible_m2[0] == pytest.approx(expected, rel=0.02)
+
+
+def test_stations_are_in_world_coordinates_and_stand_on_pavements():
+    where = np.array([500_000.0, 5_400_000.0, 300.0])
+    parts = (
+        placed("Ground", (20, 20, 0.2), (0, 0, -0.2)),
+        placed("Pavement", (20, 20, 0.15), (0, 0, 0)),
+    )
+    scene = Scene.from_meshes([Mesh(m.name, m.vertices + where, m.faces) for m in parts])
+    plan = plan_stations(scene, EVERYWHERE, count=1, height_m=1.5)
+    assert np.abs(plan.candidates[:, :2] - where[:2]).max() < 10
+    assert plan.stations[0, 2] == pytest.approx(300 + 0.15 + 1.5)
+    assert plan.visible_m2[0] == 0 < plan.visible_m2[1]
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        ({"count": 2, "coverage": 0.9}, "give one of them"),
+        ({"count": 0}, "count is 0; it must be 1 to 100"),
+        ({"coverage": 95.0}, "coverage is 95.0; it must be above 0, at most 1"),
+        ({"height_m": -1.0}, "height_m is -1.0"),
+        ({"spacing_m": 0.001}, "give a larger spacing"),
+        ({"slant_deg": 91.0}, "slant_deg is 91.0"),
+        ({"sensor": load_sensor("livox/mid70")}, "does not look all around"),
+        ({"sensor": Sensor.grid(max_range_m=0.5)}, "Nothing is visible"),
+        ({"scene": Scene.from_meshes(POLES), "spacing_m": 3.0}, "The scene has no floor"),
+        ({"scene": Scene.from_meshes(POLES[:1])}, "There is no room on the floor"),
+    ],
+)
+def test_what_cannot_be_is_refused(given, says):
+    given = {"scene": Scene.from_meshes(rooms()), "sensor": EVERYWHERE, **given}
+    with pytest.raises(LidarpoolError, match=says):
+        plan_stations(**given)

@@ -1,0 +1,226 @@
+"""The command `lidarpool stations`: where to put a terrestrial scanner, and what it sees there."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ..base.errors import LidarpoolError
+from .terminal import shown_status
+
+if TYPE_CHECKING:
+    from ..plan.stations import StationPlan
+    from ..scenario.scenario import Scenario
+
+SCENARIO_FILE, PICTURE_FILE = "stations.yaml", "stations.png"
+_OBJECTS_TOLD = 12
+
+
+def _share(ctx: click.Context, param: click.Parameter, value: str | None) -> float | None:
+    """Parse a percentage such as 95% or 95."""
+    if value is None:
+        return None
+    try:
+        share = float(value.removesuffix("%")) / 100
+    except ValueError:
+        share = math.nan
+    if not (0.01 <= share <= 1):
+        raise click.BadParameter(f"{value!r} is not 1% to 100%: give a percentage, such as 95%.")
+    return share
+
+
+@click.command(context_settings={"show_default": True})
+@click.argument("scene", metavar="MESH|SCENARIO", type=click.Path(path_type=Path))
+@click.option(
+    "--sensor",
+    "model",
+    metavar="MODEL|FILE.yaml",
+    required=True,
+    help="The instrument: a model of lidarpool sensors, with or without its maker.",
+)
+@click.option("--count", type=click.IntRange(1, 100), help="Number of stations.")
+@click.option(
+    "--coverage",
+    callback=_share,
+    metavar="SHARE",
+    help="Choose until this share of what can be seen is covered, such as 95%; without --count "
+    "and --coverage, for as long as each station adds 1%.",
+)
+@click.option("--height", default=1.7, metavar="M", help="Of the instrument above the floor.")
+@click.option(
+    "--spacing",
+    type=float,
+    metavar="M",
+    help="Between the places that are tried.  [default: for about 600 places]",
+)
+@click.option("--slant", default=80.0, metavar="DEG", help="Largest angle of incidence.")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, file_okay=False),
+    metavar="FOLDER",
+    help="Folder for stations.yaml and stations.png.  [default: named after the scene]",
+)
+@click.option("--overwrite", is_flag=True, help="Replace existing files.")
+@click.option("--json", "as_json", is_flag=True, help="Print the plan as one JSON document.")
+def stations(
+    scene: Path,
+    model: str,
+    count: int | None,
+    coverage: float | None,
+    height: float,
+    spacing: float | None,
+    slant: float,
+    out: Path | None,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    """Choose stations for a terrestrial scan.
+
+    Places on the floor are tried, and whichever adds most to what is covered comes next. Coverage
+    is by area, of what any of these places sees. A scenario with the stations is written, and a
+    picture of what they cover.
+
+    \b
+    Examples:
+      lidarpool stations hall.glb --sensor riegl-vz400 --coverage 95%
+      lidarpool stations hall/scenario.yaml --sensor riegl-vz400 --count 6 --out hall/stations
+    """  # noqa: D301 - click wants the character, not its name
+    if count is not None and coverage is not None:
+        raise click.UsageError("--count and --coverage both say when to stop: give one of them.")
+    from ..plan.stations import STATIONS_MOST, plan_stations
+    from ..report.station_picture import draw_stations
+    from ..scenario.scenario import Scenario
+    from ..sensor.models import full_name, load_sensor
+
+    folder = Path(f"{scene.stem}-stations") if out is None else out
+    there = [folder / name for name in (SCENARIO_FILE, PICTURE_FILE) if (folder / name).exists()]
+    if there and not overwrite:
+        raise LidarpoolError(f"{there[0]} exists: give another folder, --out, or --overwrite.")
+    model = full_name(model)
+    sensor = load_sensor(model)
+    read = Scenario.load(scene)
+    with shown_status("reading the scene", as_json, logged=False):
+        built = read.build_scene()
+    with shown_status("looking from all places", as_json, logged=False):
+        plan = plan_stations(
+            built,
+            sensor,
+            count=count,
+            coverage=coverage,
+            height_m=height,
+            spacing_m=spacing,
+            slant_deg=slant,
+        )
+    with shown_status("drawing the picture", as_json, logged=False):
+        page = draw_stations(built, plan)
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / SCENARIO_FILE
+    file.write_text(_scenario(read, scene.parent, folder, model, plan), "utf-8", newline="\n")
+    page.save(folder / PICTURE_FILE)
+    notes = read.advice(built)
+    reached = float(plan.coverage[-1])
+    if coverage is not None and reached < coverage:
+        notes.append(
+            f"{coverage:.0%} is not reached: {STATIONS_MOST} stations, which is the most, cover "
+            f"{reached:.1%}; try a greater --height, --slant or --spacing"
+        )
+    if count is not None and len(plan.stations) < count:
+        notes.append(f"{len(plan.stations)} of {count} stations already see all that can be seen")
+    if as_json:
+        click.echo(json.dumps(_figures(plan, built.names, sensor.model, notes), indent=1))
+        return
+    for line in _told(plan, built.names):
+        click.echo(line)
+    for note in notes:
+        click.echo(f"note: {note}")
+    click.echo(f"stations in {click.format_filename(folder)}: {SCENARIO_FILE}, {PICTURE_FILE}")
+    click.echo(f"next: lidarpool check {shlex.quote(str(file))}")
+
+
+def _scenario(read: Scenario, base: Path, folder: Path, model: str, plan: StationPlan) -> str:
+    """Return the text of a scenario whose poses are the stations."""
+    import yaml
+
+    from ..scenario.scenario import MESH_CLOUD
+
+    def moved(file: str) -> str:
+        path = (base / Path(file).expanduser()).resolve()
+        return Path(os.path.relpath(path, folder.resolve())).as_posix()
+
+    entry = read.scene.model_dump(exclude_unset=True, mode="json")
+    if "files" in entry:
+        entry["files"] = [{**one, "file": moved(one["file"])} for one in entry["files"]]
+    if model.endswith((".yaml", ".yml")):
+        model = Path(os.path.relpath(Path(model).resolve(), folder.resolve())).as_posix()
+    data = {
+        **({"scene": entry} if entry else {}),
+        "sensor": {"model": model},
+        "poses": [[round(float(part), 3) for part in place] for place in plan.stations],
+        "steps": 36,
+        "cloud": {**MESH_CLOUD, "columns": ["range"]},
+    }
+    head = (
+        f"# {len(plan.stations)} stations that cover {plan.coverage[-1]:.1%} of what can be seen, "
+        "in the order\n# in which they were chosen. Steps are of 10 degrees: one turn from each.\n"
+    )
+    return head + yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=100)
+
+
+def _figures(
+    plan: StationPlan, names: tuple[str, ...], sensor: str, notes: list[str]
+) -> dict[str, Any]:
+    """Return what --json prints."""
+    return {
+        "sensor": sensor,
+        "places": len(plan.candidates),
+        "spacing_m": plan.spacing_m,
+        "stations": [
+            {"position": [round(float(part), 3) for part in place], "coverage": float(share)}
+            for place, share in zip(plan.stations, plan.coverage, strict=True)
+        ],
+        "objects": {
+            name: {"visible_m2": float(visible), "covered_m2": float(covered)}
+            for name, visible, covered in zip(names, plan.visible_m2, plan.covered_m2, strict=True)
+        },
+        "notes": notes,
+    }
+
+
+def _told(plan: StationPlan, names: tuple[str, ...]) -> Iterator[str]:
+    """Print a plan as lines of text: stations, then objects, those with most left first."""
+    from ..base.words import counted
+    from ..render.page import without_common_prefix
+
+    yield (
+        f"{counted(len(plan.candidates), 'place')} on a grid of {plan.spacing_m:g} m, which see "
+        f"{plan.visible_m2.sum():,.0f} m²"
+    )
+    yield "station        x          y          z   covered     added"
+    before = 0.0
+    rows = zip(plan.stations.tolist(), plan.coverage.tolist(), strict=True)
+    for number, ((x, y, z), share) in enumerate(rows, 1):
+        yield f"{number:7} {x:10,.2f} {y:10,.2f} {z:10,.2f} {share:9.1%} {share - before:9.1%}"
+        before = share
+    left = plan.visible_m2 - plan.covered_m2
+    order = [k for k in (-left).argsort(kind="stable").tolist() if plan.visible_m2[k] > 0]
+    shown = order[:_OBJECTS_TOLD]
+    labels = without_common_prefix(names)
+    wide = max(6, *(len(labels[k]) for k in shown))
+    yield f"{'object':<{wide}}  can be seen   covered"
+    for k in shown:
+        visible, covered = float(plan.visible_m2[k]), float(plan.covered_m2[k])
+        yield f"{labels[k]:<{wide}} {visible:9,.1f} m² {covered / visible:9.1%}"
+    if others := order[_OBJECTS_TOLD:]:
+        visible, covered = plan.visible_m2[others].sum(), plan.covered_m2[others].sum()
+        label = f"{len(others):,} others"
+        yield f"{label:<{wide}} {visible:9,.1f} m² {covered / visible:9.1%}"
+    blind = len(names) - len(order)
+    if blind:
+        yield f"out of sight from all places: {counted(blind, 'object')}"
