@@ -96,6 +96,31 @@ def test_what_is_inside_closed_things_or_under_them_does_not_count():
     assert not (np.abs(within - 5) < 1).all(axis=1).all()
 
 
+def test_each_side_of_a_thin_wall_counts_by_itself():
+    corners = np.array([[2, -3, 0], [2, 3, 0], [2, 3, 3], [2, -3, 3]], float)
+    sheet = Mesh("Sheet", corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    scene = Scene.from_meshes([*rooms(), sheet])
+    plan = plan_stations(scene, EVERYWHERE, count=1, slant_deg=90)
+    assert areas(plan, scene)["Sheet"] == pytest.approx((36, 18), rel=0.02)
+
+
+def test_a_hall_may_be_modelled_by_its_outside_alone():
+    scene = Scene.from_meshes([box("Hall", (8, 6, 3)), placed("Case", (1, 1, 2.5), (2.1, 1.1, 0))])
+    plan = plan_stations(scene, EVERYWHERE, slant_deg=90)
+    # Inner sides of the hall, less what the case stands on; and the sides of the case.
+    assert plan.visible_m2 == pytest.approx([180 - 1, 10], rel=0.03)
+    assert (np.abs(plan.candidates[:, :2] - (2.1, 1.1)).max(axis=1) > 0.5).all()
+
+
+def test_nobody_stands_on_eaves_or_tables_or_in_shelves():
+    shelf = [placed("Shelf", (3, 3, 0.02), (-3, -2, z)) for z in (0.5, 1.0, 2.9)]
+    roof = placed("Roof", (14, 12, 0.2), (0, 0, 3.5))
+    scene = Scene.from_meshes([placed("Floor", (10, 8, 0.2), (0, 0, -0.2)), roof, *shelf])
+    places = plan_stations(scene, EVERYWHERE, count=1, slant_deg=90).candidates
+    assert (np.abs(places[:, :2]) <= (5, 4)).all() and places[:, 2] == pytest.approx(1.7)
+    assert not (np.abs(places[:, :2] - (-3, -2)) < 1.5).all(axis=1).any()
+
+
 def test_range_field_of_view_and_slant_limit_what_is_seen():
     far = placed("Far", (2, 2, 5), (60, 0, 0))
     scene = Scene.from_meshes([placed("Ground", (10, 10, 0.2), (0, 0, -0.2)), far])

@@ -62,7 +62,7 @@ def _by_coverage(shot: Shot, plan: StationPlan) -> Shot:
     sight = Sight(shot.scene, plan.sight.sensor, plan.sight.slant_deg)  # it has been moved a little
     stations, places = (p - shot.scene.origin for p in (plan.stations, plan.candidates))
     width = shot.camera.size[0]
-    kinds = np.full(shot.whole.triangle.size, UNCOVERED)
+    kinds = np.full(shot.whole.triangle.size, HIDDEN)
     surface = np.flatnonzero(shot.whole.triangle >= 0)
     covered = _seen(sight, stations, shot.whole, surface)
     kinds[surface[covered]] = COVERED
@@ -71,10 +71,10 @@ def _by_coverage(shot: Shot, plan: StationPlan) -> Shot:
     block = left // width // _BLOCK * width + left % width // _BLOCK
     key = block * np.int64(len(shot.scene.faces)) + shot.whole.triangle[left]
     _, asked, alike = np.unique(key, return_index=True, return_inverse=True)
-    hidden = ~_seen(sight, places, shot.whole, left[asked])
-    kinds[left[hidden[alike]]] = HIDDEN
+    visible = _seen(sight, places, shot.whole, left[asked])
+    kinds[left[visible[alike]]] = UNCOVERED
     edges = shot.finer.triangle.size // max(len(shot.edges), 1)
-    finer = np.repeat(np.where(kinds[shot.edges] == COVERED, UNCOVERED, kinds[shot.edges]), edges)
+    finer = np.repeat(np.where(kinds[shot.edges] == COVERED, HIDDEN, kinds[shot.edges]), edges)
     some = np.flatnonzero(shot.finer.triangle >= 0)
     finer[some[_seen(sight, stations, shot.finer, some)]] = COVERED
     return replace(shot, whole=_painted(shot.whole, kinds), finer=_painted(shot.finer, finer))
