@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..base.errors import LidarpoolError
-from .terminal import shown_status
 
 if TYPE_CHECKING:
     from ..plan.stations import StationPlan
@@ -98,6 +97,7 @@ def stations(
     from ..report.station_picture import draw_stations
     from ..scenario.scenario import Scenario
     from ..sensor.models import full_name, load_sensor
+    from .terminal import shown_status
 
     folder = Path(f"{scene.stem}-stations") if out is None else out
     there = [folder / name for name in (SCENARIO_FILE, PICTURE_FILE) if (folder / name).exists()]
@@ -148,6 +148,7 @@ def _scenario(read: Scenario, base: Path, folder: Path, model: str, plan: Statio
     """Return the text of a scenario whose poses are the stations."""
     import yaml
 
+    from ..base.words import counted
     from ..scenario.scenario import MESH_CLOUD
 
     def moved(file: str) -> str:
@@ -167,8 +168,9 @@ def _scenario(read: Scenario, base: Path, folder: Path, model: str, plan: Statio
         "cloud": {**MESH_CLOUD, "columns": ["range"]},
     }
     head = (
-        f"# {len(plan.stations)} stations that cover {plan.coverage[-1]:.1%} of what can be seen, "
-        "in the order\n# in which they were chosen. Steps are of 10 degrees: one turn from each.\n"
+        f"# {counted(len(plan.stations), 'station')}, in the order in which they were chosen: "
+        f"{plan.coverage[-1]:.1%} of what\n# can be seen is covered. Steps are of 10 degrees: one "
+        "turn from each.\n"
     )
     return head + yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=100)
 

@@ -48,10 +48,10 @@ def draw_stations(scene: Scene, plan: StationPlan, size: tuple[int, int] = SIZE)
         for marker, name, colour in marks
     ]
     page.key(handles, 7.0)
+    places = counted(len(plan.candidates), "place")
     page.title(
-        "Stations",
-        f"{counted(len(plan.stations), 'station')} cover {plan.coverage[-1]:.1%} of what can be "
-        f"seen from {len(plan.candidates):,} places",
+        counted(len(plan.stations), "station").capitalize(),
+        f"{plan.coverage[-1]:.1%} covered of what can be seen from {places}",
         plan.sight.sensor.model,
     )
     return page
