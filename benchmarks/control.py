@@ -57,7 +57,6 @@ class Counted:
         """What the scheduler sent and received: all of its connections end at one address."""
         return max(self._bytes.values(), key=lambda counts: sum(counts.values()))
 
-
     def work(self, *, driver: bool = False) -> int:
         """Bytes that came with work: at the scheduler, or at all other ends in this process."""
         ends = self._bytes.values()
