@@ -7,14 +7,17 @@ import sys
 import threading
 import types
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta, timezone
 
 import laspy
 import numpy as np
 import pandas as pd
 import pye57
 import pytest
+from laspy.header import GpsTimeType
 from pypcd4.pypcd4 import PointCloud
 from rosbags.highlevel import AnyReader
+from rosbags.interfaces import QosDurability
 from rosbags.typesys import Stores, get_typestore
 
 from lidarpool import (
@@ -31,12 +34,15 @@ from lidarpool import (
 )
 from lidarpool.base.open3d_module import load_open3d
 from lidarpool.base.vocabulary import FORMATS
+from lidarpool.base.yamlfile import load_yaml
 from lidarpool.columns.storage import Storage
 from lidarpool.columns.table import TABLE
-from lidarpool.export import parquet, pieces
+from lidarpool.export import crs, parquet, pieces
 from lidarpool.export.boxes import Boxes
 from lidarpool.export.cloud_file import CloudFile
+from lidarpool.export.crs import wkt
 from lidarpool.export.formats import Format
+from lidarpool.export.ros import START_NS
 from lidarpool.export.sweeps import Sweeps
 from lidarpool.scene.actors import Actor, box
 from lidarpool.sensor.trajectory import matrices
@@ -231,7 +237,7 @@ def test_nuscenes_has_a_folder_for_each_sensor(written, cloud):
 @pytest.mark.parametrize(("layout", "step"), [("velodyne", 22), ("autoware", 32), ("ouster", 48)])
 def test_bags_have_points_frames_and_a_clock(written, cloud, sweeps, name, layout, step):
     store = get_typestore(Stores.ROS2_HUMBLE)
-    clouds, frames, boxes, clocks = {}, {}, [], []
+    clouds, frames, fixed, boxes, clocks = {}, {}, {}, [], []
     with AnyReader([written(name, layout)], default_typestore=store) as bag:
         for connection, when, data in bag.messages():
             message = bag.deserialize(data, connection.msgtype)
@@ -240,24 +246,38 @@ def test_bags_have_points_frames_and_a_clock(written, cloud, sweeps, name, layou
             elif connection.topic == "/tf":
                 for transform in message.transforms:
                     frames[transform.child_frame_id, when] = transform
+            elif connection.topic == "/tf_static":
+                # Without it, `ros2 bag play` would offer the frames only to those who listen then.
+                (offered,) = connection.ext.offered_qos_profiles
+                assert offered.durability == QosDurability.TRANSIENT_LOCAL
+                fixed |= {transform.child_frame_id: transform for transform in message.transforms}
             elif connection.topic == "/actors":
                 (box,) = message.markers
                 boxes.append((when, box))
             else:
                 clocks.append(when)
     assert {topic for topic, _ in clouds} == {"/front/points", "/rear/points"}
-    assert {frame for frame, _ in frames} == {"front", "rear", "Car"}
+    assert {frame for frame, _ in frames} == {"base_link", "Car"}
+    parents = {(one.header.frame_id, one.child_frame_id) for one in frames.values()}
+    assert parents == {("map", "base_link"), ("map", "Car")}
+    assert {(one.header.frame_id, name) for name, one in fixed.items()} == {
+        ("base_link", "front"), ("base_link", "rear")
+    }  # fmt: skip
+    mount = fixed["front"].transform
+    assert (mount.translation.x, mount.translation.z) == (1, 0.5)
+    np.testing.assert_allclose(2 * np.degrees(np.arcsin(mount.rotation.z)), 30)
+    assert min(clocks) == START_NS
     assert len(clouds) == len(clocks) == len(boxes) == 10
     # One box, however many sensors see it. The first of this time is of a sweep without points.
     assert {(box.ns, box.id) for _, box in boxes} == {("actors", 0)}
-    box = next(box for when, box in boxes if when == 300_000_000)
+    box = next(box for when, box in boxes if when == START_NS + 300_000_000)
     assert (box.header.frame_id, box.text, box.type) == ("map", "Car", box.CUBE)
     place = box.pose.position
     np.testing.assert_allclose([place.x, place.y, place.z], [5.6, 5, 0.75], atol=1e-12)
     assert (box.scale.x, box.scale.y, box.scale.z) == (4, 2, 1.5)
-    sweep, when = 7, 200_000_000
-    message, points = clouds["/rear/points", when], of_sweep(cloud, sweep)
-    assert (message.point_step, message.header.frame_id) == (step, "rear")
+    sweep, when = 2, START_NS + 200_000_000
+    message, points = clouds["/front/points", when], of_sweep(cloud, sweep)
+    assert (message.point_step, message.header.frame_id) == (step, "front")
     kinds = {2: "u1", 4: "u2", 6: "u4", 7: "f4"}
     row = np.dtype({
         "names": [field.name for field in message.fields],
@@ -266,11 +286,11 @@ def test_bags_have_points_frames_and_a_clock(written, cloud, sweeps, name, layou
         "itemsize": step,
     })  # fmt: skip
     rows = message.data.view(row)
-    place = frames["rear", when].transform
-    turn = [getattr(place.rotation, axis) for axis in "xyzw"]
-    inside = np.stack([rows[axis] for axis in "xyz"], axis=1).astype(float)
-    back = inside @ matrices(np.array([turn]))[0].T
-    back += [getattr(place.translation, axis) for axis in "xyz"]
+    back = np.stack([rows[axis] for axis in "xyz"], axis=1).astype(float)
+    for place in (mount, frames["base_link", when].transform):
+        turn = [getattr(place.rotation, axis) for axis in "xyzw"]
+        back = back @ matrices(np.array([turn]))[0].T
+        back += [getattr(place.translation, axis) for axis in "xyz"]
     np.testing.assert_allclose(back, points.positions, atol=2e-5)
     channel, time = {
         "velodyne": ("ring", "time"), "autoware": ("channel", "time_stamp"), "ouster": ("ring", "t")
@@ -383,20 +403,74 @@ def test_an_interrupt_waits_for_what_lazrs_writes(cloud, sweeps, tmp_path, monke
 
 def test_any_name_makes_a_topic_a_frame_and_a_folder(cloud, sweeps, tmp_path):
     """Also one that would lead out of the folder, and an actor called as the world's frame."""
-    odd = replace(sweeps, sensors=("../front", ".. front"), actors=("map",))
+    odd = replace(sweeps, sensors=("../front", "base_link"), actors=("map",))
     Format("nuscenes").write(tmp_path / "nuscenes", cloud, odd)
     folders = {path.name for path in (tmp_path / "nuscenes/samples").iterdir()}
-    assert folders == {"___front", "___front_2"}
+    assert folders == {"___front", "base_link"}
     Format("mcap").write(tmp_path / "cloud.mcap", cloud, odd)
     store = get_typestore(Stores.ROS2_HUMBLE)
     frames = set()
     with AnyReader([tmp_path / "cloud.mcap"], default_typestore=store) as bag:
-        assert {"/___front/points", "/___front_2/points"} < {*bag.topics}
+        assert {"/___front/points", "/base_link_2/points"} < {*bag.topics}
         for connection, _, data in bag.messages():
-            if connection.topic == "/tf":
+            if connection.topic.startswith("/tf"):
                 transforms = bag.deserialize(data, connection.msgtype).transforms
                 frames |= {transform.child_frame_id for transform in transforms}
-    assert frames == {"___front", "___front_2", "map_2"}
+    assert frames == {"base_link", "___front", "base_link_2", "map_2"}
+
+
+def test_readers_of_humble_parse_the_description_of_a_bag(written):
+    """They take profiles as text, as all do up to version 8."""
+    told = load_yaml((written("rosbag2") / "metadata.yaml").read_text())
+    told = told["rosbag2_bagfile_information"]
+    assert told["version"] == 8
+    for one in told["topics_with_message_count"]:
+        topic = one["topic_metadata"]
+        profiles = load_yaml(topic["offered_qos_profiles"]) or []
+        assert [profile["durability"] for profile in profiles] == [1] * (
+            topic["name"] == "/tf_static"
+        )
+
+
+def test_a_start_and_a_coordinate_system_are_in_files_that_hold_them(
+    cloud, scene, survey, tmp_path
+):
+    """Also after `sweeps.npz`, of which an export reads them."""
+    start = datetime(2026, 11, 21, 12, 0, tzinfo=timezone(timedelta(hours=2)))
+    Sweeps.of(replace(survey, start=start, epsg=25832), scene).save(tmp_path / "s.npz")
+    dated = Sweeps.load(tmp_path / "s.npz")
+    Format("laz").write(tmp_path / "a.laz", cloud, dated)
+    las = laspy.read(tmp_path / "a.laz")
+    assert str(las.header.creation_date) == "2026-11-21"
+    assert las.header.global_encoding.gps_time_type == GpsTimeType.STANDARD
+    # GPS time is 18 s ahead of UTC; adjusted standard GPS time is a billion seconds behind it.
+    since = start - datetime(1980, 1, 6, tzinfo=UTC)
+    begins = since.total_seconds() + 18 - 1e9
+    np.testing.assert_allclose(las.gps_time - begins, cloud.time / 1e9, atol=1e-7)
+    np.testing.assert_array_equal(las["time"], cloud.time)
+    (system,) = las.header.vlrs.get("WktCoordinateSystemVlr")
+    assert 'PROJCS["ETRS89 / UTM zone 32N"' in system.string and 'AUTHORITY["EPSG","25832"]]' in (
+        system.string
+    )
+    Format("mcap").write(tmp_path / "a.mcap", cloud, dated)
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    with AnyReader([tmp_path / "a.mcap"], default_typestore=store) as bag:
+        assert bag.start_time == start.timestamp() * 1e9
+
+
+@pytest.mark.parametrize(
+    ("epsg", "middle", "north"), [(32601, -177, 0), (32733, 15, 10_000_000), (25838, 45, 0)]
+)
+def test_zones_of_utm_need_no_other_package(epsg, middle, north):
+    text = wkt(epsg)
+    assert f'"central_meridian",{middle}]' in text and f'"false_northing",{north}]' in text
+    assert text.count("[") == text.count("]")
+
+
+def test_other_coordinate_systems_come_from_pyproj(monkeypatch):
+    monkeypatch.setattr(crs, "find_spec", lambda name: None)
+    with pytest.raises(LidarpoolError, match=r"EPSG:2056 is not a UTM zone .*: pip install pyproj"):
+        wkt(2056)
 
 
 @pytest.fixture(scope="module")
@@ -526,7 +600,9 @@ def test_a_cloud_is_saved_in_the_format_of_its_ending(cloud, sweeps, tmp_path):
     assert left_out[:2] == ["scan", "object"] and "range" not in left_out
     store = get_typestore(Stores.ROS2_HUMBLE)
     with AnyReader([tmp_path / "c.mcap"], default_typestore=store) as bag:
-        assert {"/front/points", "/rear/points", "/tf", "/actors", "/clock"} == set(bag.topics)
+        assert {"/front/points", "/rear/points", "/tf", "/tf_static", "/actors", "/clock"} == {
+            *bag.topics
+        }
     (tmp_path / "result").mkdir()
     sweeps.save(tmp_path / "result/sweeps.npz")
     known.save(tmp_path / "result/cloud.ply")

@@ -2,6 +2,7 @@
 
 import itertools
 import shutil
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -77,7 +78,7 @@ def test_the_seed_example_writes_out_the_defaults():
     stated = read_yaml(EXAMPLES / "seed.yaml")
     plain, scenario = Scenario().model_dump(), Scenario.load(EXAMPLES / "seed.yaml")
     loaded = scenario.model_dump()
-    assert stated["cloud"].keys() == plain["cloud"].keys()
+    assert stated["cloud"].keys() == plain["cloud"].keys() - {"epsg", "start"}
     chosen = {"keep_every": SEED_KEPT, "precision_m": Sensor().optics.resolution_m}
     assert loaded["cloud"] == plain["cloud"] | chosen
     sensors = (scenario.sensor.sensor(Path()), Sensor(), Sensor.grid())
@@ -438,3 +439,12 @@ def test_it_is_told_that_gltf_was_turned_and_what_to_say(tmp_path, size, generat
     assert len(told) == bool(says)
     if says:
         assert says in told[0] and "set up_axis: z in scene.files" in told[0]
+
+
+def test_a_start_is_a_time_of_yaml_or_text(scenario):
+    for text in ("2026-11-21T10:00:00Z", "'2026-11-21T12:00:00+02:00'"):
+        loaded = scenario(f"cloud: {{epsg: 25832, start: {text}}}")
+        survey = loaded.survey(loaded.build_scene())
+        assert (survey.epsg, survey.start) == (25832, datetime(2026, 11, 21, 10, tzinfo=UTC))
+    with pytest.raises(LidarpoolError, match=r"cloud\.start"):
+        scenario("cloud: {start: 2026-11-21T10:00:00}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from datetime import UTC, datetime
 
 import numpy as np
 import pytest
@@ -110,3 +111,11 @@ def test_each_sensor_may_start_later_and_take_steps_of_its_own():
 def test_a_pose_that_looks_straight_up_or_down_is_found_again(yaw, pitch):
     turned = Pose((0, 0, 0), yaw, pitch, 20).rotation
     assert np.allclose(Pose.of((1, 2, 3), turned).rotation, turned, atol=1e-12)
+
+
+def test_a_start_needs_a_time_zone_and_a_year_of_known_leap_seconds():
+    for start in (datetime(2026, 11, 21), datetime(2016, 12, 31, tzinfo=UTC)):
+        with pytest.raises(LidarpoolError, match="a time from 2017 on, with its time zone"):
+            Survey(poses=[(0, 0, 1)], start=start)
+    with pytest.raises(LidarpoolError, match="epsg is 5; it must be 1024 to 32767"):
+        Survey(poses=[(0, 0, 1)], epsg=5)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from datetime import date
+from datetime import UTC, date, datetime
 from pathlib import Path
 from textwrap import shorten
 from typing import Any
@@ -10,17 +10,22 @@ from typing import Any
 import laspy
 import lazrs
 import numpy as np
+from laspy.vlrs.known import WktCoordinateSystemVlr
 from numpy.typing import NDArray
 
 from ..base.errors import LidarpoolError
 from ..base.interrupts import deferred_interrupts
 from ..columns.cloud import Cloud, CloudLike
 from ..columns.table import TABLE
+from .crs import wkt
 from .sweeps import Sweeps
 
 ANGLE_DEG = 0.006  # of one step of the format's scan angle
 FULL = 65_535  # the format's intensity for 1 and above
 _OF_FORMAT = ("return_number", "returns", "azimuth")  # stored only in fields of the format
+_GPS_NS = 315_964_800 * 10**9  # from 1970-01-01 to 1980-01-06, the start of GPS time
+_LEAP_S = 18  # that GPS time is ahead of UTC since 2017, the earliest start
+_ADJUSTED_S = 1e9  # that adjusted standard GPS time is behind GPS time
 _FAR = 2**31 - 1  # steps from the offset to the farthest point
 
 
@@ -37,15 +42,23 @@ def write_laz(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
 def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> None:
     """Write a cloud: columns with a field of the format there, the others in extra bytes.
 
-    `time` is the GPS time in seconds, `return_number` and `returns` are as they are, `azimuth`
-    (-180 to 180 degrees) is the scan angle, `sensor` + 1 the point source. Intensity is the column
-    `intensity` times 65,535, at most that, and classification `class` if it is below 256; because
-    of these limits, both columns are in the extra bytes as well. Return numbers are 15 at most,
-    and angles in steps of 0.006 degrees.
+    `time` is adjusted standard GPS time of a survey with a start, else seconds since the survey's
+    start. A coordinate system is stored as WKT. `return_number` and `returns` are as they are,
+    `azimuth` (-180 to 180 degrees) is the scan angle, `sensor` + 1 the point source. Intensity is
+    the column `intensity` times 65,535, at most that, and classification `class` if it is below
+    256; because of these limits, both columns are in the extra bytes as well. Return numbers are
+    15 at most, and angles in steps of 0.006 degrees.
     """
     header = laspy.LasHeader(version="1.4", point_format=6)
     header.generating_software = "lidarpool"
-    header.creation_date = date(1980, 1, 6)  # of GPS time 0, at which surveys begin
+    header.creation_date = date(1980, 1, 6)  # of GPS time 0, at which surveys without a date begin
+    begins_s = 0.0
+    if sweeps.start_ns is not None:
+        header.creation_date = datetime.fromtimestamp(sweeps.start_ns // 10**9, UTC).date()
+        header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
+        begins_s = (sweeps.start_ns - _GPS_NS) / 1e9 + _LEAP_S - _ADJUSTED_S
+    if sweeps.epsg is not None:
+        header.vlrs.append(WktCoordinateSystemVlr(wkt(sweeps.epsg)))
     # LAS 1.4 wants it of formats 6 and above, with a coordinate system or without; PDAL before
     # 2.7.2, and what reads through it, opens no others (PDAL's issue 4412).
     header.global_encoding.wkt = True
@@ -73,7 +86,7 @@ def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> N
             laspy.open(file, "w", header=header, do_compress=compress, closefd=False) as writer,
         ):
             for chunk in cloud.chunks():
-                points = _points(chunk, header, names)
+                points = _points(chunk, header, names, begins_s)
                 with deferred_interrupts():  # lazrs replaces errors raised within it
                     writer.write_points(points)
             with deferred_interrupts():
@@ -82,7 +95,7 @@ def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> N
         raise OSError(f"{error}; the disk may be full") from error
 
 
-def _points(chunk: Cloud, header: laspy.LasHeader, extra: list[str]) -> Any:
+def _points(chunk: Cloud, header: laspy.LasHeader, extra: list[str], begins_s: float) -> Any:
     record = laspy.ScaleAwarePointRecord.zeros(len(chunk), header=header)
     record.x, record.y, record.z = chunk.positions.T.astype(np.float64)
     there = chunk.columns
@@ -90,7 +103,7 @@ def _points(chunk: Cloud, header: laspy.LasHeader, extra: list[str]) -> Any:
     record.return_number = _at_most(there.get("return_number", one), 15)
     record.number_of_returns = _at_most(there.get("returns", one), 15)
     if "time" in there:
-        record.gps_time = there["time"] / 1e9
+        record.gps_time = there["time"] / 1e9 + begins_s
     if "intensity" in there:
         record.intensity = np.round(np.clip(there["intensity"], 0, 1) * FULL).astype(np.uint16)
     if "azimuth" in there:

@@ -1,4 +1,4 @@
-"""Bags of ROS 2, as MCAP, through rosbags: PointCloud2, /tf, /actors and /clock."""
+"""Bags of ROS 2, as MCAP, through rosbags: PointCloud2, frames, /actors and /clock."""
 
 from __future__ import annotations
 
@@ -9,6 +9,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rosbags.interfaces import (
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -16,7 +24,14 @@ from ..columns.cloud import Cloud, CloudLike
 from .boxes import Boxes
 from .sweeps import Placed, Sweeps, plain_names
 
-WORLD = "map"  # the frame of the world
+WORLD, CARRIER = "map", "base_link"  # frames
+# Of a survey without a date: at time 0, tf2 would take the newest frames for all times.
+START_NS = 1_000_000_000_000_000_000
+# As `ros2 bag play` must offer it, so that late listeners get the frames, too.
+_LATCHED = Qos(
+    QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL,
+    QosTime(0, 0), QosTime(0, 0), QosLiveliness.AUTOMATIC, QosTime(0, 0), False,
+)  # fmt: skip
 _KINDS = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 # Fields of a point: name, type, offset, and the column that it is made of.
 _LAYOUTS: dict[str, tuple[int, tuple[tuple[str, str, int], ...]]] = {
@@ -43,12 +58,16 @@ _LAYOUTS: dict[str, tuple[int, tuple[tuple[str, str, int], ...]]] = {
 def write_rosbag2(path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str) -> None:
     """Write a bag, a folder for `ros2 bag play`; see `write_mcap`."""
     store = get_typestore(Stores.ROS2_HUMBLE)
-    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+    # Readers of Humble take no later version: from 9 on, its profiles are lists.
+    with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as bag:
         topics: dict[str, Any] = {}
         for topic, message, time_ns in _messages(cloud, sweeps, layout, store.types):
             kind = message.__msgtype__
             if topic not in topics:
-                topics[topic] = bag.add_connection(topic, kind, typestore=store)
+                latched = (_LATCHED,) if topic == "/tf_static" else ()
+                topics[topic] = bag.add_connection(
+                    topic, kind, typestore=store, offered_qos_profiles=latched
+                )
             bag.write(topics[topic], time_ns, store.serialize_cdr(message, kind))
 
 
@@ -56,9 +75,10 @@ def write_mcap(path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str) -> Non
     """Write an MCAP file.
 
     Each sweep is a PointCloud2 on `/NAME/points`, NAME that of its sensor, or on `/points`. Points
-    are in the sensor's axes when the sweep began. `/tf` has the frames of sensors and actors in
-    `map`, and `/clock` the time, both at each sweep. The survey begins at time 0. `/actors` has a
-    MarkerArray of the boxes of actors where their points of the sweep are.
+    are in the sensor's axes when the sweep began. `/tf` has the frames of the carrier (`base_link`)
+    and of actors in `map`, and `/clock` the time, both at each sweep; `/tf_static` has the sensors
+    on the carrier. The survey begins at its start, or at `START_NS` without one. `/actors` has
+    a MarkerArray of the boxes of actors where their points of the sweep are.
 
     Layouts of a point: `velodyne` (22 bytes; its time in seconds since the sweep began),
     `autoware` (PointXYZIRCAEDT, 32 bytes; angles in radians, time_stamp in ns since the sweep
@@ -88,16 +108,23 @@ def _messages(
     fields = [field(name, offset, _KINDS[kind], 1) for name, kind, offset in described]
     make = _Messages(types)
     named = (*(name or "lidar" for name in sweeps.sensors), *sweeps.actors)
-    _, *frames = plain_names((WORLD, *named))
+    _, _, *frames = plain_names((WORLD, CARRIER, *named))
     actors = frames[len(sweeps.sensors) :]
-    placed = list(zip(actors, sweeps.actor_poses, strict=True))
+    moving = [(CARRIER, sweeps.carrier), *zip(actors, sweeps.actor_poses, strict=True)]
+    start_ns = START_NS if sweeps.start_ns is None else sweeps.start_ns
+    on_carrier = [
+        (CARRIER, frame, sweeps.mounts, number)
+        for number, frame in enumerate(frames[: len(sweeps.sensors)])
+    ]
+    yield "/tf_static", make.transforms(on_carrier, start_ns), start_ns
     for sweep, points in enumerate(sweeps.points(cloud)):
-        time_ns = round(sweeps.begins_ns[sweep])
+        time_ns = start_ns + round(sweeps.begins_ns[sweep])
         frame = frames[sweeps.sensor[sweep]]
         topic = f"/{frame}/points" if sweeps.sensors[sweeps.sensor[sweep]] else "/points"
         rows = _rows(row, points, sweeps, sweep)
+        in_world = [(WORLD, name, placed, sweep) for name, placed in moving]
         yield "/clock", types["rosgraph_msgs/msg/Clock"](make.stamp(time_ns)), time_ns
-        yield "/tf", make.transforms([(frame, sweeps.pose), *placed], sweep, time_ns), time_ns
+        yield "/tf", make.transforms(in_world, time_ns), time_ns
         message = types["sensor_msgs/msg/PointCloud2"](
             make.header(frame, time_ns), 1, len(rows), fields, False, step,
             step * len(rows), rows.view(np.uint8).ravel(), True,
@@ -153,20 +180,20 @@ class _Messages:
         """Header of a message."""
         return self._types["std_msgs/msg/Header"](self.stamp(time_ns), frame)
 
-    def transforms(self, frames: list[tuple[str, Placed]], sweep: int, time_ns: int) -> Any:
-        """Frames in the world at the start of a sweep."""
+    def transforms(self, frames: list[tuple[str, str, Placed, int]], time_ns: int) -> Any:
+        """Frames in others: parent, name, poses, and which of them."""
         kind = "geometry_msgs/msg/"
         vector, turn = self._types[f"{kind}Vector3"], self._types[f"{kind}Quaternion"]
         transform, stamped = self._types[f"{kind}Transform"], self._types[f"{kind}TransformStamped"]
         return self._types["tf2_msgs/msg/TFMessage"]([
             stamped(
-                self.header(WORLD, time_ns), name,
+                self.header(parent, time_ns), name,
                 transform(
-                    vector(*placed.positions[sweep].tolist()),
-                    turn(*placed.quaternions[sweep].tolist()),
+                    vector(*placed.positions[which].tolist()),
+                    turn(*placed.quaternions[which].tolist()),
                 ),
             )
-            for name, placed in frames
+            for parent, name, placed, which in frames
         ])  # fmt: skip
 
     def markers(self, boxes: Boxes, actors: list[str], time_ns: int) -> Any:

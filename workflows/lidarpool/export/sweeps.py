@@ -19,6 +19,7 @@ from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud, CloudLike
 from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
+from ..sensor.survey import nanoseconds
 from ..sensor.trajectory import matrices, quaternions_of
 
 Floats = NDArray[np.float64]
@@ -28,7 +29,7 @@ MIXED_UP = (
     f"({SWEEPS_FILE}): give both of one run, and keep the order."
 )
 _PIECE = 250_000  # points that are read at a time: several threads or tasks have so many
-_FORMAT = 1
+_FORMAT = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +68,8 @@ class Sweeps:
         uint8 (n,): number of its sensor.
     pose
         Poses of the sensors.
+    mounts
+        Pose of each sensor in the carrier's axes.
     sensors, objects, actors
         Names; those of actors follow those of objects in the column `object`.
     actor_poses
@@ -77,12 +80,17 @@ class Sweeps:
         Of the cloud's points, "world" or "sensor".
     precision_m
         Step to which positions were rounded, metres.
+    epsg
+        Code of the coordinate system of the world; None if unknown.
+    start_ns
+        Nanoseconds from 1970-01-01 UTC to the survey's start; None if unknown.
     """
 
     scans: NDArray[np.int64]
     begins_ns: Floats
     sensor: NDArray[np.uint8]
     pose: Placed
+    mounts: Placed
     sensors: tuple[str, ...]
     objects: tuple[str, ...]
     actors: tuple[str, ...]
@@ -90,6 +98,8 @@ class Sweeps:
     actor_bounds: Floats
     coordinates: str
     precision_m: float
+    epsg: int | None = None
+    start_ns: int | None = None
 
     def __len__(self) -> int:
         return len(self.begins_ns)
@@ -98,6 +108,14 @@ class Sweeps:
         """Points (k, 3) of a sweep in its sensor's axes: at its start, or as stored."""
         exact = points.astype(np.float64)
         return exact if self.coordinates == "sensor" else self.pose.inward(sweep, exact)
+
+    @cached_property
+    def carrier(self) -> Placed:
+        """Poses of the carrier."""
+        mounts = matrices(self.mounts.quaternions)[self.sensor]
+        turns = matrices(self.pose.quaternions) @ mounts.transpose(0, 2, 1)
+        levers = np.einsum("nij,nj->ni", turns, self.mounts.positions[self.sensor])
+        return _placed(self.pose.positions - levers, turns)
 
     @cached_property
     def numbers(self) -> NDArray[np.int64]:
@@ -109,7 +127,7 @@ class Sweeps:
         """Return no sweeps, for points of an unknown survey, in steps of a millimetre."""
         none = Placed(np.empty((0, 3)), np.empty((0, 4)))
         return cls(
-            np.zeros(1, np.int64), np.empty(0), np.empty(0, np.uint8), none, (), (), (), (),
+            np.zeros(1, np.int64), np.empty(0), np.empty(0, np.uint8), none, none, (), (), (), (),
             np.empty((0, 2, 3)), "world", 0.001,
         )  # fmt: skip
 
@@ -117,13 +135,14 @@ class Sweeps:
     def of(cls, survey: Survey, scene: Scene) -> Sweeps:
         """Return the sweeps of a survey of a scene."""
         path = survey.path
-        scans, begins, sensors, places, turns, done = [], [], [], [], [], 0
+        scans, begins, sensors, places, turns, mounts, done = [], [], [], [], [], [], 0
         for number, (carried, steps) in enumerate(
             zip(survey.carried, survey.steps_each, strict=True)
         ):
             firsts, since = _of_head(carried.sensor, steps)
             mount = carried.mount
             turned = np.eye(3) if mount.rotation is None else mount.rotation
+            mounts.append((mount.position, turned))
             for station in range(path.stations):
                 positions, rotations = _poses(survey, station, since)
                 places.append(positions + rotations @ np.array(mount.position))
@@ -146,6 +165,7 @@ class Sweeps:
             when,
             np.concatenate(sensors),
             _placed(np.concatenate(places) + scene.origin, np.concatenate(turns)),
+            _placed(*(np.array(part) for part in zip(*mounts, strict=True))),
             tuple(carried.name for carried in survey.carried),
             tuple(scene.names),
             tuple(actor.name for actor in scene.actors),
@@ -153,6 +173,8 @@ class Sweeps:
             np.array(bounds).reshape(-1, 2, 3),
             survey.coordinates,
             survey.precision_m,
+            survey.epsg,
+            None if survey.start is None else nanoseconds(survey.start),
         )
 
     def points(self, cloud: CloudLike, first: int = 0, stop: int | None = None) -> Iterator[Cloud]:
@@ -192,6 +214,8 @@ class Sweeps:
             "actors": self.actors,
             "coordinates": self.coordinates,
             "precision_m": self.precision_m,
+            "epsg": self.epsg,
+            "start_ns": self.start_ns,
         }
         arrays: dict[str, Any] = {
             "words": np.frombuffer(json.dumps(words).encode(), np.uint8),
@@ -200,6 +224,8 @@ class Sweeps:
             "sensor": self.sensor,
             "positions": self.pose.positions,
             "quaternions": self.pose.quaternions,
+            "mount_positions": self.mounts.positions,
+            "mount_quaternions": self.mounts.quaternions,
             "actor_bounds": self.actor_bounds,
         }
         for number, placed in enumerate(self.actor_poses):
@@ -218,8 +244,9 @@ class Sweeps:
             (self.sensor.shape, (count,)),
             (self.actor_bounds.shape, (len(self.actors), 2, 3)),
         }
-        for placed in (self.pose, *self.actor_poses):
-            shapes |= {(placed.positions.shape, (count, 3)), (placed.quaternions.shape, (count, 4))}
+        each = [(placed, count) for placed in (self.pose, *self.actor_poses)]
+        for placed, many in (*each, (self.mounts, len(self.sensors))):
+            shapes |= {(placed.positions.shape, (many, 3)), (placed.quaternions.shape, (many, 4))}
         wrong = [f"{one} for {other}" for one, other in shapes if one != other]
         if wrong or (count and self.sensor.max() >= len(self.sensors)):
             raise ValueError(f"its arrays do not fit together {'; '.join(wrong[:1])}".strip())
@@ -247,6 +274,7 @@ class Sweeps:
                     arrays["begins_ns"],
                     arrays["sensor"],
                     Placed(arrays["positions"], arrays["quaternions"]),
+                    Placed(arrays["mount_positions"], arrays["mount_quaternions"]),
                     tuple(words["sensors"]),
                     tuple(words["objects"]),
                     tuple(words["actors"]),
@@ -254,6 +282,8 @@ class Sweeps:
                     arrays["actor_bounds"],
                     words["coordinates"],
                     words["precision_m"],
+                    words["epsg"],
+                    words["start_ns"],
                 )
             found._check()
             return found

@@ -128,6 +128,8 @@ def _parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
         "returns": asdict(survey.returns),
         "noise": asdict(survey.noise),
         "visibility_km": survey.visibility_km,
+        "epsg": survey.epsg,
+        "start": None if survey.start is None else survey.start.isoformat(),
     }
 
 

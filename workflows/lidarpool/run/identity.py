@@ -39,6 +39,8 @@ def identity_of(job: Job) -> dict[str, str]:
             survey.returns,
             survey.noise,
             survey.visibility_km,
+            survey.epsg,
+            str(survey.start),
         ),
         "planning": "" if job.planning is None else fingerprint(job.planning),
     }

@@ -385,6 +385,8 @@ class Scenario(Section):
                 returns=Returns(**self.returns.model_dump()),
                 noise=Noise(**self.noise.model_dump()),
                 visibility_km=self.weather.visibility_km,
+                epsg=self.cloud.epsg,
+                start=self.cloud.start,
             )
 
     def plan(self, scene: Scene) -> Planning | None:

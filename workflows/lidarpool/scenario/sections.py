@@ -6,7 +6,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, Strict, model_validator
+from pydantic import (
+    AwareDatetime,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    Strict,
+    model_validator,
+)
 
 from ..base.arguments import shown
 from ..base.vocabulary import BACKENDS, FORMATS, LAYOUTS, columns_needed
@@ -326,6 +334,20 @@ class CloudSection(Section):
             examples=[["time", "range", "intensity"]],
         ),
     ] = ()
+    epsg: Annotated[
+        Annotated[int, Field(ge=1024, le=32767)] | None,
+        Field(
+            description="EPSG code of the world's coordinate system, for LAS and LAZ",
+            examples=[25832],
+        ),
+    ] = None
+    start: Annotated[
+        Annotated[AwareDatetime, Strict(False)] | None,
+        Field(
+            description="when the survey starts, with its time zone, for LAS, LAZ and bags",
+            examples=["2026-11-21T10:00:00Z"],
+        ),
+    ] = None
 
 
 class ExportSection(Section):

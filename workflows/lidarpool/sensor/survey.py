@@ -5,6 +5,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
 from functools import cached_property, partial
 from itertools import accumulate
 from typing import Any
@@ -24,7 +25,13 @@ STEPS = 36  # default at each pose: one turn of most sensors
 STEPS_MOST = 10_000_000  # along a trajectory
 SENSORS_MOST = 255  # the type of the column
 RAYS_MOST = 1 << 32  # of a scan, which is cast in one call
+START_FROM = datetime(2017, 1, 1, tzinfo=UTC)  # since when GPS and UTC have been 18 s apart
 LASTS_MOST_NS = 2.0**63  # the type of the column time: 292 years
+
+
+def nanoseconds(when: datetime) -> int:
+    """Nanoseconds from 1970-01-01 UTC to a time with a time zone."""
+    return (when - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1) * 1000
 
 
 @dataclass(frozen=True)
@@ -124,6 +131,10 @@ class Survey:
         Noise of ranges and angles, and lost returns.
     visibility_km
         Meteorological visibility; None for air without extinction.
+    epsg
+        EPSG code of the world's coordinate system, for files that name one.
+    start
+        When the survey starts, from 2017 on and with a time zone, for files that hold dates.
 
     Raises
     ------
@@ -151,6 +162,8 @@ class Survey:
     returns: Returns = field(default_factory=Returns)
     noise: Noise = field(default_factory=Noise)
     visibility_km: float | None = None
+    epsg: int | None = None
+    start: datetime | None = None
 
     def __post_init__(self) -> None:
         poses = _poses(self.poses)
@@ -178,7 +191,12 @@ class Survey:
         if getattr(self, "precision_m", None) is None:
             finest = min(carried.sensor.optics.resolution_m for carried in self.carried)
             object.__setattr__(self, "precision_m", finest)
-        check_numbers(self, {"visibility_km": (1e-3, 1e6)})
+        check_numbers(self, {"visibility_km": (1e-3, 1e6), "epsg": (1024, 32767)})
+        if self.start is not None and (self.start.tzinfo is None or self.start < START_FROM):
+            raise LidarpoolError(
+                f"start is {self.start}; it must be a time from 2017 on, with its time zone: "
+                "2026-11-21T10:00:00Z."
+            )
         for carried in self.carried:
             self.returns.of(carried.sensor.optics)  # LidarpoolError if they do not fit together
         limits = [("keep_every", 1), ("precision_m", 1e-6), ("steps", 1)]
