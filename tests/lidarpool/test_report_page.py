@@ -91,6 +91,7 @@ def write(tmp_path: Path) -> Callable[..., tuple[str, dict[str, Any]]]:
         plan: Planning | None = PLANNING,
         scenario: Scenario | None = SCENARIO,
         origin: tuple[float, float, float] = (0, 0, 0),
+        cloud: Cloud | None = None,
         **changes: Any,
     ) -> tuple[str, dict[str, Any]]:
         scene = replace(scene_of(names), origin=np.array(origin))
@@ -104,7 +105,7 @@ def write(tmp_path: Path) -> Callable[..., tuple[str, dict[str, Any]]]:
                 "scene": scene,
                 "survey": survey,
                 "planning": plan,
-                "points": cloud_of(points, len(names), survey.scan_count, 16),
+                "points": cloud or cloud_of(points, len(names), survey.scan_count, 16),
                 "plan": best(trials, plan) if plan else None,
                 "trials": trials,
                 "backend": "numpy",
@@ -128,9 +129,9 @@ def write(tmp_path: Path) -> Callable[..., tuple[str, dict[str, Any]]]:
         drawn = PICTURES if plan else PICTURES[:3]
         pictures = {name: f'<svg id="{name}"></svg>' for name in drawn}
         files = [*(f"{name}.png" for name in drawn), "report.html", "report.json"]
-        cloud = counted(result.points, len(scene.names))
-        report = make_report(result, files, cloud)
-        write_page(tmp_path / "report.html", report, result, cloud, pictures, scenario)
+        numbers = counted(result.points, len(scene.names))
+        report = make_report(result, files, numbers)
+        write_page(tmp_path / "report.html", report, result, numbers, pictures, scenario)
         return (tmp_path / "report.html").read_text(encoding="utf-8"), report
 
     return write
@@ -161,7 +162,7 @@ def test_names_are_words_and_never_markup(write):
         for text in (tame, evil)
     ]
     assert shapes[0] == shapes[1]
-    assert html.fromstring(evil).findtext(".//h1").startswith("Lidar survey: x onerror=y>&amp;{{ 7")
+    assert "x onerror=y>&amp;{{ 7" in html.fromstring(evil).xpath("string(//dl[1])")
     assert not set("\u202e\x00\udc80") & set(evil)
 
 
@@ -195,6 +196,42 @@ def test_points_by_object_are_all_accounted_for(write):
     missed = re.search(r"(\d+) objects? without points", text)
     assert int(more[2].replace(",", "")) == report["points"] - sum(counts)
     assert int(more[1]) + OBJECTS_MOST + (int(missed[1]) if missed else 0) == 300
+
+
+def test_the_head_says_who_scanned_and_what_a_user_asks_for(write):
+    """Times and placement of tasks are further down, behind the survey and its cloud."""
+    text, _ = write()
+    page = html.fromstring(text)
+    assert page.findtext(".//h1") == page.findtext(".//title")
+    assert page.findtext(".//h1") == "Sensor with 16 channels from 2 positions"
+    facts = {
+        fact.findtext("dt"): fact.findtext("dd") for fact in page.xpath("//dl[@class='facts']/div")
+    }
+    assert facts["points in the cloud"] == "500"
+    assert facts["of scanning"] == "333 ms"
+    assert {"points per m² of surface, the median", "size of the cloud"} < {*facts}
+    assert not [what for what in facts if "partition" in what or "overlap" in what]
+    order = page.xpath("//h2/text()")
+    assert order.index("The cloud") < order.index("Sensor and scene") < order.index("Timeline")
+
+
+def test_ranges_are_at_the_head_if_the_cloud_has_them(write):
+    cloud = cloud_of(500, 2, 120, 16)
+    ranges = {**cloud.columns, "range": np.linspace(0.5, 98.7, 500).astype(np.float32)}
+    text, _ = write(cloud=Cloud(cloud.positions, ranges))
+    assert "0.5 to 98.7 m" in text and "size of the cloud" not in text
+
+
+@pytest.mark.parametrize("each", [4, 400])
+def test_the_density_is_that_of_the_surfaces(each):
+    """Of a floor and a wall, sparser than a cell has or denser, wherever they are."""
+    side = np.arange(0, 20, 1 / np.sqrt(each))
+    u, v = (axis.ravel() for axis in np.meshgrid(side, side))
+    zero = np.zeros_like(u)
+    both = np.concatenate([np.stack([u, v, zero], axis=1), np.stack([u, zero, v], axis=1)])
+    columns = {name: np.zeros(len(both), np.int32) for name in ("scan", "channel", "object")}
+    found = counted(Cloud(both + np.array([5e5, 0, 100]), columns), 1)
+    assert found.density == pytest.approx(each, rel=0.3)
 
 
 class Chunks(Cloud):

@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 from ..columns.cloud import CHUNK_POINTS, Cloud, CloudLike
 from ..columns.table import Column
 
+_CELLS = 64  # along an axis of the grid in which points are counted, a power of two
+_ENOUGH = 12  # points in a cell from which a density is estimated
+
 
 class CountedCloud:
     """A cloud that computes its statistics while its points are read for something else.
@@ -29,6 +32,8 @@ class CountedCloud:
         {column: minimum and maximum}; empty without points.
     bounds : float64 (2, 3)
         Lowest and highest coordinates in the world.
+    density : float or None
+        Of what was read: points per square metre, the median over the surfaces.
     """
 
     def __init__(self, cloud: CloudLike, objects: int) -> None:
@@ -36,6 +41,9 @@ class CountedCloud:
         self.by_object = np.zeros(objects, np.int64)
         self.limits: dict[str, tuple[float, float]] = {}
         self.bounds: NDArray[np.float64] = np.asarray(cloud.bounds, dtype=np.float64)
+        # A cell that a surface crosses has about the square of its side of that surface.
+        self._side = float(np.ptp(self.bounds, axis=0).max()) / _CELLS or 1.0
+        self._cells = np.zeros(_CELLS**3, np.int64)
         self.table: tuple[Column, ...] = cloud.table
         self.row_of = cloud.row_of
 
@@ -49,4 +57,18 @@ class CountedCloud:
             for name, values in chunk.columns.items():
                 low, high = self.limits.get(name, (np.inf, -np.inf))
                 self.limits[name] = min(low, values.min().item()), max(high, values.max().item())
+            cell = ((chunk.positions - self.bounds[0]) / self._side).astype(np.int64)
+            cell = cell.clip(0, _CELLS - 1) @ [_CELLS**2, _CELLS, 1]
+            self._cells += np.bincount(cell, minlength=len(self._cells))
             yield chunk
+
+    @property
+    def density(self) -> float | None:
+        """Points per square metre of surface."""
+        if not self._cells.any():
+            return None
+        cells, side = self._cells.reshape(3 * (_CELLS,)), self._side
+        while (median := float(np.median(cells[cells > 0]))) < _ENOUGH and len(cells) > 1:
+            half = len(cells) // 2  # larger cells: those without points between sparse ones count
+            cells, side = cells.reshape(half, 2, half, 2, half, 2).sum((1, 3, 5)), 2 * side
+        return median / side**2

@@ -72,6 +72,7 @@ def make_report(
         "points_by_object": {
             name: int(count) for name, count in zip(scene.all_names, cloud.by_object, strict=True)
         },
+        "points_per_m2": cloud.density if survey.coordinates == "world" else None,
         "columns": _columns(cloud),
         "seconds": {
             "total": round(result.seconds, 3),
@@ -119,6 +120,7 @@ def _parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
         "sensors": {m.name: _sensor(m.sensor) for m in survey.sensors if m.name},
         "actors": [actor.name for actor in scene.actors],
         "poses": survey.path.stations,
+        "duration_s": survey.duration_ns / 1e9,
         "trajectory_s": survey.duration_ns / 1e9 if survey.path.moves else None,
         "steps": survey.steps_each[0],
         "coordinates": survey.coordinates,

@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import yaml
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
@@ -25,6 +26,7 @@ from .timeline import make_timeline
 from .words import duration, excess, large, metres, share
 
 Report = Mapping[str, Any]
+SENSORS_NAMED = 3  # in the title
 OBJECTS_MOST = 25  # objects that have a bar
 SCENARIO_MOST = 50_000  # letters of the scenario; a survey may have a million poses
 
@@ -40,11 +42,10 @@ STAGES = {
 
 
 class Fact(NamedTuple):
-    """A number at the head of the page; `bad` marks an error."""
+    """A number at the head of the page."""
 
     value: str
     what: str
-    bad: bool = False
 
 
 class Picture(NamedTuple):
@@ -98,10 +99,10 @@ def write_page(
     page = _environment().get_template("page.html")
     text = page.render(
         report=report,
-        title="Lidar survey" + (f": {scenario.source.name}" if scenario else ""),
+        title=_title(report["parameters"]),
         begun=f"{datetime.fromtimestamp(begun, UTC):%Y-%m-%d %H:%M UTC}" if ordered else "",
         summary=_summary(report),
-        facts=list(_facts(report)),
+        facts=list(_facts(report, cloud)),
         pictures=list(_pictures(report, pictures)),
         stages=ordered,
         names=STAGES,
@@ -193,18 +194,34 @@ def _summary(report: Report) -> str:
     return f"{text}, {excess(planning['excess']).removeprefix('+')} above the shortest possible."
 
 
-def _facts(report: Report) -> Iterator[Fact]:
+def _title(parameters: Mapping[str, Any]) -> str:
+    """Name the sensors, and where they were."""
+    sensors = (parameters["sensors"] or {"": parameters["sensor"]}).values()
+    names = list(dict.fromkeys(sensor["kind"] for sensor in sensors))
+    if len(names) > SENSORS_NAMED:
+        names[SENSORS_NAMED:] = [f"{len(names) - SENSORS_NAMED} more"]
+    where = f"from {counted(parameters['poses'], 'position')}"
+    if seconds := parameters["trajectory_s"]:
+        where = f"along {duration(seconds)} of a trajectory"
+    return f"{' and '.join(', '.join(names).rsplit(', ', 1))} {where}"
+
+
+def _facts(report: Report, cloud: CountedCloud) -> Iterator[Fact]:
     """Return the numbers for the head of the page."""
-    seconds, wrong = report["seconds"], report["placement_violations"]
     yield Fact(large(report["points"]), "points in the cloud")
+    if report["points_per_m2"] is not None:
+        each = "points per m² of surface, the median"
+        yield Fact(large(report["points_per_m2"]), each)
+    if "range" in cloud.limits:
+        low, high = cloud.limits["range"]
+        yield Fact(f"{low:.3g} to {high:.3g} m", "ranges of the points")
+    elif report["points"]:
+        sides = " × ".join(f"{side:.3g}" for side in np.ptp(cloud.bounds, axis=0))
+        yield Fact(f"{sides} m", "size of the cloud")
+    yield Fact(duration(report["parameters"]["duration_s"]), "of scanning")
     yield Fact(large(report["rays"]), f"rays, cast by {report['backend']}")
     if report["stages"]:
-        yield Fact(duration(seconds["survey"]), "for the survey")
-        if report["planning"] is not None:
-            yield Fact(duration(seconds["planning"]), "for the planning")
-            beside = seconds["survey_and_planning_overlap"]
-            yield Fact(duration(beside), "survey and planning overlap")
-    yield Fact(f"{wrong:,}", "tasks outside their partition", bad=wrong > 0)
+        yield Fact(duration(report["seconds"]["total"]), "for the run")
 
 
 def _pictures(report: Report, images: Mapping[str, str]) -> Iterator[Picture]:
