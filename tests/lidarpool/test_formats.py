@@ -703,3 +703,6 @@ def test_a_cloud_becomes_a_dataframe_of_a_library(cloud, monkeypatch):
     monkeypatch.setitem(sys.modules, "polars", made)  # which is not installed for one test
     frame = cloud.to_dataframe("polars")
     np.testing.assert_array_equal(frame["channel"], cloud.channel)
+    monkeypatch.setitem(sys.modules, "pandas", None)  # as where it is not installed
+    with pytest.raises(LidarpoolError, match="Dataframes need pandas: pip install pandas"):
+        cloud.to_dataframe()

@@ -22,7 +22,8 @@ from ..run.result import RunResult
 if TYPE_CHECKING:
     from ..run.picture_file import Pictured
 
-# In a notebook: what is drawn of a result, and how large.
+# In a notebook: what is drawn of a result, and how large in pixels; scaled down by much, their
+# letters could not be read.
 _SHOWN, _SIZE = ("intensity", "cloud"), (800, 500)
 
 
@@ -171,8 +172,9 @@ class Result(RunResult):
         with TemporaryDirectory(prefix="lidarpool-") as folder:
             drawn = self.pictures(folder, only=_SHOWN, size=_SIZE)
             data = [b64encode(path.read_bytes()).decode() for path in drawn]
+        style = f"display:block;width:100%;max-width:{_SIZE[0]}px"
         return "".join(
-            f'<img alt="{name}" src="data:image/png;base64,{one}" style="width:49%">'
+            f'<img alt="{name}" src="data:image/png;base64,{one}" style="{style}">'
             for name, one in zip(_SHOWN, data, strict=True)
         )
 

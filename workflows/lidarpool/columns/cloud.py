@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -180,7 +182,14 @@ class Cloud(Savable):
 
     @checked
     def to_dataframe(self, library: Literal["pandas", "polars"] = "pandas") -> Any:
-        """Return a DataFrame of pandas or polars with all columns."""
+        """Return a DataFrame of pandas or polars with all columns.
+
+        Raises
+        ------
+        LidarpoolError
+            If the library is not installed.
+        """
+        need_packages(library)
         columns = dict(zip("xyz", self.positions.T, strict=True))
         columns |= {column.name: self[column.name] for column in self.table}
         return import_module(library).DataFrame(columns)
@@ -219,6 +228,18 @@ class Cloud(Savable):
         }
         return cls(
             np.concatenate([part.positions for part in parts]), columns, first.own, first.sweeps
+        )
+
+
+def need_packages(*packages: str) -> None:
+    """Refuse with LidarpoolError what needs packages that are not installed."""
+    # A module that a program made itself has no spec.
+    missing = [
+        name for name in packages if sys.modules.get(name) is None and find_spec(name) is None
+    ]
+    if missing:
+        raise LidarpoolError(
+            f"Dataframes need {' and '.join(missing)}: pip install {' '.join(missing)}."
         )
 
 

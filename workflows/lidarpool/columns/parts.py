@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from ..base.choice import one_of_each_part
 from ..base.errors import LidarpoolError
-from .cloud import CHUNK_POINTS, Cloud, Savable, described
+from .cloud import CHUNK_POINTS, Cloud, Savable, described, need_packages
 from .storage import Storage, target_of
 from .table import AXES, SCAN, Column
 
@@ -386,7 +386,13 @@ class StoredCloud(Savable):
         """Return a Dask DataFrame of all columns, a partition for each part.
 
         The computing workers must see the parts, and the result must be kept until then.
+
+        Raises
+        ------
+        LidarpoolError
+            If pandas or pyarrow, which Dask's dataframes need, is not installed.
         """
+        need_packages("pandas", "pyarrow")
         import dask.dataframe as dd
 
         bare = StoredCloud(
