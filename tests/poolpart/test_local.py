@@ -186,3 +186,22 @@ def test_a_worker_that_is_slow_to_come_back_is_not_given_up():
         os.kill(pid, signal.SIGKILL)
         assert partition.submit(os.getpid).result(timeout=120) != pid
         assert "A-0" in cluster.workers
+
+
+LATE = """
+        import asyncio
+        waiting = set()
+        async def late(*_, address, **__):
+            waiting.add(address)
+            await asyncio.sleep(600)
+        cluster.scheduler.handlers["heartbeat_worker"] = late
+        while len(waiting) < 3:
+            time.sleep(0.05)
+"""
+
+
+def test_workers_that_close_while_the_scheduler_owes_an_answer_say_nothing(tmp_path):
+    """As the schedulers of busy machines do at the end of a run."""
+    running = script(tmp_path, LATE)
+    _, told = running.communicate(timeout=300)
+    assert (running.returncode, told) == (0, "")
