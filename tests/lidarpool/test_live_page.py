@@ -6,6 +6,7 @@ import queue
 import socket
 import threading
 import time
+import types
 from importlib.metadata import version
 
 import msgspec
@@ -16,7 +17,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.frames import OP_BINARY, Frame
 from websockets.sync.client import connect
 
-from lidarpool.live.page import live_page, may_connect, redrawn
+from lidarpool.live.page import announced, live_page, may_connect, redrawn
 
 # {origin of a page: whether it may connect}
 ORIGINS = {
@@ -174,3 +175,21 @@ def test_an_error_ends_the_drawing_and_not_the_run(caplog):
         while "no paint" not in caplog.text:
             time.sleep(0.01)
     assert caplog.text.count("OSError: no paint") == 1
+
+
+@pytest.mark.parametrize("hub", [False, True])
+def test_a_cell_shows_the_page_unless_it_is_on_the_machine_of_a_hub(served, monkeypatch, hub):
+    """There 127.0.0.1 in a frame would be the reader's own machine."""
+    cells = []
+    cell = types.SimpleNamespace(update=cells.append)
+    display = types.SimpleNamespace(HTML=str, display=lambda html, **_: cells.append(html) or cell)
+    monkeypatch.setattr("lidarpool.live.page.cell_display", lambda: display)
+    monkeypatch.delenv("JUPYTERHUB_SERVICE_PREFIX", raising=False)
+    if hub:
+        monkeypatch.setenv("JUPYTERHUB_SERVICE_PREFIX", "/user/ada/")
+    page = served[0]
+    with announced(page, f"live page at {page.url}", browser=True):
+        (shown,) = cells
+    assert cells == [shown, ""] and f"live page at {page.url}" in shown
+    assert ("<iframe" in shown) != hub
+    assert (f"ssh -L {page.get_port()}:127.0.0.1:{page.get_port()}" in shown) == hub

@@ -286,8 +286,14 @@ def announced(page: LivePage, words: str, browser: bool) -> Iterator[None]:
         yield
         return
     link = f'<a href="{page.url}" target="_blank">{escape(words)}</a>'
-    frame = f'<iframe src="{page.url}" style="width:100%;height:560px;border:0"></iframe>'
-    shown = display.display(display.HTML(f"{link}<br>{frame}"), display_id=True)
+    below = f'<iframe src="{page.url}" style="width:100%;height:560px;border:0"></iframe>'
+    if "JUPYTERHUB_SERVICE_PREFIX" in os.environ:  # a frame would show the reader's own machine
+        port = page.get_port()
+        below = (
+            "This address is on the kernel's machine, and the hub leads nobody there: connect "
+            f"with ssh -L {port}:{HOST}:{port} and the machine's name, then open it."
+        )
+    shown = display.display(display.HTML(f"{link}<br>{below}"), display_id=True)
     try:
         yield
     finally:
