@@ -28,6 +28,7 @@ def test_the_notebook_shows_progress_a_result_a_table_and_a_picture(tmp_path):
     )
     assert "180 scans, 144,688 rays" in result
     assert result.count("data:image/png;base64") == 2
+    assert result.count("max-width:800px") == 2  # as drawn: smaller, letters could not be read
     assert "<iframe src=" in shown[-1].data["text/html"]
 
 
