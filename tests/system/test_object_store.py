@@ -170,13 +170,16 @@ def test_a_result_goes_to_the_bucket(cluster, lidarpool, tmp_path, environment):
     Storage.at(f"{url}/pcd").write("000000.pcd", b"of an earlier result")
     Storage.at(url).write("path.png", b"of an earlier result")
     arguments = ["run", tmp_path / "s.yaml", "--scheduler", cluster, "--out", url]
-    done = lidarpool(*arguments, "--only", "cloud", "--json", "-q")
+    refused = lidarpool(*arguments, "--only", "cloud", "-q")
+    assert refused.code == 2 and "holds path.png, which no result there lists" in refused.err
+    done = lidarpool(*arguments, "--only", "cloud", "--json", "-q", "--overwrite")
     assert (done.code, done.err) == (0, "")
     report = result_at(url)
     told = json.loads(done.out)
     assert told["folder"] == url and told["files"]["cloud.ply"] == f"{url}/cloud.ply"
     assert set(report["files"]) == Storage.at(url).sizes().keys()
-    assert not Storage.at(url).has("pcd")
+    assert Storage.at(f"{url}/pcd").read("000000.pcd") == b"of an earlier result", "unlisted"
+    Storage.at(url).discard("pcd")
     assert environment["AWS_SECRET_ACCESS_KEY"] not in json.dumps(report)
 
     exported = lidarpool("export", url, "--format", "pcd")
@@ -196,7 +199,17 @@ def test_workers_put_files_of_sweeps_there(cluster, lidarpool, tmp_path, environ
     (tmp_path / "s.yaml").write_text(SCENARIO + "output: {write: [nuscenes]}\n")
     url, here = f"{BUCKET}/results/sweeps", tmp_path / "here"
     Storage.at(f"{url}/nuscenes").write("map.json", b"of an earlier result")
-    run = ["run", tmp_path / "s.yaml", "--scheduler", cluster, "--only", "cloud", "-q", "--out"]
+    run = [
+        "run",
+        tmp_path / "s.yaml",
+        "--scheduler",
+        cluster,
+        "--only",
+        "cloud",
+        "-q",
+        "--overwrite",
+        "--out",
+    ]
     for place in (here, url):
         assert lidarpool(*run, place).code == 0
     report = json.loads(Storage.at(url).read("report.json"))
