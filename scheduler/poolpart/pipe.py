@@ -19,7 +19,7 @@ import asyncio
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
@@ -427,10 +427,13 @@ class Pipes(SchedulerPlugin):
         self._wake()
         return self._replies(states, lambda state: len(state.items))
 
-    async def put(
+    def put(
         self, names: Sequence[str], asker: str, items: list[bytes], unbounded: bool, seconds: float
-    ) -> Replies:
-        """Put items into a pipe as soon as there is room for any; the answer is their number."""
+    ) -> Replies | Awaitable[Replies]:
+        """Put items into a pipe as soon as there is room for any; the answer is their number.
+
+        At once if there is room: for a coroutine Dask makes a task, which takes longer than this.
+        """
 
         def put(state: PipeState) -> int:
             if state.ended or asker not in self.scheduler.clients:
@@ -445,9 +448,15 @@ class Pipes(SchedulerPlugin):
         def room(state: PipeState) -> int:
             return len(items) if unbounded else max(0, state.capacity - len(state.items))
 
+        def ready() -> bool:
+            return all(state.ended or room(state) for state in states.values())
+
+        async def later() -> Replies:
+            await self._until(seconds, ready)
+            return self._replies(states, put)
+
         states = self._states(names)
-        await self._until(seconds, lambda: all(s.ended or room(s) for s in states.values()))
-        return self._replies(states, put)
+        return self._replies(states, put) if ready() else later()
 
     async def take(
         self,
