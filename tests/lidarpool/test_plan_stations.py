@@ -43,6 +43,7 @@ def areas(plan, scene):
     }
 
 
+@pytest.mark.slow
 def test_two_closed_rooms_need_two_stations_each_of_which_sees_its_own():
     scene = Scene.from_meshes(rooms((2, -3, 3)))
     plan = plan_stations(scene, EVERYWHERE, slant_deg=90)
@@ -83,6 +84,7 @@ def test_a_hall_with_a_column_and_a_door():
     assert left.min() >= 0.3  # none in the column
 
 
+@pytest.mark.slow
 def test_what_is_inside_closed_things_or_under_them_does_not_count():
     house = placed("House", (4, 4, 4), (0, 0, 0))
     table = placed("Table", (2, 2, 0.1), (5, 5, 1))
@@ -112,6 +114,7 @@ def test_a_hall_may_be_modelled_by_its_outside_alone():
     assert (np.abs(plan.candidates[:, :2] - (2.1, 1.1)).max(axis=1) > 0.5).all()
 
 
+@pytest.mark.slow
 def test_nobody_stands_on_eaves_or_tables_or_in_shelves():
     shelf = [placed("Shelf", (3, 3, 0.02), (-3, -2, z)) for z in (0.5, 1.0, 2.9)]
     roof = placed("Roof", (14, 12, 0.2), (0, 0, 3.5))
@@ -141,6 +144,7 @@ def test_range_field_of_view_and_slant_limit_what_is_seen():
         assert plan.visible_m2[0] == pytest.approx(expected, rel=0.02)
 
 
+@pytest.mark.slow
 def test_stations_are_in_world_coordinates_and_stand_on_pavements():
     where = np.array([500_000.0, 5_400_000.0, 300.0])
     parts = (

@@ -77,7 +77,7 @@ def test_a_worker_whose_embree_gives_other_bits_casts_nothing(outside, cluster_c
     assert {r.worker for r in result.records if r.stage == "intersect"} <= {*ours}
 
 
-@pytest.mark.parametrize("partition", ["LIDAR", "OTHER"])
+@pytest.mark.parametrize("partition", ["LIDAR", pytest.param("OTHER", marks=pytest.mark.slow)])
 def test_other_workers_with_other_sources_end_the_run_before_they_change_a_byte(outside, partition):
     """Those that are there when it begins are refused; this one joins late."""
     survey = Survey(
