@@ -46,7 +46,6 @@ def test_more_deaths_than_dask_allows_a_task(arena, what, known):
 
 
 @pytest.mark.slow
-@pytest.mark.sample
 def test_twenty_faults_are_survived(arena, what, known):
     campaign = Campaign(PLANNED, SEED, what)
     while not campaign.over:
