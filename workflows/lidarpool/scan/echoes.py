@@ -20,7 +20,7 @@ from ..sensor import Sensor, Survey
 from ..sensor.disc import disc, neighbours
 from ..sensor.optics import Mode, spread
 from .motion import Clock, Poses
-from .surfaces import Surfaces
+from .surfaces import Surfaces, products
 from .world import World
 
 PATTERN_RAYS = 20_000_000  # sub-rays of a head's period that are kept; 24 bytes each
@@ -262,7 +262,7 @@ class EchoCaster:
         seen: list[Real] = []  # normals as the sensor sees them
         for _ in range(PASSES_MOST):
             normals = surfaces.normals(triangle, times)
-            along = _products(normals, directions)
+            along = products(normals, directions)
             distance = before + step
             energy = share * self._energy(sensor, triangle, np.abs(along), distance)
             parts.append(Hits(ray, distance, triangle, energy))
@@ -347,15 +347,6 @@ def _runs(ray: Whole) -> tuple[Whole, Whole]:
     """Find starts and lengths of runs of equal numbers."""
     begins = np.flatnonzero(np.diff(ray, prepend=-1))
     return begins, np.diff(begins, append=len(ray))
-
-
-def _products(one: Real, other: Real) -> Real:
-    """Scalar products of vectors (n, 3): (n,)."""
-    (x, y, z), (a, b, c) = one.T, other.T
-    product = x * a
-    product += y * b
-    product += z * c
-    return np.asarray(product)
 
 
 def separated(hits: Hits, gap_m: float, each: int = 1, planes: Planes | None = None) -> Hits:
@@ -453,7 +444,7 @@ def _continued(
 
     def half_way(this: Whole, that: Whole) -> Real:
         """Ranges half-way to another hit, on the plane of the first."""
-        slope = _products(normal[this], direction[that]) / _products(normal[this], direction[this])
+        slope = products(normal[this], direction[that]) / products(normal[this], direction[this])
         return np.asarray(2 / (near[this] * np.maximum(1 + slope, 1e-9)))
 
     step = np.abs(half_way(one, other) - half_way(other, one))

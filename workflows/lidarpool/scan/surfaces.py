@@ -72,11 +72,7 @@ class Surfaces:
         self, triangle: Triangles, directions: Real, times: Real | NDArray[np.int64]
     ) -> Real:
         """Cosines between unit directions (n, 3) and the normals of triangles (n,) at times."""
-        (x, y, z), (a, b, c) = self.normals(triangle, times).T, directions.T
-        along = x * a
-        along += y * b
-        along += z * c
-        return np.asarray(along)
+        return products(self.normals(triangle, times), directions)
 
     def objects(self, triangle: Triangles) -> NDArray[np.int32]:
         """Objects of triangles (n,)."""
@@ -90,3 +86,12 @@ class Surfaces:
         """
         scattered = self.materials.scattered(self.objects(triangle), cosine)
         return np.asarray(scattered * at_right_angles(distance, extinction))
+
+
+def products(one: Real, other: Real) -> Real:
+    """Scalar products of vectors (n, 3): (n,)."""
+    (x, y, z), (a, b, c) = one.T, other.T
+    product = x * a
+    product += y * b
+    product += z * c
+    return np.asarray(product)
