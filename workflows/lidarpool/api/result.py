@@ -1,4 +1,4 @@
-"""What a run gives, and everything that the command makes of it."""
+"""A run's result, with the outputs of `lidarpool run`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _SHOWN, _SIZE = ("intensity", "cloud"), (800, 500)
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Result(RunResult):
-    """What a run gives, and everything that the command makes of it.
+    """A run's result, with the outputs of `lidarpool run`.
 
     A notebook shows it as a table with two pictures.
     """
