@@ -30,8 +30,8 @@ from typing import Any
 import numpy as np
 
 from lidarpool import Beams, Noise, Returns, Scene, Sensor, Spin, Survey, Track, load_sensor
-from lidarpool.scan.returns import BatchReturns
-from lidarpool.scan.rig import Rig, RigPlan
+from lidarpool.pipeline.returns import BatchReturns
+from lidarpool.pipeline.rig import Rig, RigPlan
 from lidarpool.scene.actors import Actor, box
 from lidarpool.scene.city import city
 from raybeam import available_backends

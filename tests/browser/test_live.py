@@ -10,11 +10,11 @@ import pytest
 
 from lidarpool import Scene, Survey
 from lidarpool.live.run_page import live_run
+from lidarpool.pipeline import SurveyDriver
 from lidarpool.run.connection import local_client
 from lidarpool.run.job import Job
 from lidarpool.run.run import Run
 from lidarpool.run.store import RunStore
-from lidarpool.scan import SurveyDriver
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 

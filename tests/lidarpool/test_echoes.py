@@ -24,8 +24,8 @@ from lidarpool import (
     Survey,
 )
 from lidarpool.base.counted import normal, raw, uniform
-from lidarpool.scan.echoes import Hits, chosen, separated
-from lidarpool.scan.rig import Rig, RigPlan
+from lidarpool.pipeline.echoes import Hits, chosen, separated
+from lidarpool.pipeline.rig import Rig, RigPlan
 from lidarpool.scene.mesh import Mesh
 from lidarpool.scene.shapes import seed_objects
 from lidarpool.sensor.materials import extinction, fresnel
@@ -358,8 +358,8 @@ def test_batches_and_chunks_leave_no_trace(options, path, per_turn, monkeypatch)
     whole = cast_between(rig, survey, [0, 28])
     assert len(whole[0]["x"]) > 200
     assert cast_between(rig, survey, [0, 1, 5, 14, 17, 28]) == whole
-    monkeypatch.setattr("lidarpool.scan.echoes.CHUNK_RAYS", 100)
-    monkeypatch.setattr("lidarpool.scan.echoes.BLOCK_RAYS", 7)
+    monkeypatch.setattr("lidarpool.pipeline.echoes.CHUNK_RAYS", 100)
+    monkeypatch.setattr("lidarpool.pipeline.echoes.BLOCK_RAYS", 7)
     assert cast_between(rig, survey, list(range(29))) == whole
 
 

@@ -19,11 +19,11 @@ from lidarpool import (
     Track,
     load_sensor,
 )
+from lidarpool.pipeline import world
+from lidarpool.pipeline.motion import into_axes
+from lidarpool.pipeline.rig import Rig, RigPlan
 from lidarpool.run.identity import identity_of
 from lidarpool.run.job import Job
-from lidarpool.scan import world
-from lidarpool.scan.motion import into_axes
-from lidarpool.scan.rig import Rig, RigPlan
 from lidarpool.scene.actors import Actor, box
 from lidarpool.scene.mesh import Mesh
 from lidarpool.sensor.optics import Returns

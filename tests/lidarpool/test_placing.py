@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from trimesh import creation
 
-from lidarpool.scan.rig import Rig, RigPlan
+from lidarpool.pipeline.rig import Rig, RigPlan
 from lidarpool.scenario.placing import inside_note, place, poses_around
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.city import city

@@ -97,7 +97,7 @@ def test_foreign_objects_stay(unfinished):
 
 
 def test_one_of_another_format(unfinished, monkeypatch):
-    monkeypatch.setattr("lidarpool.scan.database.FORMAT", 99)
+    monkeypatch.setattr("lidarpool.pipeline.database.FORMAT", 99)
     with pytest.raises(LidarpoolError, match=rf"^{unfinished}/run.db is damaged \(it is of format"):
         RunStore(JOB, unfinished, resume=True)
 

@@ -9,8 +9,8 @@ import pytest
 from tests.lidarpool.casting import Cart, cast_between
 
 from lidarpool import Beams, Column, Mounted, Pose, Scene, Sensor, Spin, Survey
-from lidarpool.scan.failures import naming_scans
-from lidarpool.scan.rig import Rig, RigPlan
+from lidarpool.pipeline.failures import naming_scans
+from lidarpool.pipeline.rig import Rig, RigPlan
 from lidarpool.scene.shapes import seed_objects
 from lidarpool.sensor.models import load_sensor
 from lidarpool.sensor.optics import Returns

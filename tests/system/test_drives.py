@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lidarpool import Mounted, Pose, Scene, Sensor, Survey, Track, read_cloud, simulate
-from lidarpool.scan.rig import Rig, RigPlan
+from lidarpool.pipeline.rig import Rig, RigPlan
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.city import city
 from lidarpool.scene.scene_file import write_scene

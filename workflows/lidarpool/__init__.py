@@ -12,9 +12,9 @@ if TYPE_CHECKING:
     from .columns.cloud import Cloud
     from .columns.table import Column
     from .export.ply import read_cloud
+    from .pipeline import Frame
     from .plan import Plan, Planning
     from .run.store import remove_run
-    from .scan import Frame
     from .scene.mesh import Mesh
     from .scene.scene import Scene
     from .sensor import (
@@ -73,9 +73,9 @@ _MODULES = {
     "columns.cloud": ("Cloud",),
     "columns.table": ("Column",),
     "export.ply": ("read_cloud",),
+    "pipeline": ("Frame",),
     "plan": ("Plan", "Planning"),
     "run.store": ("remove_run",),
-    "scan": ("Frame",),
     "scene.mesh": ("Mesh",),
     "scene.scene": ("Scene",),
     "sensor.models": ("load_sensor",),

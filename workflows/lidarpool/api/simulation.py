@@ -13,6 +13,7 @@ from distributed import Client
 
 from ..base.arguments import checked
 from ..base.vocabulary import PATIENCE_S, WAIT_S
+from ..pipeline import Frame
 from ..plan import Planning
 from ..run.bars import bars_here
 from ..run.checks import check_backend_here
@@ -21,7 +22,6 @@ from ..run.job import Job
 from ..run.progress import Progress
 from ..run.run import Run, make_result
 from ..run.store import RunStore
-from ..scan import Frame
 from ..scene.scene import Scene
 from ..sensor import Survey
 from .result import Result

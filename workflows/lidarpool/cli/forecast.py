@@ -24,6 +24,11 @@ from ..base.errors import LidarpoolError
 from ..columns.cloud import CHUNK_POINTS
 from ..columns.storage import Storage
 from ..export.formats import Format
+from ..pipeline import GPU, LIDAR, OTHER
+from ..pipeline.database import FILE
+from ..pipeline.driver import BATCH_RAYS
+from ..pipeline.echoes import PATTERN_RAYS
+from ..pipeline.rig import Rig, RigPlan
 from ..report.output import ROOM_BYTES, refuse_to_replace
 from ..run.checks import check_backend_here, find_workers, gpu_note, slots_needed
 from ..run.cluster_file import ClusterFile
@@ -31,11 +36,6 @@ from ..run.identity import identity_of
 from ..run.job import Job
 from ..run.local import default_workers, usable_cores
 from ..run.store import RUN_FOLDER
-from ..scan import GPU, LIDAR, OTHER
-from ..scan.database import FILE
-from ..scan.driver import BATCH_RAYS
-from ..scan.echoes import PATTERN_RAYS
-from ..scan.rig import Rig, RigPlan
 from ..scenario.sections import PoolSection
 from ..scene.scene import Scene
 from ..sensor import Survey

@@ -20,6 +20,8 @@ from ..base.words import counted
 from ..columns.storage import Storage
 from ..export.folder import local_result, result_folder
 from ..export.formats import Format
+from ..pipeline import LIDAR
+from ..pipeline.database import FILE
 from ..report.output import CLOUD, refuse_to_replace, write_result
 from ..report.report import summary
 from ..run.checks import TooFewWorkersError, check_backend_here, slots_needed
@@ -32,8 +34,6 @@ from ..run.result import RunResult
 from ..run.run import Run, make_result
 from ..run.store import RUN_FOLDER, RunStore, remove_run
 from ..run.waiting import Waiting
-from ..scan import LIDAR
-from ..scan.database import FILE
 from ..scenario.placing import seen_from
 from ..scenario.scenario import Scenario
 from .logs import set_logs

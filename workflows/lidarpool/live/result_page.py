@@ -15,9 +15,9 @@ from ..base.errors import LidarpoolError
 from ..base.notebook import cell_display
 from ..columns.cloud import Cloud
 from ..export.cloud_file import CloudFile
+from ..pipeline.database import FILE
 from ..run.picture_file import PICTURE_FILE, Pictured
 from ..run.store import RUN_FOLDER
-from ..scan.database import FILE
 from .blocks import VIEW_POINTS, Blocks
 from .colouring import boxed
 from .page import PORT, LivePage, announced, live_page, redrawn

@@ -23,13 +23,13 @@ from poolpart import Partition
 
 from ..columns.table import SCAN, TABLE
 from ..export.cloud_file import CloudFile
+from ..pipeline import Frame
 from ..plan import best
 from ..run.job import Job
 from ..run.picture_file import Pictured, sensor_ways
 from ..run.progress import STAGES, Progress, Show, in_words, is_sure, time_in_words
 from ..run.result import RunResult
 from ..run.store import RunStore
-from ..scan import Frame
 from ..sensor.materials import MaterialTable
 from .blocks import VIEW_POINTS, Blocks
 from .live_points import LivePoints

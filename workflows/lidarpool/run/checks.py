@@ -19,7 +19,7 @@ from ..base.errors import LidarpoolError
 from ..base.interrupts import deferred_interrupts
 from ..base.software import difference, software, software_there
 from ..base.words import did_you_mean
-from ..scan import COLLECT, GENERATE, GPU, LIDAR, OTHER, SORT
+from ..pipeline import COLLECT, GENERATE, GPU, LIDAR, OTHER, SORT
 from ..scene.scene import Scene
 from ..sensor import Survey
 from .waiting import Waiting

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from ..base.errors import LidarpoolError
 from ..columns.storage import Storage
-from ..scan.database import FILE, RunDatabase
+from ..pipeline.database import FILE, RunDatabase
 
 OWNER = "run.owner"  # the mark of the run that may write the copy
 COPY_EVERY_S = 5.0

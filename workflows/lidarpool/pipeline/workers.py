@@ -215,7 +215,7 @@ def _preparation(backend: str, wanted: dict[str, str]) -> Callable[[str, bytes],
         slots = {name: int(count) for name, count in worker.state.total_resources.items()}
         here = software()
         if here == wanted:
-            from lidarpool.scan.rig import set_up
+            from lidarpool.pipeline.rig import set_up
 
             set_up(handle, packed)
         return {"worker": str(worker.name), "software": here, "slots": slots}
