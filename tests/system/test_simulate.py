@@ -162,12 +162,12 @@ def raise_at(scan: int | None, scan_of=None):
             "stage generate failed: scan 0: FloatingPointError",
         ),
         (
-            "lidarpool.pipeline.rig.Rig.cast",
+            "lidarpool.simulator.rig.Rig.cast",
             raise_at(None),
             r"stage intersect, scan (\d+) failed: scan \1: FloatingPointError",
         ),
         (
-            "lidarpool.pipeline.world.RayCaster",
+            "lidarpool.simulator.world.RayCaster",
             raise_at(None),
             "preparing the scene on the GPU workers failed: .*the mirror is loose",
         ),

@@ -1,0 +1,1 @@
+"""The simulator: scene, sensors and physics make returns, and those make columns."""
