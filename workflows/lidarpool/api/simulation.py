@@ -5,9 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from distributed import Client
 
@@ -17,17 +15,15 @@ from ..pipeline import Frame
 from ..plan import Planning
 from ..run.bars import bars_here
 from ..run.checks import check_backend_here
+from ..run.conductor import NoPage, Page, conducted
 from ..run.connection import local_client
 from ..run.job import Job
 from ..run.progress import Progress
-from ..run.run import Run, make_result
 from ..run.store import RunStore
+from ..run.waiting import Waiting
 from ..scene.scene import Scene
 from ..sensor import Survey
 from .result import Result
-
-if TYPE_CHECKING:
-    from ..live.run_page import LiveRun
 
 logger = logging.getLogger(__name__)
 
@@ -136,41 +132,37 @@ def simulate(
         wait_s,
         patience_s,
     )
-    own = client is None
-    if own:
+    if client is None:  # before anything is made in the folder
         check_backend_here(backend)
     store = RunStore(job, folder, parts, resume=resume)
-    with store.kept_on_error():
-        if store.complete:
-            store.db.unlock()
-            return Result(**vars(make_result(store)))
-        if client is None:
-            check_backend_here(store.backend or backend, store.advice)
-        with (
-            local_client(
-                gpu_workers=gpu_workers,
-                collectors=collectors,
-                other_workers=other_workers,
-                planning=planning is not None,
-                tls=tls,
-            )
-            if client is None
-            else nullcontext(client) as client,
-            bars_here() if on_progress is None else nullcontext(on_progress) as show,
-            _page_of(job) if live else nullcontext() as page,
-        ):
-            run = Run(client, store, logger.info)
-            if page is not None:
-                page.follow(store)
-                on_frame = partial(page.on_frame, take=on_frame)
-                show = page.with_progress(show, run.partitions)
-            with nullcontext() if own else run.partitions_page():
-                result = run.drive(on_frame, show)
-            store.db.unlock()
-            return Result(**vars(result))
+
+    def cluster(_: Waiting) -> AbstractContextManager[Client]:
+        if client is not None:
+            return nullcontext(client)
+        return local_client(
+            gpu_workers=gpu_workers,
+            collectors=collectors,
+            other_workers=other_workers,
+            planning=planning is not None,
+            tls=tls,
+        )
+
+    with conducted(
+        store,
+        cluster,
+        own=client is None,
+        progress=bars_here() if on_progress is None else nullcontext(on_progress),
+        page=_page(job, live and not store.complete),
+        tell=logger.info,
+        on_frame=on_frame,
+    ) as (result, _):
+        store.db.unlock()
+        return Result(**vars(result))
 
 
-def _page_of(job: Job) -> AbstractContextManager[LiveRun]:
+def _page(job: Job, wanted: bool) -> AbstractContextManager[Page]:
+    if not wanted:
+        return nullcontext(NoPage())
     from ..live.run_page import live_run  # with viser, which takes half a second
 
     return live_run(job)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 from distributed import Client
@@ -20,18 +20,16 @@ from ..base.words import counted
 from ..columns.storage import Storage
 from ..export.folder import local_result, result_folder
 from ..export.formats import Format
-from ..pipeline import LIDAR
 from ..pipeline.database import FILE
 from ..report.output import CLOUD, refuse_to_replace, write_result
 from ..report.report import summary
-from ..run.checks import TooFewWorkersError, check_backend_here, slots_needed
+from ..run.checks import check_backend_here, slots_needed
 from ..run.cluster_file import ClusterFile
+from ..run.conductor import NoPage, Page, conducted
 from ..run.connection import TlsFiles, connected, local_client, started_client
 from ..run.identity import identity_of
 from ..run.job import Job, make_job
-from ..run.ranges import LidarWorkers
 from ..run.result import RunResult
-from ..run.run import Run, make_result
 from ..run.store import RUN_FOLDER, RunStore, remove_run
 from ..run.waiting import Waiting
 from ..scenario.placing import seen_from
@@ -39,9 +37,6 @@ from ..scenario.scenario import Scenario
 from .logs import set_logs
 from .terminal import shown_progress, shown_status, tell
 from .worker_logs import WorkerLogs
-
-if TYPE_CHECKING:
-    from ..live.run_page import LiveRun
 
 
 @dataclass(frozen=True)
@@ -104,23 +99,19 @@ def run_scenario(scenario: Scenario, options: RunOptions) -> None:
     if not options.quiet:
         for note in scenario.advice(job.scene):
             _note(note)
-    with ExitStack() as whole, _shown_live(job, options) as live:
-        result, report = _simulate(scenario, job, options, live, whole)
+    with ExitStack() as whole, _page(job, options.live) as page:
+        result, report = _run(scenario, job, options, page, whole)
         if options.as_json:
             click.echo(json.dumps(summary(options.out, report), indent=1, allow_nan=False))
         else:
             _tell(options.out, result, job, report)
-        if live is not None and options.stay:
+        if options.live and options.stay:
             with local_result(options.out, [CLOUD]) as folder:
-                live.stay(folder / CLOUD)
+                page.stay(folder / CLOUD)
 
 
-def _simulate(
-    scenario: Scenario,
-    job: Job,
-    options: RunOptions,
-    live: LiveRun | None,
-    whole: ExitStack,
+def _run(
+    scenario: Scenario, job: Job, options: RunOptions, page: Page, whole: ExitStack
 ) -> tuple[RunResult, dict[str, Any]]:
     """Run what is not done yet, write the result, and return it with its report.
 
@@ -130,48 +121,41 @@ def _simulate(
     for one in formats:
         one.check_installed()
     load_open3d()  # what writes the cloud in the end
-    out = options.out
+    out, left = options.out, ""
+
+    def in_place() -> None:
+        nonlocal left
+        whole.enter_context(_noting_complete(out))
+        left = store.remove()
+
     with result_folder(out) as folder:
         goes_on = options.resume and FILE in Storage.at(f"{out}/{RUN_FOLDER}").sizes()
         if not (options.overwrite or goes_on):
             refuse_to_replace(out, lambda: identity_of(job), formats)
         store = _store(job, options, goes_on)
-
-        left = ""
-
-        def in_place() -> None:
-            nonlocal left
-            whole.enter_context(_noting_complete(out))
-            left = store.remove()
-
-        with store.kept_on_error():
-            if live is not None:
-                live.follow(store)
-            # Workers write formats of many files; else they are not kept longer than the survey.
-            keep = any(one.in_pieces for one in formats)
-            with ExitStack() as cluster:
-                result, workers = (
-                    (make_result(store), None)
-                    if store.complete
-                    else _drive(scenario, store, options, live, cluster)
+        with conducted(
+            store,
+            lambda waiting: _cluster(scenario, job, options, waiting),
+            own=options.here,
+            progress=shown_progress(options.quiet),
+            page=nullcontext(page),
+            tell=_teller(options),
+            keep=any(one.in_pieces for one in formats),
+        ) as (result, workers):
+            page.finish(result)
+            only_cloud = options.only == "cloud"
+            what = "the cloud" if only_cloud else "the cloud, the pictures and the report"
+            with shown_status(f"writing {what}", options.quiet):
+                report = write_result(
+                    folder,
+                    out,
+                    result,
+                    scenario,
+                    in_place,
+                    only_cloud=only_cloud,
+                    formats=formats,
+                    workers=workers,
                 )
-                if not keep:
-                    cluster.close()
-                if live is not None:
-                    live.finish(result)
-                only_cloud = options.only == "cloud"
-                what = "the cloud" if only_cloud else "the cloud, the pictures and the report"
-                with shown_status(f"writing {what}", options.quiet):
-                    report = write_result(
-                        folder,
-                        out,
-                        result,
-                        scenario,
-                        in_place,
-                        only_cloud=only_cloud,
-                        formats=formats,
-                        workers=workers if keep else None,
-                    )
         if left:
             report["notes"].append(left.rstrip("."))
     return result, report
@@ -200,16 +184,12 @@ def _noting_complete(out: Path | Storage) -> Iterator[None]:
         raise
 
 
-@contextmanager
-def _shown_live(job: Job, options: RunOptions) -> Iterator[LiveRun | None]:
-    """Live page of the run, if it is wanted."""
-    if not options.live:
-        yield None
-        return
+def _page(job: Job, live: bool) -> AbstractContextManager[Page]:
+    if not live:
+        return nullcontext(NoPage())
     from ..live.run_page import live_run
 
-    with live_run(job) as live:
-        yield live
+    return live_run(job)
 
 
 def _store(job: Job, options: RunOptions, goes_on: bool) -> RunStore:
@@ -231,50 +211,37 @@ def _store(job: Job, options: RunOptions, goes_on: bool) -> RunStore:
     return store
 
 
-def _drive(
-    scenario: Scenario,
-    store: RunStore,
-    options: RunOptions,
-    live: LiveRun | None,
-    stack: ExitStack,
-) -> tuple[RunResult, LidarWorkers]:
-    """Run on a cluster, a local one if none is given, which lasts as long as the stack."""
-    waiting = None
-    if options.scheduler is not None:  # for scheduler and workers together
-        waiting = Waiting(options.wait_s, _teller(options))
+def _cluster(
+    scenario: Scenario, job: Job, options: RunOptions, waiting: Waiting
+) -> AbstractContextManager[Client]:
+    """Client of the cluster that is to be started or connected to."""
+    if options.scheduler is not None:
+        return connected(options.scheduler, options.files, waiting)
     if options.cluster is not None:
-        cluster = _started_client(options.cluster, options)
-    elif options.scheduler is not None:
-        cluster = connected(options.scheduler, options.files, waiting)
-    else:
-        check_backend_here(store.backend or store.job.backend, store.advice)
-        cluster = _local_client(scenario, options, store.job.planning is not None)
-    client = stack.enter_context(cluster)
-    with shown_progress(options.quiet) as show:
-        run = Run(client, store, _teller(options), waiting)
-        # The cluster of one run has no dashboard.
-        with nullcontext() if options.here else run.partitions_page():
-            on_frame = None if live is None else live.on_frame
-            shown = show if live is None else live.with_progress(show, run.partitions)
-            result = run.drive(on_frame, shown)
-    return result, LidarWorkers(
-        client, run.partitions[LIDAR], store.job.patience_s, _teller(options)
+        started = started_client(options.cluster, _teller(options))
+        return _with_status(started, f"starting {options.cluster}", options)
+    local = local_client(
+        gpu_workers=scenario.pool.gpu,
+        collectors=scenario.pool.collectors,
+        other_workers=scenario.pool.other,
+        planning=job.planning is not None,
+        tls=options.tls,
     )
+    return _with_status(local, "starting the workers", options)
 
 
 @contextmanager
-def _started_client(file: ClusterFile, options: RunOptions) -> Iterator[Client]:
-    """Client of the cluster of a file."""
+def _with_status(
+    cluster: AbstractContextManager[Client], starting: str, options: RunOptions
+) -> Iterator[Client]:
+    """Show a status until the cluster has started."""
     with ExitStack() as stack:
-        with shown_status(f"starting {file}", options.quiet):
-            client = stack.enter_context(started_client(file, _teller(options)))
-        if not options.quiet:
-            _note(f"started {file}")
-        try:
-            yield client
-        except TooFewWorkersError as error:
-            error.add_note("Jobs that began and failed say why in their logs.")
-            raise
+        with shown_status(starting, options.quiet):
+            client = stack.enter_context(cluster)
+            if options.here:  # its workers share the terminal
+                set_logs(options.verbose)
+                client.register_plugin(WorkerLogs(options.verbose))
+        yield client
 
 
 def _teller(options: RunOptions) -> Callable[[str], None]:
@@ -283,24 +250,6 @@ def _teller(options: RunOptions) -> Callable[[str], None]:
 
 def _note(words: str) -> None:
     tell(f"note: {words}")
-
-
-@contextmanager
-def _local_client(scenario: Scenario, options: RunOptions, planning: bool) -> Iterator[Client]:
-    """Client of a local cluster, whose workers share the terminal."""
-    cluster = local_client(
-        gpu_workers=scenario.pool.gpu,
-        collectors=scenario.pool.collectors,
-        other_workers=scenario.pool.other,
-        planning=planning,
-        tls=options.tls,
-    )
-    with ExitStack() as stack:
-        with shown_status("starting the workers", options.quiet):
-            client = stack.enter_context(cluster)
-            set_logs(options.verbose)
-            client.register_plugin(WorkerLogs(options.verbose))
-        yield client
 
 
 def _tell(out: Path | Storage, result: RunResult, job: Job, report: dict[str, Any]) -> None:

@@ -6,12 +6,12 @@ import asyncio
 import errno
 import socket
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
 from pathlib import Path
 from typing import NamedTuple
 
 import dask
-from distributed import Client, Security
+from distributed import Client, Security, SpecCluster
 from distributed.comm import connect
 
 from poolpart.internals import forked_workers
@@ -19,7 +19,7 @@ from poolpart.internals import forked_workers
 from ..base.errors import LidarpoolError
 from ..base.fork_server import start_fork_server
 from ..base.interrupts import children_spared, deferred_interrupts
-from .checks import LOOK_EVERY_S
+from .checks import LOOK_EVERY_S, TooFewWorkersError
 from .cluster_file import ClusterFile
 from .local import local_cluster
 from .waiting import Waiting
@@ -44,7 +44,6 @@ class TlsFiles(NamedTuple):
     key: Path | None = None
 
 
-@contextmanager
 def local_client(
     *,
     gpu_workers: int | None,
@@ -52,11 +51,8 @@ def local_client(
     other_workers: int | None,
     planning: bool = True,
     tls: bool = False,
-) -> Iterator[Client]:
+) -> AbstractContextManager[Client]:
     """Client of a cluster on this machine that lasts as long as the body.
-
-    Half a cluster cannot be stopped in good order: an interrupt waits until it is up, and one
-    that comes while it is being stopped waits until it is down.
 
     Parameters
     ----------
@@ -74,44 +70,59 @@ def local_client(
     PoolError
         If the workers do not start, or no certificate can be made.
     """
-    stack = ExitStack()
-    try:
-        with deferred_interrupts(), children_spared():
-            stack.enter_context(dask.config.set(_QUIET))
-            if start_fork_server():
-                stack.enter_context(forked_workers())
-            cluster = local_cluster(
-                gpu_workers=gpu_workers,
-                lidar_slots=2 + collectors,
-                other_workers=other_workers if planning or other_workers else 0,
-                security=tls,
-                dashboard_port=None,  # its address is never printed, and Bokeh takes half a second
-            )
-            stack.callback(cluster.close)
-            client = stack.enter_context(Client(cluster, set_as_default=False))
-        yield client
-    finally:
-        with deferred_interrupts():
-            stack.close()
+
+    @contextmanager
+    def started() -> Iterator[SpecCluster]:
+        with (
+            dask.config.set(_QUIET),
+            forked_workers() if start_fork_server() else nullcontext(),
+            closing(
+                local_cluster(
+                    gpu_workers=gpu_workers,
+                    lidar_slots=2 + collectors,
+                    other_workers=other_workers if planning or other_workers else 0,
+                    security=tls,
+                    dashboard_port=None,  # is never printed, and Bokeh takes half a second
+                )
+            ) as cluster,
+        ):
+            yield cluster
+
+    return _client_of(started())
 
 
 @contextmanager
 def started_client(file: ClusterFile, tell: Callable[[str], object]) -> Iterator[Client]:
     """Client of a cluster that is started for it and lasts as long as the body.
 
-    An interrupt waits until all jobs are in the queue, and until they have been cancelled. `tell`
-    is called with what goes wrong with workers.
+    `tell` is called when it has started, and with what goes wrong with workers.
 
     Raises
     ------
     LidarpoolError
         If it does not start.
     """
+    with _client_of(file.started(tell)) as client:
+        tell(f"started {file}")
+        try:
+            yield client
+        except TooFewWorkersError as error:
+            error.add_note("Jobs that began and failed say why in their logs.")
+            raise
+
+
+@contextmanager
+def _client_of(cluster: AbstractContextManager[SpecCluster]) -> Iterator[Client]:
+    """Client of a cluster that is started for it and lasts as long as the body.
+
+    Half a cluster cannot be stopped in good order: an interrupt waits until all workers are up, or
+    all jobs in the queue, and one that comes while they are being stopped waits until they are.
+    """
     stack = ExitStack()
     try:
         with deferred_interrupts(), children_spared():
-            cluster = stack.enter_context(file.started(tell))
-            client = stack.enter_context(Client(cluster, set_as_default=False))
+            client = Client(stack.enter_context(cluster), set_as_default=False)
+            stack.enter_context(client)
         yield client
     finally:
         with deferred_interrupts():

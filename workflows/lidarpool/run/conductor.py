@@ -1,0 +1,131 @@
+"""Conducts a run from its store to its result, for `lidarpool run` and for `simulate`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from functools import partial
+from pathlib import Path
+from typing import Protocol
+
+from distributed import Client
+
+from poolpart import Partition
+
+from ..pipeline import LIDAR, Frame
+from .checks import check_backend_here
+from .progress import Progress, Show
+from .ranges import LidarWorkers
+from .result import RunResult
+from .run import Run, make_result
+from .store import RunStore
+from .waiting import Waiting
+
+
+class Page(Protocol):
+    """The live page of a run; see `lidarpool.live.run_page`."""
+
+    def follow(self, store: RunStore) -> None:
+        """Show what is committed from now on."""
+
+    def with_progress(self, show: Show, partitions: Mapping[str, Partition]) -> Show:
+        """Return a function that calls `show` and updates the page."""
+        ...
+
+    def on_frame(self, frame: Frame, take: Callable[[Frame], None] | None) -> None:
+        """Show a frame and call `take` with it."""
+
+    def finish(self, result: RunResult) -> None:
+        """Show the whole result; its parts may then be removed."""
+
+    def stay(self, cloud: Path) -> None:
+        """Keep the page until its user ends it; points are read from the written `cloud`."""
+
+
+class NoPage:
+    """Stands for the live page of a run that has none."""
+
+    def follow(self, store: RunStore) -> None:
+        """Show nothing."""
+
+    def with_progress(self, show: Show, partitions: Mapping[str, Partition]) -> Show:
+        """Return `show` itself."""
+        return show
+
+    def on_frame(self, frame: Frame, take: Callable[[Frame], None] | None) -> None:
+        """Call `take`."""
+        if take is not None:
+            take(frame)
+
+    def finish(self, result: RunResult) -> None:
+        """Show nothing."""
+
+    def stay(self, cloud: Path) -> None:
+        """Return at once."""
+
+
+@contextmanager
+def conducted(
+    store: RunStore,
+    cluster: Callable[[Waiting], AbstractContextManager[Client]],
+    *,
+    own: bool,
+    progress: AbstractContextManager[Callable[[Progress], None]],
+    page: AbstractContextManager[Page],
+    tell: Callable[[str], None],
+    on_frame: Callable[[Frame], None] | None = None,
+    keep: bool = False,
+) -> Iterator[tuple[RunResult, LidarWorkers | None]]:
+    """Do what is left of a run; the body gets its result.
+
+    An error or interrupt, also of the body, is noted with how to resume.
+
+    Parameters
+    ----------
+    store
+        Store of the run, with what an earlier run has left.
+    cluster
+        Starts a cluster or connects to one, if anything is left to do. The time to wait for its
+        scheduler, if it has to be waited for, is also that for its workers.
+    own
+        Whether the cluster is a local one for this run: then the backend must be available here,
+        and there is no page of partitions.
+    progress
+        Shows the progress while the run lasts.
+    page
+        The live page, or `NoPage`.
+    tell
+        Called with messages for the user.
+    on_frame
+        Called with each frame, in scan order.
+    keep
+        Whether the cluster lasts as long as the body, which also gets workers of LIDAR that write
+        formats of many files; None if nothing was left to do.
+
+    Raises
+    ------
+    LidarpoolError
+        If the cluster lacks something or a task fails.
+    """
+    workers = None
+    with store.kept_on_error(), page as live, ExitStack() as stack:
+        live.follow(store)
+        if store.complete:
+            result = make_result(store)
+        else:
+            if own:
+                check_backend_here(store.backend or store.job.backend, store.advice)
+            waiting = Waiting(store.job.wait_s, tell)
+            client = stack.enter_context(cluster(waiting))
+            with progress as show:
+                run = Run(client, store, tell, waiting)
+                with nullcontext() if own else run.partitions_page():
+                    result = run.drive(
+                        partial(live.on_frame, take=on_frame),
+                        live.with_progress(show, run.partitions),
+                    )
+            if keep:
+                workers = LidarWorkers(client, run.partitions[LIDAR], store.job.patience_s, tell)
+            else:
+                stack.close()
+        yield result, workers
