@@ -154,7 +154,7 @@ def simulate(
         progress=bars_here() if on_progress is None else nullcontext(on_progress),
         page=_page(job, live and not store.complete),
         tell=logger.info,
-        on_frame=on_frame,
+        on_frame=on_frame or (lambda frame: None),
     ) as (result, _):
         store.db.unlock()
         return Result(**vars(result))

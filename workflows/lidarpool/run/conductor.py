@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from distributed import Client
 
@@ -23,17 +23,18 @@ from .waiting import Waiting
 
 
 class Page(Protocol):
-    """The live page of a run; see `lidarpool.live.run_page`."""
+    """What a run tells its live page, see `lidarpool.live.run_page`."""
 
     def follow(self, store: RunStore) -> None:
         """Show what is committed from now on."""
 
     def with_progress(self, show: Show, partitions: Mapping[str, Partition]) -> Show:
-        """Return a function that calls `show` and updates the page."""
-        ...
+        """Return a function that calls `show`, and updates the page."""
+        return show
 
-    def on_frame(self, frame: Frame, take: Callable[[Frame], None] | None) -> None:
-        """Show a frame and call `take` with it."""
+    def on_frame(self, frame: Frame, take: Callable[[Frame], None]) -> None:
+        """Call `take` with a frame, and show it."""
+        take(frame)
 
     def finish(self, result: RunResult) -> None:
         """Show the whole result; its parts may then be removed."""
@@ -42,26 +43,13 @@ class Page(Protocol):
         """Keep the page until its user ends it; points are read from the written `cloud`."""
 
 
-class NoPage:
+class NoPage(Page):
     """Stands for the live page of a run that has none."""
 
-    def follow(self, store: RunStore) -> None:
-        """Show nothing."""
+    def _ignore(self, *_: Any, **__: Any) -> None:
+        pass
 
-    def with_progress(self, show: Show, partitions: Mapping[str, Partition]) -> Show:
-        """Return `show` itself."""
-        return show
-
-    def on_frame(self, frame: Frame, take: Callable[[Frame], None] | None) -> None:
-        """Call `take`."""
-        if take is not None:
-            take(frame)
-
-    def finish(self, result: RunResult) -> None:
-        """Show nothing."""
-
-    def stay(self, cloud: Path) -> None:
-        """Return at once."""
+    follow = finish = stay = _ignore
 
 
 @contextmanager
@@ -73,7 +61,7 @@ def conducted(
     progress: AbstractContextManager[Callable[[Progress], None]],
     page: AbstractContextManager[Page],
     tell: Callable[[str], None],
-    on_frame: Callable[[Frame], None] | None = None,
+    on_frame: Callable[[Frame], None] = lambda frame: None,
     keep: bool = False,
 ) -> Iterator[tuple[RunResult, LidarWorkers | None]]:
     """Do what is left of a run; the body gets its result.
