@@ -6,7 +6,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from poolpart.probe import visible_gpus
 from raybeam import available_backends
 
 from ..base.choice import one_of_each_part
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarpoolError, Mistakes
 from ..columns.cloud import CHUNK_POINTS
 from ..columns.storage import Storage
 from ..export.formats import Format
@@ -104,35 +104,22 @@ def forecast(
         Plain data for JSON, sizes in bytes. `reasons` say why it cannot run, each with what to
         do. `memory` is of all processes on this machine, or, on another cluster, of a GPU worker.
     """
-    reasons, notes = _look_at_folder(out)
+    mistakes, notes = Mistakes(), []
+    with mistakes.noted():
+        notes += _look_at_folder(out)
     try:
         refuse_to_replace(out, lambda: identity_of(job), formats)
     except LidarpoolError as error:
         notes.append(str(error).rstrip("."))
     for one in formats:
-        try:
+        with mistakes.noted():
             one.check_installed()
-        except LidarpoolError as error:
-            reasons.append(str(error))
     slots = _slots(job, pool, client, file)
-    backend, memory, casters = None, MEMORY_LIMIT, slots[GPU]["there"]
-    try:
-        if file is not None:
-            memory = 0  # of machines that are not there yet
-            file.require({name: one["needed"] for name, one in slots.items()})
-        elif client is None:
-            backend = _backend_here(job.backend)
-        else:
-            planning = job.planning is not None
-            pool_there, casting, backend, _ = find_workers(
-                client, job.collectors, planning, job.backend
-            )
-            memory = min((worker.memory for worker in casting if worker.memory), default=0)
-            casters = len(casting)
-            if note := gpu_note(pool_there, casting, backend):
-                notes.append(note)
-    except (LidarpoolError, PoolError) as error:
-        reasons.append(str(error))
+    # The memory of machines that are not there yet is unknown.
+    casters = Casters(slots[GPU]["there"], memory=0 if client or file else MEMORY_LIMIT)
+    with mistakes.noted():
+        casters = _casters(job, casters, slots, client, file)
+    notes += casters.notes
     sample = None
     # Casting here needs as much memory as on a worker: it would fail or be killed.
     if _worker_bytes(job) <= MEMORY_LIMIT:
@@ -141,28 +128,19 @@ def forecast(
             notes.append(no_hits(job))
     # Without a sample every ray may hit.
     points = sample.points if sample else job.survey.ray_count // job.survey.keep_every
+    disk = _disk(job, points, len(formats), out)
+    with mistakes.noted():
+        _check_disk(disk, isinstance(out, Storage))
     needed = _worker_bytes(job) if client or file else _machine_bytes(job, points, slots)
-    parts, result = _disk_bytes(job, points, len(formats))
-    # What goes into storage is made in a folder for temporary files, but for the parts.
-    folder = Path(tempfile.gettempdir()) if isinstance(out, Storage) else out
-    needed_here = result if isinstance(out, Storage) else parts + result
-    free = shutil.disk_usage(_existing(folder)).free
-    if free < needed_here:
-        other = "TMPDIR" if isinstance(out, Storage) else "--out"
-        reasons.append(
-            f"The disk of {folder} has {format_bytes(free)} free, and the run needs about "
-            f"{format_bytes(needed_here)}: make room, name another folder with {other}, or take "
-            "a larger keep_every."
-        )
-    if memory and memory < needed:
-        reasons.append(
-            f"There are {format_bytes(memory)} of memory, and the run needs about "
+    if casters.memory and casters.memory < needed:
+        mistakes.lines.append(
+            f"There are {format_bytes(casters.memory)} of memory, and the run needs about "
             f"{format_bytes(needed)}: take a smaller scene, fewer workers (pool.gpu), "
             "rays_per_revolution or planning.particles, or a machine with more."
         )
     return {
-        "can_run": not reasons,
-        "reasons": reasons,
+        "can_run": not mistakes.lines,
+        "reasons": mistakes.lines,
         "notes": notes,
         "objects": len(job.scene.all_names),
         "triangles": job.scene.triangles,
@@ -173,12 +151,68 @@ def forecast(
         "rays": job.survey.ray_count,
         "estimate": asdict(sample) if sample else None,
         "trials": job.trials,
-        "backend": backend,
-        "casters": casters,
+        "backend": casters.backend,
+        "casters": casters.count,
         "slots": slots,
-        "memory": {"needed": needed, "there": memory or None},
-        "disk": {"parts": parts, "result": result, "free": free, "folder": str(folder)},
+        "memory": {"needed": needed, "there": casters.memory or None},
+        "disk": disk,
     }
+
+
+@dataclass(frozen=True)
+class Casters:
+    """The workers that would cast: how many, with which backend, and the least memory of one.
+
+    The backend is None, and the memory 0, where it is not known.
+    """
+
+    count: int
+    backend: str | None = None
+    memory: int = 0
+    notes: tuple[str, ...] = ()
+
+
+def _casters(
+    job: Job,
+    unknown: Casters,
+    slots: dict[str, dict[str, int]],
+    client: Client | None,
+    file: ClusterFile | None,
+) -> Casters:
+    """Find the workers that would cast; LidarpoolError if they cannot."""
+    if file is not None:
+        file.require({name: one["needed"] for name, one in slots.items()})
+        return unknown
+    if client is None:
+        return replace(unknown, backend=_backend_here(job.backend))
+    try:
+        pool, casting, backend, _ = find_workers(
+            client, job.collectors, job.planning is not None, job.backend
+        )
+    except PoolError as error:
+        raise LidarpoolError(str(error)) from error
+    memory = min((worker.memory for worker in casting if worker.memory), default=0)
+    note = gpu_note(pool, casting, backend)
+    return Casters(len(casting), backend, memory, (note,) if note else ())
+
+
+def _disk(job: Job, points: int, exports: int, out: Path | Storage) -> dict[str, Any]:
+    """Disk that is needed and free, and its folder."""
+    parts, result = _disk_bytes(job, points, exports)
+    # What goes into storage is made in a folder for temporary files, but for the parts.
+    folder = Path(tempfile.gettempdir()) if isinstance(out, Storage) else out
+    free = shutil.disk_usage(_existing(folder)).free
+    return {"parts": parts, "result": result, "free": free, "folder": str(folder)}
+
+
+def _check_disk(disk: dict[str, Any], stored: bool) -> None:
+    needed = disk["result"] + (0 if stored else disk["parts"])
+    if disk["free"] < needed:
+        raise LidarpoolError(
+            f"The disk of {disk['folder']} has {format_bytes(disk['free'])} free, and the run "
+            f"needs about {format_bytes(needed)}: make room, name another folder with "
+            f"{'TMPDIR' if stored else '--out'}, or take a larger keep_every."
+        )
 
 
 def _drive(survey: Survey) -> dict[str, Any] | None:
@@ -252,26 +286,20 @@ def _existing(out: Path) -> Path:
     return next(path for path in (out, *out.absolute().parents) if path.exists())
 
 
-def _look_at_folder(out: Path | Storage) -> tuple[list[str], list[str]]:
-    """Return reasons why the result cannot be written there, and notes; changes nothing."""
-    reasons = []
+def _look_at_folder(out: Path | Storage) -> list[str]:
+    """Return notes on the place of the result; LidarpoolError if it cannot be written there."""
     if isinstance(out, Storage):
-        try:
-            out.claim()  # leaves nothing
-        except LidarpoolError as error:
-            return [str(error)], []
+        out.claim()  # leaves nothing
         unfinished = FILE in Storage.at(f"{out}/{RUN_FOLDER}").sizes()
     else:
         there = _existing(out)
         if not there.is_dir():
-            reasons.append(f"{there} is a file: give a folder for the results with --out.")
-        elif not os.access(there, os.W_OK | os.X_OK):
-            reasons.append(f"Cannot write to the folder {there}: give another with --out.")
+            raise LidarpoolError(f"{there} is a file: give a folder for the results with --out.")
+        if not os.access(there, os.W_OK | os.X_OK):
+            raise LidarpoolError(f"Cannot write to the folder {there}: give another with --out.")
         unfinished = (out / RUN_FOLDER / FILE).exists()
-    if not unfinished:
-        return reasons, []
     note = f"{out} holds an unfinished run: --resume continues it, --fresh deletes it"
-    return reasons, [note]
+    return [note] if unfinished else []
 
 
 def _worker_bytes(job: Job) -> int:

@@ -147,9 +147,20 @@ def local_folder(place: Path | Storage) -> Iterator[Path]:
         yield folder
 
 
-def staging(folder: Path) -> Path:
-    """Path of a temporary folder in a folder, for what is moved into place once it is whole."""
-    return folder / f"{_WRITING}{secrets.token_hex(4)}"
+@contextmanager
+def staging(folder: Path, place: object = None) -> Iterator[Path]:
+    """Temporary folder in a folder, for what is moved into place once it is whole.
+
+    Errors name `place`, by default `folder`, in its stead.
+    """
+    staged = folder / f"{_WRITING}{secrets.token_hex(4)}"
+    try:
+        staged.mkdir()
+        yield staged
+    except LidarpoolError as error:
+        raise LidarpoolError(str(error).replace(str(staged), str(place or folder))) from error
+    finally:
+        shutil.rmtree(staged, ignore_errors=True)
 
 
 def _lock(folder: Path) -> int:

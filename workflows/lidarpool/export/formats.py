@@ -184,12 +184,10 @@ class Format:
         """
         module = _MODULES[self.name][0]
         more: dict[str, Any] = {"layout": self.layout} if self._laid_out else {}
-        beside = staging(path.parent)
-        staged = beside / path.name  # bags contain the name of their file
         with _explained(path):
             self.check(path, cloud, overwrite=overwrite)
-            try:
-                beside.mkdir()
+            with staging(path.parent) as beside:
+                staged = beside / path.name  # bags contain the name of their file
                 if self.in_pieces:
                     place = Storage(str(staged), durable=False)
                     RangeWriter(module, cloud, sweeps, place).write(workers)
@@ -201,10 +199,6 @@ class Format:
                     remove(path)
                 staged.replace(path)
                 flush(path.parent)
-            except LidarpoolError as error:  # names the file, without its temporary folder
-                raise LidarpoolError(str(error).replace(str(beside), str(path.parent))) from error
-            finally:
-                shutil.rmtree(beside, ignore_errors=True)
 
     def put(
         self, storage: Storage, cloud: CloudLike, sweeps: Sweeps, workers: Workers | None

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-import shutil
-from collections.abc import Callable, Collection, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ..base.errors import LidarpoolError
 from ..base.interrupts import deferred_interrupts
@@ -22,9 +22,6 @@ from ..run.result import RunResult
 from ..scenario.scenario import Scenario
 from .cloud_numbers import CountedCloud
 from .report import make_report
-
-if TYPE_CHECKING:
-    from ..render.page import Page
 
 ROOM_BYTES = 32 << 20  # room for pictures and report
 
@@ -116,100 +113,142 @@ def write_result(
     LidarpoolError
         If a file cannot be written.
     """
-    staged = staging(folder)
-    scene, survey = result.scene, result.survey
-    counted = CountedCloud(result.points, len(scene.all_names))
-    makers: dict[str, Callable[[], Page]] = {}
-    drawn: dict[str, Future[str]] = {}
-    # Pictures are drawn while the cloud is written, which keeps one core busy.
-    beside = ThreadPoolExecutor(1, "pictures")
-    if not only_cloud:
-        # Importing Matplotlib takes as long as all other imports.
-        from .page.page import write_page
-        from .pictures import picture_makers
-
-        shown = Pictured.of(result)
-        # The cloud is drawn from its file, as by `lidarpool plot`, so that both draw the same.
-        makers = picture_makers(shown, staged / CLOUD)
-    exported = [one.file for one in formats]
-    pictures = [] if only_cloud else [*(f"{name}.png" for name in makers), PICTURE_FILE]
-    files = [CLOUD, *exported, *pictures, SWEEPS_FILE, *([] if only_cloud else [PAGE]), REPORT]
     storage = place if isinstance(place, Storage) else None
     earlier = _listed(storage or Storage.at(folder))
+    # Workers write these into the storage.
     direct = [one for one in formats if one.in_pieces] if storage and workers else []
-
-    def draw(name: str) -> str:
-        page = makers[name]()
-        page.save(staged / f"{name}.png")
-        return page.svg()
-
+    points, sweeps = result.points, Sweeps.of(result.survey, result.scene)
+    cloud = CountedCloud(points, len(result.scene.all_names))
     try:
-        staged.mkdir()
-        drawn |= {name: beside.submit(draw, name) for name in makers if name not in _OF_CLOUD}
-        sweeps = Sweeps.of(survey, scene)
-        sweeps.save(staged / SWEEPS_FILE)
-        Format("ply").write(staged / CLOUD, counted, sweeps)
-        for one in formats:
-            if one not in direct:
-                one.write(staged / one.file, result.points, sweeps, workers=workers)
-        if storage and direct:
-            _remove_earlier(storage, earlier, files)
-            for one in direct:
-                one.put(storage, result.points, sweeps, workers)
-        if workers:
-            result = workers.recorded(result)
-        report = make_report(result, files, counted)
-        report["notes"] += [note for one in formats for note in one.notes(result.points)]
-        if not only_cloud:
-            drawn |= {name: beside.submit(draw, name) for name in _OF_CLOUD}
-            shown.save(staged / PICTURE_FILE)
-            images = {name: drawn[name].result() for name in makers}
-            write_page(staged / PAGE, report, result, counted, images, scenario)
-        text = json.dumps(report, indent=1, allow_nan=False) + "\n"
-        (staged / REPORT).write_text(text, encoding="utf-8")
-        if storage:
-            if not direct:
+        with staging(folder, place) as staged, _pictures(result, staged, only_cloud) as pictures:
+            exports = [one.file for one in formats]
+            page = [] if only_cloud else [PAGE]
+            files = [CLOUD, *exports, *pictures.files, SWEEPS_FILE, *page, REPORT]
+            sweeps.save(staged / SWEEPS_FILE)
+            Format("ply").write(staged / CLOUD, cloud, sweeps)
+            for one in formats:
+                if one not in direct:
+                    one.write(staged / one.file, points, sweeps, workers=workers)
+            if storage and direct:
                 _remove_earlier(storage, earlier, files)
-            for name in (*EXPORTS, *FILES):
-                if (staged / name).exists():
-                    storage.put(staged / name, name)
-            with deferred_interrupts():
-                then()
-            return report
-        for name in files:
-            flush(staged / name)
-        with deferred_interrupts():
-            _publish(staged, folder, earlier, files)
-            then()
-    except LidarpoolError as error:  # names the file, without its temporary folder
-        raise LidarpoolError(str(error).replace(str(staged), str(place))) from error
+                for one in direct:
+                    one.put(storage, points, sweeps, workers)
+            if workers:
+                result = workers.recorded(result)
+            report = make_report(result, files, cloud)
+            report["notes"] += [note for one in formats for note in one.notes(points)]
+            pictures.write_page(report, result, cloud, scenario)
+            text = json.dumps(report, indent=1, allow_nan=False) + "\n"
+            (staged / REPORT).write_text(text, encoding="utf-8")
+            if storage is None:
+                _publish(staged, folder, earlier, files, then)
+            else:
+                if not direct:
+                    _remove_earlier(storage, earlier, files)
+                _put(staged, storage, then)
     except OSError as error:
         raise LidarpoolError(
             f"The result cannot be written to {place} ({error.strerror or error}): make room or "
             "give another folder with --out."
         ) from error
-    finally:
-        beside.shutdown(cancel_futures=True)
-        shutil.rmtree(staged, ignore_errors=True)
     return report
 
 
-def _publish(staged: Path, folder: Path, earlier: Collection[str], files: Collection[str]) -> None:
+class _NoPictures:
+    """Stands for the pictures and the page of a result that has only the cloud."""
+
+    files: Sequence[str] = ()
+
+    def write_page(self, *_: object) -> None:
+        """Write nothing."""
+
+
+class _Pictures:
+    """Pictures of a result, drawn in a thread while the cloud is written, and their page.
+
+    They are drawn from the file of the cloud, as by `lidarpool plot`, so that both draw the same.
+    """
+
+    def __init__(self, result: RunResult, staged: Path, thread: ThreadPoolExecutor) -> None:
+        from .pictures import picture_makers
+
+        self._staged, self._thread = staged, thread
+        self._pictured = Pictured.of(result)
+        self._makers = picture_makers(self._pictured, staged / CLOUD)
+        self.files = [*(f"{name}.png" for name in self._makers), PICTURE_FILE]
+        self._drawn = {n: thread.submit(self._draw, n) for n in self._makers if n not in _OF_CLOUD}
+
+    def _draw(self, name: str) -> str:
+        page = self._makers[name]()
+        page.save(self._staged / f"{name}.png")
+        return page.svg()
+
+    def write_page(
+        self,
+        report: dict[str, Any],
+        result: RunResult,
+        cloud: CountedCloud,
+        scenario: Scenario | None,
+    ) -> None:
+        """Draw the pictures of the cloud, whose file is there by now, and write the page."""
+        from .page.page import write_page
+
+        self._drawn |= {name: self._thread.submit(self._draw, name) for name in _OF_CLOUD}
+        self._pictured.save(self._staged / PICTURE_FILE)
+        images = {name: self._drawn[name].result() for name in self._makers}
+        write_page(self._staged / PAGE, report, result, cloud, images, scenario)
+
+
+@contextmanager
+def _pictures(
+    result: RunResult, staged: Path, only_cloud: bool
+) -> Iterator[_Pictures | _NoPictures]:
+    """Begin to draw the pictures of a result; at the end no thread draws any more."""
+    if only_cloud:  # importing Matplotlib takes as long as all other imports
+        yield _NoPictures()
+        return
+    thread = ThreadPoolExecutor(1, "pictures")
+    try:
+        yield _Pictures(result, staged, thread)
+    finally:
+        thread.shutdown(cancel_futures=True)
+
+
+def _put(staged: Path, storage: Storage, then: Callable[[], object]) -> None:
+    """Put the files of a result into a storage, the report last."""
+    for name in (*EXPORTS, *FILES):
+        if (staged / name).exists():
+            storage.put(staged / name, name)
+    with deferred_interrupts():
+        then()
+
+
+def _publish(
+    staged: Path,
+    folder: Path,
+    earlier: Collection[str],
+    files: Collection[str],
+    then: Callable[[], object],
+) -> None:
     """Move a whole result into place.
 
     A folder with a report is a result: the earlier report is removed first, and the new one is
     moved last. If the process is killed in between, --resume continues from the run's folder.
     """
-    for name in (REPORT, PAGE):
-        (folder / name).unlink(missing_ok=True)
-    flush(folder)
-    for name in (*EXPORTS, *FILES):
-        # A path of an earlier run would look like this one's; and folders are not replaced.
-        if _goes(name, earlier, files):
-            remove(folder / name)
-        if name in files:
-            (staged / name).replace(folder / name)
-    flush(folder)
+    for name in files:
+        flush(staged / name)
+    with deferred_interrupts():
+        for name in (REPORT, PAGE):
+            (folder / name).unlink(missing_ok=True)
+        flush(folder)
+        for name in (*EXPORTS, *FILES):
+            # A path of an earlier run would look like this one's; and folders are not replaced.
+            if _goes(name, earlier, files):
+                remove(folder / name)
+            if name in files:
+                (staged / name).replace(folder / name)
+        flush(folder)
+        then()
 
 
 def _remove_earlier(storage: Storage, earlier: Collection[str], files: Collection[str]) -> None:

@@ -166,31 +166,46 @@ class Survey:
     start: datetime | None = None
 
     def __post_init__(self) -> None:
-        poses = _poses(self.poses)
-        object.__setattr__(self, "poses", poses)
-        object.__setattr__(self, "sensors", tuple(self.sensors))
+        self._set(poses=_poses(self.poses), sensors=tuple(self.sensors))
+        self._set(trajectory=self._trajectory(), materials=tuple(self.materials))
+        self._check_names()
+        if self.sensors:
+            self._set(sensor=self.sensors[0].sensor)
+        extra = ("sensor",) if len(self.sensors) > 1 else ()
+        self._set(columns=chosen((*self.columns, *extra)))
+        if getattr(self, "precision_m", None) is None:
+            finest = min(carried.sensor.optics.resolution_m for carried in self.carried)
+            self._set(precision_m=finest)
+        self._check_values()
+        if self.steps is None and self.path.duration_ns == float("inf"):
+            self._set(steps=STEPS)
+        for carried, steps in zip(self.carried, self.steps_each, strict=True):
+            self._check_duration(carried.sensor, steps)
+
+    def _set(self, **fields: Any) -> None:
+        for name, value in fields.items():
+            object.__setattr__(self, name, value)
+
+    def _trajectory(self) -> Trajectory:
         if self.trajectory is None:
-            if not poses:
+            if not self.poses:
                 raise LidarpoolError("A survey needs at least one pose to scan from.")
-            object.__setattr__(self, "trajectory", Stations(poses))
-        elif poses and self.trajectory != Stations(poses):
+            return Stations(tuple(self.poses))
+        if self.poses and self.trajectory != Stations(tuple(self.poses)):
             raise LidarpoolError("A survey has either poses or a trajectory, not both.")
+        return self.trajectory
+
+    def _check_names(self) -> None:
         names = [carried.name for carried in self.sensors]
         if len(names) > SENSORS_MOST or len({*names}) < len(names):
             raise LidarpoolError(
                 f"A survey has at most {SENSORS_MOST} sensors, each with a name of its own; given: "
                 f"{', '.join(names[:10])}."
             )
-        if self.sensors:
-            object.__setattr__(self, "sensor", self.sensors[0].sensor)
-        extra = ("sensor",) if len(self.sensors) > 1 else ()
-        object.__setattr__(self, "columns", chosen((*self.columns, *extra)))
+
+    def _check_values(self) -> None:
         if self.coordinates not in COORDINATES:
             raise LidarpoolError(f"coordinates are {' or '.join(COORDINATES)}.")
-        object.__setattr__(self, "materials", tuple(self.materials))
-        if getattr(self, "precision_m", None) is None:
-            finest = min(carried.sensor.optics.resolution_m for carried in self.carried)
-            object.__setattr__(self, "precision_m", finest)
         check_numbers(self, {"visibility_km": (1e-3, 1e6), "epsg": (1024, 32767)})
         if self.start is not None and (self.start.tzinfo is None or self.start < START_FROM):
             raise LidarpoolError(
@@ -204,29 +219,28 @@ class Survey:
         for name, value, least in [*values, *(("steps", c.steps, 1) for c in self.carried)]:
             if value is not None and not least <= value < float("inf"):
                 raise LidarpoolError(f"{name} is {value}; it must be at least {least}.")
-        if self.steps is None and self.path.duration_ns == float("inf"):
-            object.__setattr__(self, "steps", STEPS)
-        for carried, steps in zip(self.carried, self.steps_each, strict=True):
-            needed, there = _end_ns(carried.sensor, steps) / 1e9, self.path.duration_ns / 1e9
-            if needed > there:
-                raise LidarpoolError(
-                    f"steps {steps} take until {needed:.6g} s and the trajectory lasts "
-                    f"{there:.6g} s, {needed - there:.6g} s less: take fewer steps, or leave them "
-                    "out for as many as it lasts."
-                )
-            first, stop = carried.sensor.firings(0)
-            if (rays := (stop - first) * carried.sensor.channels) > RAYS_MOST:
-                raise LidarpoolError(
-                    f"A scan would have {rays:,} rays, more than {RAYS_MOST:,}: make step_deg "
-                    "smaller, or take fewer rays."
-                )
-            lasts = _begin_ns(carried.sensor, carried.sensor.firings(steps - 1)[1])
-            if not lasts * self.path.stations < LASTS_MOST_NS:
-                raise LidarpoolError(
-                    f"The survey would last {lasts * self.path.stations / 1e9:.3g} s, and times "
-                    "are counted in nanoseconds for 292 years: make rate_hz larger, or start_s or "
-                    "steps smaller."
-                )
+
+    def _check_duration(self, sensor: Sensor, steps: int) -> None:
+        """Check that the trajectory lasts as long as a sensor, and that its numbers do not end."""
+        needed, there = _end_ns(sensor, steps) / 1e9, self.path.duration_ns / 1e9
+        if needed > there:
+            raise LidarpoolError(
+                f"steps {steps} take until {needed:.6g} s and the trajectory lasts {there:.6g} s, "
+                f"{needed - there:.6g} s less: take fewer steps, or leave them out for as many as "
+                "it lasts."
+            )
+        first, stop = sensor.firings(0)
+        if (rays := (stop - first) * sensor.channels) > RAYS_MOST:
+            raise LidarpoolError(
+                f"A scan would have {rays:,} rays, more than {RAYS_MOST:,}: make step_deg smaller, "
+                "or take fewer rays."
+            )
+        lasts = _begin_ns(sensor, sensor.firings(steps - 1)[1]) * self.path.stations
+        if not lasts < LASTS_MOST_NS:
+            raise LidarpoolError(
+                f"The survey would last {lasts / 1e9:.3g} s, and times are counted in nanoseconds "
+                "for 292 years: make rate_hz larger, or start_s or steps smaller."
+            )
 
     @cached_property
     def path(self) -> Trajectory:
