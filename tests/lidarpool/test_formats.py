@@ -2,12 +2,15 @@
 
 import json
 import pickle
+import re
 import signal
 import sys
 import threading
+import tomllib
 import types
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta, timezone
+from pathlib import Path
 
 import laspy
 import numpy as np
@@ -33,7 +36,6 @@ from lidarpool import (
     read_cloud,
 )
 from lidarpool.base.open3d_module import load_open3d
-from lidarpool.base.vocabulary import FORMATS
 from lidarpool.base.yamlfile import load_yaml
 from lidarpool.columns.storage import Storage
 from lidarpool.columns.table import TABLE
@@ -44,6 +46,7 @@ from lidarpool.export.crs import wkt
 from lidarpool.export.formats import Format
 from lidarpool.export.ros import START_NS
 from lidarpool.export.sweeps import Sweeps
+from lidarpool.export.table import EXPORTS, FORMATS, LAYOUTS
 from lidarpool.scene.actors import Actor, box
 from lidarpool.sensor.trajectory import matrices
 
@@ -330,7 +333,7 @@ def test_e57_has_a_scan_with_its_pose_for_each_sweep(written, cloud):
     np.testing.assert_allclose(found["intensity"], points.intensity)
 
 
-@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("name", EXPORTS)
 def test_an_empty_cloud_can_be_written(sweeps, tmp_path, name):
     columns = {
         key: np.empty(0, TABLE[key].dtype) for key in ("scan", "channel", "object", *COLUMNS)
@@ -368,7 +371,7 @@ def test_what_cannot_be_written_is_one_line_and_leaves_nothing(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="has no limits of files")
-@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("name", EXPORTS)
 def test_a_file_that_cannot_grow_is_one_line_and_leaves_nothing(cloud, sweeps, tmp_path, name):
     import resource
 
@@ -574,7 +577,7 @@ def test_boxes_of_nuscenes_hold_the_points_of_their_actors(traffic, tmp_path):
     assert [row["name"] for row in tables["category"]] == ["Car", "Far_away"]
 
 
-@pytest.mark.parametrize("name", ["ply", *FORMATS])
+@pytest.mark.parametrize("name", FORMATS)
 def test_a_cloud_is_saved_twice_with_the_same_bytes(cloud, sweeps, tmp_path, name):
     known = replace(cloud, sweeps=lambda: sweeps)
     written = []
@@ -632,6 +635,26 @@ def test_a_cloud_is_saved_in_the_format_of_its_ending(cloud, sweeps, tmp_path):
     with pytest.raises(LidarpoolError, match="or of another survey than the sweeps"):
         replace(cloud, sweeps=lambda: shorter).save(tmp_path / "x.mcap")
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_documentation_and_installation_follow_the_table_of_formats():
+    root = Path(__file__).parents[2]
+    project = tomllib.loads((root / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    for name, row in FORMATS.items():
+        installed = {re.split("[<>=]", one)[0] for one in extras.get(row.module, ())}
+        assert installed == {*row.packages}, name
+    text = (root / "docs/how-to/formats.md").read_text()
+    cells = [
+        [re.findall("`([^`]+)`", cell) for cell in line.split("|")] for line in text.split("\n")
+    ]
+    for name in EXPORTS:
+        row = FORMATS[name]
+        files, extra = next((c[2], c[4]) for c in cells if len(c) > 5 and name in c[1])
+        assert row.file in [file.rstrip("/") for file in files], name
+        assert extra == ([f"lidarpool[{row.module}]"] if row.packages else []), name
+    for layout, needed in LAYOUTS.items():
+        assert re.search(rf"\| `{layout}` \|.*\| {', '.join(needed)} \|", text), layout
 
 
 def test_a_format_is_named_as_in_a_scenario():

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from ..base.errors import LidarpoolError
-from ..base.vocabulary import FORMATS, LAYOUTS
+from ..export.table import EXPORTS, LAYOUTS
 from .options import Place
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     "--format",
     "-f",
     "formats",
-    type=click.Choice(list(FORMATS)),
+    type=click.Choice(list(EXPORTS)),
     multiple=True,
     required=True,
     help="Format to write; may be given several times.",

@@ -1,4 +1,4 @@
-"""The export formats of clouds, and their common parts."""
+"""Writes clouds in the formats of the table, completely or not at all."""
 
 from __future__ import annotations
 
@@ -9,52 +9,19 @@ from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ..base.errors import LidarpoolError
-from ..base.vocabulary import FORMATS, LAYOUTS, columns_needed
 from ..columns.cloud import Cloud, CloudLike
 from ..columns.parts import StoredCloud
 from ..columns.storage import Storage, flush
 from .folder import staging
 from .pieces import RangeWriter, Workers
 from .sweeps import Sweeps
+from .table import FORMATS, LAYOUTS, FormatRow, columns_needed
 
-# The module that writes each format, and the packages that it needs.
-_MODULES = {
-    "ply": ("ply", ""),
-    "las": ("las", "las"),
-    "laz": ("las", "las"),
-    "parquet": ("parquet", "parquet"),
-    "pcd": ("pcd", "pcd"),
-    "e57": ("e57", "e57"),
-    "kitti": ("kitti", ""),
-    "nuscenes": ("nuscenes", ""),
-    "mcap": ("ros", "ros"),
-    "rosbag2": ("ros", "ros"),
-}
-_PACKAGES = {
-    "las": ("laspy", "lazrs"),
-    "parquet": ("pyarrow",),
-    "pcd": ("pypcd4",),
-    "e57": ("pye57",),
-    "ros": ("rosbags",),
-}
-_IN_PIECES = ("parquet", "pcd", "kitti", "nuscenes")  # their modules have a class `Pieces`
-_ENDINGS = {".ply": "ply"} | {
-    Path(file).suffix: name for name, (file, _) in FORMATS.items() if "." in file
-}
-# Columns that a format can hold, unless it holds all.
-_HELD = {
-    "e57": {"intensity"},
-    "kitti": {"object", "intensity", "class"},
-    "nuscenes": {"intensity", "channel"},
-    "velodyne": {"channel", "intensity", "time"},
-    "autoware": {"channel", "intensity", "time", "azimuth", "elevation", "range"},
-    "ouster": {"channel", "intensity", "time", "reflectivity", "range"},
-}
+_ENDINGS = {Path(row.file).suffix: name for name, row in FORMATS.items() if "." in row.file}
 
 
 @dataclass(frozen=True)
@@ -64,7 +31,7 @@ class Format:
     Parameters
     ----------
     name
-        ply, or one of `lidarpool.base.vocabulary.FORMATS`.
+        One of `lidarpool.export.table.FORMATS`.
     layout
         Layout of points in mcap and rosbag2: velodyne, autoware or ouster.
 
@@ -79,7 +46,7 @@ class Format:
 
     def __post_init__(self) -> None:
         for what, given, known in (
-            ("format", self.name, _MODULES),
+            ("format", self.name, FORMATS),
             ("layout", self.layout, LAYOUTS),
         ):
             if given not in known:
@@ -97,30 +64,31 @@ class Format:
             ) from error
 
     @property
+    def _row(self) -> FormatRow:
+        return FORMATS[self.name]
+
+    @property
     def file(self) -> str:
         """Its file or folder in the folder of a result."""
-        return FORMATS[self.name][0]
+        return self._row.file
 
     @property
     def in_pieces(self) -> bool:
         """Whether it has many files, which workers can write."""
-        return self.name in _IN_PIECES
-
-    @property
-    def _laid_out(self) -> bool:
-        """Whether it has layouts."""
-        return _MODULES[self.name][0] == "ros"
+        return self._row.in_pieces
 
     @property
     def needs(self) -> tuple[str, ...]:
         """Names of the columns that a cloud must have."""
-        return columns_needed(self.name, self.layout) if self.name in FORMATS else ()
+        return columns_needed(self.name, self.layout)
 
     def left_out(self, cloud: CloudLike) -> list[str]:
         """Names of the cloud's columns that it cannot hold."""
         names = [column.name for column in cloud.table]
-        held = _HELD.get(self.layout if self._laid_out else self.name, set(names))
-        return [name for name in names if name not in held]
+        held = self._row.holds
+        if held is None:
+            return []
+        return [name for name in names if name not in held + self._row.layouts.get(self.layout, ())]
 
     def notes(self, cloud: CloudLike) -> list[str]:
         """Return a note for the user on the cloud in this format, or none."""
@@ -129,12 +97,11 @@ class Format:
 
     def check_installed(self) -> None:
         """Check that it can be written here; LidarpoolError if a package is missing."""
-        extra = _MODULES[self.name][1]
-        absent = [package for package in _PACKAGES.get(extra, ()) if find_spec(package) is None]
+        absent = [package for package in self._row.packages if find_spec(package) is None]
         if absent:
             raise LidarpoolError(
                 f"The format {self.name} needs {' and '.join(absent)}: "
-                f'pip install "lidarpool[{extra}]".'
+                f'pip install "lidarpool[{self._row.module}]".'
             )
 
     def check(self, path: Path, cloud: CloudLike, *, overwrite: bool = False) -> None:
@@ -146,11 +113,12 @@ class Format:
             raise LidarpoolError(f"{path} exists: give another place with --out, or --overwrite.")
         there = {column.name for column in cloud.table}
         if missing := [name for name in self.needs if name not in there]:
-            whole = f"{self.name} with the layout {self.layout}" if self._laid_out else self.name
+            laid_out = f"with the layout {self.layout} " if self._row.layouts else ""
             lacks = ", ".join(missing)
             raise LidarpoolError(
-                f"The format {whole} needs {lacks}, which the cloud lacks: run the survey again "
-                f"with {self.name} in output.write, or with {lacks} among cloud.columns."
+                f"The format {self.name} {laid_out}needs {lacks}, which the cloud lacks: run the "
+                f"survey again with {self.name} in output.write, or with {lacks} among "
+                "cloud.columns."
             )
 
     def write(
@@ -182,8 +150,8 @@ class Format:
         LidarpoolError
             If a package or column is missing, if something is there, or if it cannot be written.
         """
-        module = _MODULES[self.name][0]
-        more: dict[str, Any] = {"layout": self.layout} if self._laid_out else {}
+        module = self._row.module
+        more = {"layout": self.layout} if self._row.layouts else {}
         with _explained(path):
             self.check(path, cloud, overwrite=overwrite)
             with staging(path.parent) as beside:
@@ -207,7 +175,7 @@ class Format:
         place = Storage(storage.path(self.file))
         with _explained(place):
             try:
-                RangeWriter(_MODULES[self.name][0], cloud, sweeps, place).write(workers)
+                RangeWriter(self._row.module, cloud, sweeps, place).write(workers)
             except BaseException:
                 with suppress(OSError):
                     storage.discard(self.file)

@@ -11,11 +11,12 @@ from typing import Any
 
 from ..base.errors import LidarpoolError
 from ..base.interrupts import deferred_interrupts
-from ..base.vocabulary import FORMATS, PICTURES
+from ..base.vocabulary import PICTURES
 from ..columns.storage import Storage, flush
 from ..export.folder import LAST_FILE, staging
 from ..export.formats import Format, remove
 from ..export.sweeps import SWEEPS_FILE, Sweeps
+from ..export.table import EXPORTS, FORMATS
 from ..run.picture_file import PICTURE_FILE, Pictured
 from ..run.ranges import LidarWorkers
 from ..run.result import RunResult
@@ -25,12 +26,12 @@ from .report import make_report
 
 ROOM_BYTES = 32 << 20  # room for pictures and report
 
-CLOUD, PAGE, REPORT = "cloud.ply", "report.html", LAST_FILE
+CLOUD, PAGE, REPORT = FORMATS["ply"].file, "report.html", LAST_FILE
 _OF_CLOUD = ("intensity", "cloud")  # are drawn from the cloud's file
 _IMAGES = tuple(f"{name}.png" for name in PICTURES)
 FILES = (CLOUD, *_IMAGES, PICTURE_FILE, SWEEPS_FILE, PAGE, REPORT)
 _SURVEY = ("scene", "survey")  # what tells one from another
-EXPORTS = tuple(file for file, _ in FORMATS.values())
+_EXPORTS = tuple(FORMATS[name].file for name in EXPORTS)
 
 
 def refuse_to_replace(
@@ -216,7 +217,7 @@ def _pictures(
 
 def _put(staged: Path, storage: Storage, then: Callable[[], object]) -> None:
     """Put the files of a result into a storage, the report last."""
-    for name in (*EXPORTS, *FILES):
+    for name in (*_EXPORTS, *FILES):
         if (staged / name).exists():
             storage.put(staged / name, name)
     with deferred_interrupts():
@@ -241,7 +242,7 @@ def _publish(
         for name in (REPORT, PAGE):
             (folder / name).unlink(missing_ok=True)
         flush(folder)
-        for name in (*EXPORTS, *FILES):
+        for name in (*_EXPORTS, *FILES):
             # A path of an earlier run would look like this one's; and folders are not replaced.
             if _goes(name, earlier, files):
                 remove(folder / name)
@@ -253,7 +254,7 @@ def _publish(
 
 def _remove_earlier(storage: Storage, earlier: Collection[str], files: Collection[str]) -> None:
     """Remove what an earlier result has in a storage and this one would not replace."""
-    for name in (REPORT, PAGE, *EXPORTS, *FILES):
+    for name in (REPORT, PAGE, *_EXPORTS, *FILES):
         if name in (REPORT, PAGE) or _goes(name, earlier, files):
             storage.discard(name)
 
@@ -264,6 +265,6 @@ def _goes(name: str, earlier: Collection[str], files: Collection[str]) -> bool:
     Folders and files of formats only if they are replaced, or the earlier result lists them. If a
     killed run has removed the earlier report, they stay.
     """
-    if name in EXPORTS:
+    if name in _EXPORTS:
         return name in files or name in earlier
     return name not in files

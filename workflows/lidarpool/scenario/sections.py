@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -17,8 +18,9 @@ from pydantic import (
 )
 
 from ..base.arguments import shown
-from ..base.vocabulary import BACKENDS, FORMATS, LAYOUTS, columns_needed
+from ..base.vocabulary import BACKENDS
 from ..columns.table import COORDINATES, OPTIONAL
+from ..export.table import EXPORTS, FORMATS, LAYOUTS, columns_needed
 from ..scene.transform import Transform
 from ..sensor import Pose, Sensor
 from ..sensor.disc import SUBRAYS
@@ -354,8 +356,8 @@ class ExportSection(Section):
     """A format to export the cloud to; in YAML also just its name."""
 
     format: Annotated[
-        Literal["ply", *FORMATS],  # type: ignore[valid-type]
-        Field(description="; ".join(f"{name}: {file}" for name, (file, _) in FORMATS.items())),
+        Literal[tuple(FORMATS)],  # type: ignore[valid-type]
+        Field(description="; ".join(f"{name}: {FORMATS[name].file}" for name in EXPORTS)),
     ]
     layout: Annotated[
         Literal[tuple(LAYOUTS)],  # type: ignore[valid-type]
@@ -393,13 +395,8 @@ class OutputSection(Section):
     @property
     def needs(self) -> tuple[str, ...]:
         """Names of the columns that the formats need."""
-        names = [
-            name
-            for one in self.write
-            if one.format != "ply"
-            for name in columns_needed(one.format, one.layout)
-        ]
-        return tuple(dict.fromkeys(names))
+        needed = (columns_needed(one.format, one.layout) for one in self.write)
+        return tuple(dict.fromkeys(chain.from_iterable(needed)))
 
 
 Names = Annotated[tuple[Text, ...], Strict(False)]
