@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 import open3d  # noqa: F401 - counted among the libraries
 
+from lidarpool.base.storage import Storage
 from lidarpool.columns.parts import PartColumns, StoredCloud, pack
-from lidarpool.columns.storage import Storage
 from lidarpool.columns.table import ALWAYS
 
 PER_SCAN = 20_000

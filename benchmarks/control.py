@@ -31,8 +31,8 @@ from distributed import Client, Scheduler, SpecCluster, Worker
 import lidarpool.pipeline.cast
 import lidarpool.pipeline.driver
 from lidarpool import Scene, Sensor, Survey, simulate
+from lidarpool.base.storage import Storage
 from lidarpool.columns.parts import PartColumns
-from lidarpool.columns.storage import Storage
 from lidarpool.pipeline.cast import CastBatch
 from lidarpool.pipeline.messages import samples_of_scan, summary_type
 from poolpart import Recorder

@@ -36,8 +36,8 @@ from lidarpool import (
     read_cloud,
 )
 from lidarpool.base.open3d_module import load_open3d
+from lidarpool.base.storage import Storage
 from lidarpool.base.yamlfile import load_yaml
-from lidarpool.columns.storage import Storage
 from lidarpool.columns.table import TABLE
 from lidarpool.export import crs, parquet, pieces
 from lidarpool.export.boxes import Boxes

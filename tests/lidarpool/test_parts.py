@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarpool import Cloud, LidarpoolError
+from lidarpool.base.storage import Storage
 from lidarpool.columns.parts import (
     PartColumns,
     StoredCloud,
@@ -24,7 +25,6 @@ from lidarpool.columns.parts import (
     read_tally,
     unpack,
 )
-from lidarpool.columns.storage import Storage
 from lidarpool.columns.table import OPTIONAL, stored
 
 COLUMNS = stored(OPTIONAL)

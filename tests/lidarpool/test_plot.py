@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from lidarpool import Cloud, LidarpoolError, Mounted, Planning, Pose, Scene, Sensor, Survey, Track
+from lidarpool.base.storage import Storage
 from lidarpool.cli.commands import cli
-from lidarpool.columns.storage import Storage
 from lidarpool.columns.table import Column
 from lidarpool.export.cloud_file import CloudFile
 from lidarpool.plan import best

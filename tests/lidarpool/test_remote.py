@@ -7,8 +7,8 @@ from tests.lidarpool.test_store import JOB, OTHERS, add
 
 import lidarpool.run.remote
 from lidarpool import LidarpoolError, remove_run
+from lidarpool.base.storage import Storage
 from lidarpool.columns.parts import mark_name
-from lidarpool.columns.storage import Storage
 from lidarpool.run.store import RunStore
 
 

@@ -9,7 +9,7 @@ import threading
 import pytest
 
 from lidarpool import LidarpoolError
-from lidarpool.columns.storage import Storage
+from lidarpool.base.storage import Storage
 
 
 @pytest.fixture(params=["folder", "memory"])

@@ -14,8 +14,8 @@ from tests.lidarpool.committing import commit
 
 import lidarpool.run.store
 from lidarpool import LidarpoolError, Planning, Scene, Sensor, Survey, remove_run
+from lidarpool.base.storage import Storage
 from lidarpool.columns.parts import mark_name, part_name, probe_name
-from lidarpool.columns.storage import Storage
 from lidarpool.plan import run_trial
 from lidarpool.run.identity import identity_of
 from lidarpool.run.job import Job

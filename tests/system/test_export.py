@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lidarpool import Cloud, Scene, Survey, read_cloud
-from lidarpool.columns.storage import Storage
+from lidarpool.base.storage import Storage
 from lidarpool.export import pieces
 from lidarpool.export.folder import result_folder
 from lidarpool.export.formats import Format
@@ -148,7 +148,7 @@ def test_a_worker_that_cannot_write_is_one_line_and_nothing_is_lost(
 # Ends its worker at its first file of points, and never again.
 DIES = """
 import os, pathlib, signal
-from lidarpool.columns.storage import Storage
+from lidarpool.base.storage import Storage
 armed = pathlib.Path(os.environ["ARMED"])
 def write_and_die(storage, name, data, write=Storage.write):  # a preload may run twice
     write(storage, name, data)

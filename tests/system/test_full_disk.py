@@ -18,7 +18,7 @@ from distributed import Client
 
 import lidarpool.report.output as lidarpool_output
 from lidarpool import LidarpoolError, simulate
-from lidarpool.columns.storage import Storage
+from lidarpool.base.storage import Storage
 from lidarpool.report.output import FILES
 from lidarpool.scenario.scenario import Scenario
 

@@ -19,8 +19,8 @@ from tests.system.test_resume import DRIVERS, SCANS
 from tests.system.test_resume import SCENARIO as RESUMED
 
 from lidarpool import LidarpoolError
+from lidarpool.base.storage import Storage
 from lidarpool.columns.parts import PartColumns, unpack
-from lidarpool.columns.storage import Storage
 from lidarpool.run.store import RunStore
 
 pytest.importorskip("s3fs", reason="parts in an object store need s3fs")
@@ -105,7 +105,7 @@ def test_parts_go_to_the_bucket_until_the_result_is_whole(run, check):
 # Ends its worker a moment after the third upload has begun.
 DIES = """
 import os, signal, threading
-from lidarpool.columns.storage import Storage
+from lidarpool.base.storage import Storage
 from lidarpool.run.store import RunStore
 write, count = Storage.write, []
 def write_and_die(storage, name, data):

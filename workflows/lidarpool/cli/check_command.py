@@ -15,7 +15,7 @@ from ..base.errors import LidarpoolError
 from . import options
 
 if TYPE_CHECKING:
-    from ..columns.storage import Storage
+    from ..base.storage import Storage
     from ..run.connection import TlsFiles
     from ..run.job import Job
 

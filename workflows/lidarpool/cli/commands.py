@@ -37,7 +37,7 @@ from .stations_command import stations
 from .view_command import view
 
 if TYPE_CHECKING:
-    from ..columns.storage import Storage
+    from ..base.storage import Storage
     from ..run.connection import TlsFiles
 
 PROGRAM = "lidarpool"

@@ -12,7 +12,7 @@ from ..export.table import EXPORTS, LAYOUTS
 from .options import Place
 
 if TYPE_CHECKING:
-    from ..columns.storage import Storage
+    from ..base.storage import Storage
 
 
 @click.command()
@@ -53,7 +53,7 @@ def export(
       lidarpool export lidarpool-out --format laz
       lidarpool export lidarpool-out --format mcap --layout autoware --out bags
     """  # noqa: D301 - click wants the character, not its name
-    from ..columns.storage import Storage
+    from ..base.storage import Storage
     from ..export.cloud_file import CloudFile
     from ..export.folder import local_result, result_folder, send
     from ..export.formats import Format

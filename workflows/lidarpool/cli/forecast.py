@@ -21,8 +21,8 @@ from raybeam import available_backends
 
 from ..base.choice import one_of_each_part
 from ..base.errors import LidarpoolError, Mistakes
+from ..base.storage import Storage
 from ..columns.cloud import CHUNK_POINTS
-from ..columns.storage import Storage
 from ..export.formats import Format
 from ..pipeline import GPU, LIDAR, OTHER
 from ..pipeline.database import FILE

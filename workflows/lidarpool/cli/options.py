@@ -24,7 +24,7 @@ class Place(click.Path):
         """Give a Path, or a Storage."""
         if "://" not in str(value):
             return super().convert(value, param, ctx)
-        from ..columns.storage import Storage
+        from ..base.storage import Storage
 
         return Storage.at(value)
 

@@ -13,7 +13,7 @@ from ..base.vocabulary import PICTURES
 from .options import Place
 
 if TYPE_CHECKING:
-    from ..columns.storage import Storage
+    from ..base.storage import Storage
 
 
 def _size(ctx: click.Context, param: click.Parameter, value: Any) -> tuple[int, int]:

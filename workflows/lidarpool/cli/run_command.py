@@ -15,9 +15,9 @@ from distributed import Client
 
 from ..base.errors import LidarpoolError
 from ..base.open3d_module import load_open3d
+from ..base.storage import Storage
 from ..base.vocabulary import PATIENCE_S, WAIT_S
 from ..base.words import counted
-from ..columns.storage import Storage
 from ..export.folder import local_result, result_folder
 from ..export.formats import Format
 from ..pipeline.database import FILE

@@ -10,7 +10,7 @@ import click
 from .options import Place
 
 if TYPE_CHECKING:
-    from ..columns.storage import Storage
+    from ..base.storage import Storage
 
 
 @click.command()

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from ..base.choice import one_of_each_part
 from ..base.errors import LidarpoolError
+from ..base.storage import Storage, target_of
 from .cloud import CHUNK_POINTS, Cloud, Savable, described, need_packages
-from .storage import Storage, target_of
 from .table import AXES, SCAN, Column
 
 # Files of a run in the folder of its parts: its mark, then what it is.

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from ..base.errors import LidarpoolError
-from ..columns.storage import Storage, is_url
+from ..base.storage import Storage, is_url
 
 LAST_FILE = "report.json"  # a result with this file is complete
 # Folder of unfinished files; the next writer removes that of a killed program.

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from ..base.errors import LidarpoolError
+from ..base.storage import Storage, flush
 from ..columns.cloud import Cloud, CloudLike
 from ..columns.parts import StoredCloud
-from ..columns.storage import Storage, flush
 from .folder import staging
 from .pieces import RangeWriter, Workers
 from .sweeps import Sweeps

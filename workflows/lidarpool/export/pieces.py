@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from ..base.errors import LidarpoolError
+from ..base.storage import Storage
 from ..columns.cloud import Cloud, CloudLike
-from ..columns.storage import Storage
 from .sweeps import MIXED_UP, Sweeps
 
 # NumPy, pyarrow and system calls for the disk hold Python's lock at most 6 % of the time.

@@ -32,11 +32,11 @@ from poolpart import (
 )
 
 from ..base.errors import LidarpoolError
+from ..base.storage import Storage
 from ..base.task_book import TaskBook
 from ..base.tracing import trace
 from ..columns.cloud import Cloud
 from ..columns.parts import part_name, probe_name
-from ..columns.storage import Storage
 from .batches import Batch, Batches, Place
 from .cast import intersect
 from .database import RunDatabase

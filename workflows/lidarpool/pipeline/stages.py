@@ -23,9 +23,9 @@ from poolpart import (
     telling_departure,
 )
 
+from ..base.storage import Storage
 from ..base.tracing import trace
 from ..columns.parts import pack
-from ..columns.storage import Storage
 from ..sensor import Survey
 from .cast import CastBatch
 from .failures import naming_scans

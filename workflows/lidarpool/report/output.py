@@ -11,8 +11,8 @@ from typing import Any
 
 from ..base.errors import LidarpoolError
 from ..base.interrupts import deferred_interrupts
+from ..base.storage import Storage, flush
 from ..base.vocabulary import PICTURES
-from ..columns.storage import Storage, flush
 from ..export.folder import LAST_FILE, staging
 from ..export.formats import Format, remove
 from ..export.sweeps import SWEEPS_FILE, Sweeps

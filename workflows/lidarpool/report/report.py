@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from .._version import __version__
+from ..base.storage import Storage
 from ..base.task_book import StageTotals, union
-from ..columns.storage import Storage
 from ..pipeline import COLLECT, EXPORT, GENERATE, INTERSECT, SORT
 from ..run.result import RunResult
 from ..run.trials import TRIAL

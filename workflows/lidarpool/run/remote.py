@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from ..base.errors import LidarpoolError
-from ..columns.storage import Storage
+from ..base.storage import Storage
 from ..pipeline.database import FILE, RunDatabase
 
 OWNER = "run.owner"  # the mark of the run that may write the copy

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from ..base.arguments import checked
 from ..base.errors import LidarpoolError
+from ..base.storage import Storage, is_url
 from ..columns.cloud import Cloud
 from ..columns.parts import StoredCloud, mark_name, own_files, read_part, read_tally, unpack
-from ..columns.storage import Storage, is_url
 from ..export.sweeps import Sweeps
 from ..pipeline.database import FILE, RunDatabase, parts_folder, read_place
 from ..pipeline.messages import Receipt, samples_of_scan, summary_type

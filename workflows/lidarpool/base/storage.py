@@ -16,7 +16,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from ..base.errors import LidarpoolError
+from .errors import LidarpoolError
 
 _TEMPORARY = ".lidarpool-tmp-"
 _LEFT = re.compile(rf"{re.escape(_TEMPORARY)}(.+)-[0-9a-f]{{8}}")
