@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 from lidarpool import LidarpoolError
 from lidarpool.cli.import_command import import_
-from lidarpool.scenario.helios import import_survey
+from lidarpool.importers.helios import import_survey
 from lidarpool.sensor.materials import MaterialTable
 from lidarpool.simulator.rig import Rig
 

@@ -36,7 +36,7 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
       lidarpool import survey.xml --assets helios/python/pyhelios -o surveys/wood
     """  # noqa: D301 - click wants the character, not its name
     from ..base.words import counted
-    from ..scenario.helios import import_survey
+    from ..importers.helios import import_survey
 
     made = import_survey(survey, out or Path(survey.stem), assets)
     sensors, files = len(made.scenario.sensors), len(made.scenario.scene.files)

@@ -16,10 +16,10 @@ import numpy as np
 import yaml
 
 from ...base.errors import LidarpoolError
+from ...scenario.scenario import Scenario
 from ...sensor import Pose
 from ...sensor.disc import SUBRAYS
 from ...sensor.survey import SENSORS_MOST
-from ..scenario import Scenario
 from .files import Assets, Float, about, clean, number, rotation, vector
 from .scanner import Device, Scanner, channels, device, unread
 from .scene import Surroundings

@@ -1,0 +1,1 @@
+"""Surveys of other programs as scenarios."""
