@@ -4,6 +4,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from ._version import __version__
+from .base import ports
 
 if TYPE_CHECKING:
     from .api.result import Result
@@ -95,6 +96,15 @@ _MODULES = {
     "sensor.trajectory": ("Track",),
     "sensor.trajectory_files": ("load_trajectory",),
 }
+
+
+def _save_cloud(*given: Any) -> list[str]:
+    from .export.formats import save
+
+    return save(*given)
+
+
+ports.save_cloud = _save_cloud
 
 
 def __getattr__(name: str) -> Any:

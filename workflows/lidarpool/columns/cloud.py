@@ -13,6 +13,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..base import ports
 from ..base.arguments import as_array, checked, checked_fields
 from ..base.errors import LidarpoolError
 from ..base.open3d_module import load_open3d
@@ -84,10 +85,7 @@ class Savable:
             If there is no such format, it lacks a column or package, it stores single sweeps and
             the cloud is not of a result, or the file cannot be written.
         """
-        # Formats are in a room above this one, which must not import it: find it by name.
-        save = import_module("lidarpool.export.formats").save
-        left_out: list[str] = save(Path(path), self, format, layout, precision_m)
-        return left_out
+        return ports.save_cloud(Path(path), self, format, layout, precision_m)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
