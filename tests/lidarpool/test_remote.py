@@ -174,7 +174,7 @@ def test_storage_that_fails(url, monkeypatch):
         raise OSError("it is full")
 
     monkeypatch.setattr(lidarpool.run.remote.Storage, "write", fail)
-    with pytest.raises(LidarpoolError, match=rf"cannot be kept in {url} \(it is full\)"):
+    with pytest.raises(LidarpoolError, match=f"cannot be kept in {url}: it is full"):
         store.save(now=True)
     with pytest.raises(LidarpoolError, match=rf"Cannot write to {url} \(it is full\)"):
         RunStore(JOB, url, resume=True)

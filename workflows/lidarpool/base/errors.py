@@ -16,6 +16,17 @@ class LidarpoolError(Exception):
     """
 
 
+@contextmanager
+def explained(what: str, advice: str = "") -> Iterator[None]:
+    """Turn an OSError of the body into a LidarpoolError: what failed, why, and what to do."""
+    try:
+        yield
+    except OSError as error:
+        why = error.strerror or error
+        told = f"{what} ({why}): {advice}." if advice else f"{what}: {why}."
+        raise LidarpoolError(told) from error
+
+
 class Mistakes:
     """Collects errors and reports them together."""
 

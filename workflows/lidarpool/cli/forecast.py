@@ -6,7 +6,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -116,10 +116,15 @@ def forecast(
             one.check_installed()
     slots = _slots(job, pool, client, file)
     # The memory of machines that are not there yet is unknown.
-    casters = Casters(slots[GPU]["there"], memory=0 if client or file else MEMORY_LIMIT)
+    casters, backend, memory = slots[GPU]["there"], None, 0 if client or file else MEMORY_LIMIT
     with mistakes.noted():
-        casters = _casters(job, casters, slots, client, file)
-    notes += casters.notes
+        if file is not None:
+            file.require({name: one["needed"] for name, one in slots.items()})
+        elif client is None:
+            backend = _backend_here(job.backend)
+        else:
+            casters, backend, memory, note = _casters(job, client)
+            notes += [note] if note else []
     sample = None
     # Casting here needs as much memory as on a worker: it would fail or be killed.
     if _worker_bytes(job) <= MEMORY_LIMIT:
@@ -132,9 +137,9 @@ def forecast(
     with mistakes.noted():
         _check_disk(disk, isinstance(out, Storage))
     needed = _worker_bytes(job) if client or file else _machine_bytes(job, points, slots)
-    if casters.memory and casters.memory < needed:
+    if memory and memory < needed:
         mistakes.lines.append(
-            f"There are {format_bytes(casters.memory)} of memory, and the run needs about "
+            f"There are {format_bytes(memory)} of memory, and the run needs about "
             f"{format_bytes(needed)}: take a smaller scene, fewer workers (pool.gpu), "
             "rays_per_revolution or planning.particles, or a machine with more."
         )
@@ -151,49 +156,23 @@ def forecast(
         "rays": job.survey.ray_count,
         "estimate": asdict(sample) if sample else None,
         "trials": job.trials,
-        "backend": casters.backend,
-        "casters": casters.count,
+        "backend": backend,
+        "casters": casters,
         "slots": slots,
-        "memory": {"needed": needed, "there": casters.memory or None},
+        "memory": {"needed": needed, "there": memory or None},
         "disk": disk,
     }
 
 
-@dataclass(frozen=True)
-class Casters:
-    """The workers that would cast: how many, with which backend, and the least memory of one.
-
-    The backend is None, and the memory 0, where it is not known.
-    """
-
-    count: int
-    backend: str | None = None
-    memory: int = 0
-    notes: tuple[str, ...] = ()
-
-
-def _casters(
-    job: Job,
-    unknown: Casters,
-    slots: dict[str, dict[str, int]],
-    client: Client | None,
-    file: ClusterFile | None,
-) -> Casters:
-    """Find the workers that would cast; LidarpoolError if they cannot."""
-    if file is not None:
-        file.require({name: one["needed"] for name, one in slots.items()})
-        return unknown
-    if client is None:
-        return replace(unknown, backend=_backend_here(job.backend))
+def _casters(job: Job, client: Client) -> tuple[int, str, int, str]:
+    """Workers of a cluster that would cast, their backend, the least memory of one, and a note."""
     try:
-        pool, casting, backend, _ = find_workers(
-            client, job.collectors, job.planning is not None, job.backend
-        )
+        planning = job.planning is not None
+        pool, casting, backend, _ = find_workers(client, job.collectors, planning, job.backend)
     except PoolError as error:
         raise LidarpoolError(str(error)) from error
     memory = min((worker.memory for worker in casting if worker.memory), default=0)
-    note = gpu_note(pool, casting, backend)
-    return Casters(len(casting), backend, memory, (note,) if note else ())
+    return len(casting), backend, memory, gpu_note(pool, casting, backend)
 
 
 def _disk(job: Job, points: int, exports: int, out: Path | Storage) -> dict[str, Any]:

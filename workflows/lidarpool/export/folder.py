@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarpoolError, explained
 from ..base.storage import Storage, is_url
 
 LAST_FILE = "report.json"  # a result with this file is complete
@@ -87,7 +87,7 @@ def local_result(place: Path | Storage, names: Sequence[str]) -> Iterator[Path]:
         if not isinstance(place, Storage):
             yield folder
             return
-        try:
+        with explained(f"{place.url} cannot be read"):
             there = place.sizes()
             if LAST_FILE not in there:
                 raise LidarpoolError(
@@ -98,10 +98,6 @@ def local_result(place: Path | Storage, names: Sequence[str]) -> Iterator[Path]:
             for name in (*names, LAST_FILE):
                 if name in there:
                     place.get(name, folder / name)
-        except OSError as error:
-            raise LidarpoolError(
-                f"{place.url} cannot be read: {error.strerror or error}."
-            ) from error
         yield folder
 
 
@@ -127,11 +123,9 @@ def send(path: Path, place: Path | Storage) -> str:
     if not isinstance(place, Storage):
         return str(path)
     url = place.path(path.name)
-    try:
+    with explained(f"{url} cannot be written"):
         place.discard(path.name)
         place.put(path, path.name)
-    except OSError as error:
-        raise LidarpoolError(f"{url} cannot be written: {error.strerror or error}.") from error
     return url
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
@@ -12,14 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarpoolError, explained
 from ..base.storage import Storage, flush
 from ..columns.cloud import Cloud, CloudLike
 from ..columns.parts import StoredCloud
 from .folder import staging
 from .pieces import RangeWriter, Workers
 from .sweeps import Sweeps
-from .table import FORMATS, LAYOUTS, FormatRow, columns_needed
+from .table import FORMATS, LAYOUTS, FormatRow
 
 _ENDINGS = {Path(row.file).suffix: name for name, row in FORMATS.items() if "." in row.file}
 
@@ -80,7 +80,7 @@ class Format:
     @property
     def needs(self) -> tuple[str, ...]:
         """Names of the columns that a cloud must have."""
-        return columns_needed(self.name, self.layout)
+        return self._row.needed(self.layout)
 
     def left_out(self, cloud: CloudLike) -> list[str]:
         """Names of the cloud's columns that it cannot hold."""
@@ -152,7 +152,7 @@ class Format:
         """
         module = self._row.module
         more = {"layout": self.layout} if self._row.layouts else {}
-        with _explained(path):
+        with explained(f"{path} cannot be written"):
             self.check(path, cloud, overwrite=overwrite)
             with staging(path.parent) as beside:
                 staged = beside / path.name  # bags contain the name of their file
@@ -173,7 +173,7 @@ class Format:
     ) -> None:
         """Have workers write a format of many files into a storage; LidarpoolError leaves none."""
         place = Storage(storage.path(self.file))
-        with _explained(place):
+        with explained(f"{place} cannot be written"):
             try:
                 RangeWriter(self._row.module, cloud, sweeps, place).write(workers)
             except BaseException:
@@ -196,7 +196,7 @@ def save(
     one = Format(name, layout)
     sweeps = Sweeps.unknown() if cloud.sweeps is None else cloud.sweeps()
     sweeps = replace(sweeps, precision_m=precision_m or sweeps.precision_m)
-    with _explained(path):
+    with explained(f"{path} cannot be written"):
         if path.is_dir():
             raise LidarpoolError(f"{path} is a folder: remove it, or give another path.")
     if cloud.sweeps is None and "scan" in one.needs:
@@ -206,15 +206,6 @@ def save(
         )
     one.write(path, cloud, sweeps, overwrite=True)
     return one.left_out(cloud)
-
-
-@contextmanager
-def _explained(place: object) -> Iterator[None]:
-    """Turn an OSError into one line on a place."""
-    try:
-        yield
-    except OSError as error:
-        raise LidarpoolError(f"{place} cannot be written: {error.strerror or error}.") from error
 
 
 def remove(path: Path) -> None:

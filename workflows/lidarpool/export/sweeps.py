@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.archives import open_archive
 from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud, CloudLike
 from ..scene.scene import Scene
@@ -260,40 +261,32 @@ class Sweeps:
         LidarpoolError
             If it cannot be read, is damaged, or of another version.
         """
-        try:
-            with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-                words = json.loads(arrays["words"].tobytes())
-                if words["format"] != _FORMAT:
-                    raise ValueError(f"it is of format {words['format']}, not {_FORMAT}")
-                poses = [
-                    Placed(arrays[f"actor{k}_positions"], arrays[f"actor{k}_quaternions"])
-                    for k in range(len(words["actors"]))
-                ]
-                found = cls(
-                    arrays["scans"],
-                    arrays["begins_ns"],
-                    arrays["sensor"],
-                    Placed(arrays["positions"], arrays["quaternions"]),
-                    Placed(arrays["mount_positions"], arrays["mount_quaternions"]),
-                    tuple(words["sensors"]),
-                    tuple(words["objects"]),
-                    tuple(words["actors"]),
-                    tuple(poses),
-                    arrays["actor_bounds"],
-                    words["coordinates"],
-                    words["precision_m"],
-                    words["epsg"],
-                    words["start_ns"],
-                )
+        with open_archive(path) as arrays:
+            words = json.loads(arrays["words"].tobytes())
+            if words["format"] != _FORMAT:
+                raise ValueError(f"it is of format {words['format']}, not {_FORMAT}")
+            poses = [
+                Placed(arrays[f"actor{k}_positions"], arrays[f"actor{k}_quaternions"])
+                for k in range(len(words["actors"]))
+            ]
+            found = cls(
+                arrays["scans"],
+                arrays["begins_ns"],
+                arrays["sensor"],
+                Placed(arrays["positions"], arrays["quaternions"]),
+                Placed(arrays["mount_positions"], arrays["mount_quaternions"]),
+                tuple(words["sensors"]),
+                tuple(words["objects"]),
+                tuple(words["actors"]),
+                tuple(poses),
+                arrays["actor_bounds"],
+                words["coordinates"],
+                words["precision_m"],
+                words["epsg"],
+                words["start_ns"],
+            )
             found._check()
             return found
-        except OSError as error:
-            raise LidarpoolError(f"{path} cannot be read: {error.strerror or error}.") from error
-        except Exception as error:  # zipfile, zlib and NumPy have many
-            raise LidarpoolError(
-                f"{path} is damaged or not of this version of lidarpool "
-                f"({' '.join(str(error).split())}): run the survey again."
-            ) from error
 
 
 def plain_names(names: Iterable[str]) -> list[str]:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarpoolError, explained
 from ..base.interrupts import deferred_interrupts
 from ..base.storage import Storage, flush
 from ..base.vocabulary import PICTURES
@@ -59,12 +59,11 @@ def refuse_to_replace(
     storage = place if isinstance(place, Storage) else Storage.at(place)
     advice = "give another folder with --out, or replace it with --overwrite (in Python "
     advice += "overwrite=True)."
-    try:
-        there = set(storage.entries())
-    except NotADirectoryError:
-        return
-    except OSError as error:
-        raise LidarpoolError(f"{place} cannot be read: {error.strerror or error}.") from error
+    with explained(f"{place} cannot be read"):
+        try:
+            there = set(storage.entries())
+        except NotADirectoryError:
+            return
     if REPORT in there:
         try:
             report = json.loads(storage.read(REPORT))
@@ -120,48 +119,39 @@ def write_result(
     direct = [one for one in formats if one.in_pieces] if storage and workers else []
     points, sweeps = result.points, Sweeps.of(result.survey, result.scene)
     cloud = CountedCloud(points, len(result.scene.all_names))
-    try:
-        with staging(folder, place) as staged, _pictures(result, staged, only_cloud) as pictures:
-            exports = [one.file for one in formats]
-            page = [] if only_cloud else [PAGE]
-            files = [CLOUD, *exports, *pictures.files, SWEEPS_FILE, *page, REPORT]
-            sweeps.save(staged / SWEEPS_FILE)
-            Format("ply").write(staged / CLOUD, cloud, sweeps)
-            for one in formats:
-                if one not in direct:
-                    one.write(staged / one.file, points, sweeps, workers=workers)
-            if storage and direct:
-                _remove_earlier(storage, earlier, files)
-                for one in direct:
-                    one.put(storage, points, sweeps, workers)
-            if workers:
-                result = workers.recorded(result)
-            report = make_report(result, files, cloud)
-            report["notes"] += [note for one in formats for note in one.notes(points)]
+    advice = "make room or give another folder with --out"
+    with (
+        explained(f"The result cannot be written to {place}", advice),
+        staging(folder, place) as staged,
+        nullcontext() if only_cloud else _Pictures(result, staged) as pictures,
+    ):
+        exports = [one.file for one in formats]
+        drawn, page = (pictures.files, [PAGE]) if pictures else ([], [])
+        files = [CLOUD, *exports, *drawn, SWEEPS_FILE, *page, REPORT]
+        sweeps.save(staged / SWEEPS_FILE)
+        Format("ply").write(staged / CLOUD, cloud, sweeps)
+        for one in formats:
+            if one not in direct:
+                one.write(staged / one.file, points, sweeps, workers=workers)
+        if storage and direct:
+            _remove_earlier(storage, earlier, files)
+            for one in direct:
+                one.put(storage, points, sweeps, workers)
+        if workers:
+            result = workers.recorded(result)
+        report = make_report(result, files, cloud)
+        report["notes"] += [note for one in formats for note in one.notes(points)]
+        if pictures:
             pictures.write_page(report, result, cloud, scenario)
-            text = json.dumps(report, indent=1, allow_nan=False) + "\n"
-            (staged / REPORT).write_text(text, encoding="utf-8")
-            if storage is None:
-                _publish(staged, folder, earlier, files, then)
-            else:
-                if not direct:
-                    _remove_earlier(storage, earlier, files)
-                _put(staged, storage, then)
-    except OSError as error:
-        raise LidarpoolError(
-            f"The result cannot be written to {place} ({error.strerror or error}): make room or "
-            "give another folder with --out."
-        ) from error
+        text = json.dumps(report, indent=1, allow_nan=False) + "\n"
+        (staged / REPORT).write_text(text, encoding="utf-8")
+        if storage is None:
+            _publish(staged, folder, earlier, files, then)
+        else:
+            if not direct:
+                _remove_earlier(storage, earlier, files)
+            _put(staged, storage, then)
     return report
-
-
-class _NoPictures:
-    """Stands for the pictures and the page of a result that has only the cloud."""
-
-    files: Sequence[str] = ()
-
-    def write_page(self, *_: object) -> None:
-        """Write nothing."""
 
 
 class _Pictures:
@@ -170,14 +160,23 @@ class _Pictures:
     They are drawn from the file of the cloud, as by `lidarpool plot`, so that both draw the same.
     """
 
-    def __init__(self, result: RunResult, staged: Path, thread: ThreadPoolExecutor) -> None:
-        from .pictures import picture_makers
+    def __init__(self, result: RunResult, staged: Path) -> None:
+        from .pictures import picture_makers  # Matplotlib takes as long as all other imports
 
-        self._staged, self._thread = staged, thread
+        self._staged, self._thread = staged, ThreadPoolExecutor(1, "pictures")
         self._pictured = Pictured.of(result)
         self._makers = picture_makers(self._pictured, staged / CLOUD)
         self.files = [*(f"{name}.png" for name in self._makers), PICTURE_FILE]
-        self._drawn = {n: thread.submit(self._draw, n) for n in self._makers if n not in _OF_CLOUD}
+        self._drawn = {n: self._begun(n) for n in self._makers if n not in _OF_CLOUD}
+
+    def __enter__(self) -> _Pictures:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._thread.shutdown(cancel_futures=True)
+
+    def _begun(self, name: str) -> Future[str]:
+        return self._thread.submit(self._draw, name)
 
     def _draw(self, name: str) -> str:
         page = self._makers[name]()
@@ -194,25 +193,10 @@ class _Pictures:
         """Draw the pictures of the cloud, whose file is there by now, and write the page."""
         from .page.page import write_page
 
-        self._drawn |= {name: self._thread.submit(self._draw, name) for name in _OF_CLOUD}
+        self._drawn |= {name: self._begun(name) for name in _OF_CLOUD}
         self._pictured.save(self._staged / PICTURE_FILE)
         images = {name: self._drawn[name].result() for name in self._makers}
         write_page(self._staged / PAGE, report, result, cloud, images, scenario)
-
-
-@contextmanager
-def _pictures(
-    result: RunResult, staged: Path, only_cloud: bool
-) -> Iterator[_Pictures | _NoPictures]:
-    """Begin to draw the pictures of a result; at the end no thread draws any more."""
-    if only_cloud:  # importing Matplotlib takes as long as all other imports
-        yield _NoPictures()
-        return
-    thread = ThreadPoolExecutor(1, "pictures")
-    try:
-        yield _Pictures(result, staged, thread)
-    finally:
-        thread.shutdown(cancel_futures=True)
 
 
 def _put(staged: Path, storage: Storage, then: Callable[[], object]) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarpoolError, explained
 from ..base.vocabulary import PICTURES
 from ..base.words import did_you_mean
 from ..columns.cloud import Cloud
@@ -57,12 +57,8 @@ def draw_pictures(
             raise LidarpoolError(f"There is no picture {name!r}.{there}")
         if name not in makers:
             raise LidarpoolError(f"There is no picture {name!r}: its run planned no path.")
-    try:
+    with explained(f"The folder {folder} cannot be made", "give another"):
         Path(folder).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise LidarpoolError(
-            f"The folder {folder} cannot be made ({error.strerror}): give another."
-        ) from error
     for name in only or makers:
         path = Path(folder) / f"{name}.png"
         makers[name]().save(path)

@@ -73,19 +73,13 @@ def conducted(
     store
         Store of the run, with what an earlier run has left.
     cluster
-        Starts a cluster or connects to one, if anything is left to do. The time to wait for its
-        scheduler, if it has to be waited for, is also that for its workers.
+        Starts a cluster or connects to one, if anything is left to do; it shares its time to wait
+        with the workers.
     own
-        Whether the cluster is a local one for this run: then the backend must be available here,
-        and there is no page of partitions.
-    progress
-        Shows the progress while the run lasts.
-    page
-        The live page, or `NoPage`.
-    tell
-        Called with messages for the user.
-    on_frame
-        Called with each frame, in scan order.
+        Whether that is a local cluster for this run: then the backend must be available here, and
+        there is no page of partitions.
+    progress, page, tell, on_frame
+        Where progress, the run itself, messages and frames are shown.
     keep
         Whether the cluster lasts as long as the body, which also gets workers of LIDAR that write
         formats of many files; None if nothing was left to do.

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.errors import LidarpoolError
+from ..base.archives import open_archive
 from ..base.words import counted
 from ..columns.table import TABLE, Column
 from ..plan import Plan, Planning
@@ -207,18 +207,8 @@ class Pictured:
         LidarpoolError
             If the file cannot be read, is damaged, or of another version.
         """
-        try:
-            # NumPy leaves a file open that it opened itself and cannot read.
-            with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-                return cls._from_arrays(archive)
-        except OSError as error:
-            raise LidarpoolError(f"{path} cannot be read: {error.strerror or error}.") from error
-        except Exception as error:  # zipfile, zlib, NumPy and Scene have many
-            reason = " ".join(str(error).split())
-            raise LidarpoolError(
-                f"{path} is damaged or not of this version of lidarpool ({reason}): run the "
-                "survey again."
-            ) from error
+        with open_archive(path) as archive:
+            return cls._from_arrays(archive)
 
     @classmethod
     def _from_arrays(cls, arrays: Mapping[str, Any]) -> Pictured:

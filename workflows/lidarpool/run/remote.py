@@ -9,11 +9,10 @@ from __future__ import annotations
 
 import secrets
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarpoolError, explained
 from ..base.storage import Storage
 from ..pipeline.database import FILE, RunDatabase
 
@@ -81,14 +80,8 @@ class RemoteRun:
                 f"A later run has taken over or deleted {self.storage.url}: this one has ended."
             )
 
-    @contextmanager
-    def _explained(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            raise LidarpoolError(
-                f"The run cannot be kept in {self.storage.url} ({error.strerror or error})."
-            ) from error
+    def _explained(self) -> AbstractContextManager[None]:
+        return explained(f"The run cannot be kept in {self.storage.url}")
 
 
 def fetch_database(storage: Storage, folder: Path) -> None:

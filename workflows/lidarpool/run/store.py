@@ -10,7 +10,7 @@ import tempfile
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.arguments import checked
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarpoolError, explained
 from ..base.storage import Storage, is_url
 from ..columns.cloud import Cloud
 from ..columns.parts import StoredCloud, mark_name, own_files, read_part, read_tally, unpack
@@ -96,13 +96,9 @@ class RunStore:
         self.place = self._remote.storage.url if self._remote else folder  # for people
         self._folder = folder  # of the database
         made = not folder.exists()
-        try:
+        advice = "make the one that it lies in first, or give another"
+        with explained(f"The run's folder {folder} cannot be made", advice):
             folder.mkdir(exist_ok=True)
-        except OSError as error:
-            raise LidarpoolError(
-                f"The run's folder {folder} cannot be made ({error.strerror or error}): make the "
-                "one that it lies in first, or give another."
-            ) from error
         try:
             self.db = self._open(here, parts)
             try:
@@ -140,7 +136,7 @@ class RunStore:
         except OSError as error:
             raise LidarpoolError(f"The run in {self.place} cannot be read: {error}.") from error
         if self.lasting:
-            with _explained(self.place):
+            with _removing(self.place):
                 left = _remove(Storage.at(self.place), _storage(self.place, earlier), mark)
             if left:
                 raise LidarpoolError(left)
@@ -174,15 +170,10 @@ class RunStore:
             self._remote.claim(self.db)
         name = mark_name(self.db.meta["mark"])
         if name not in sizes:
-            try:
+            advice = "make room there, or give another place with --parts"
+            with explained(f"The points cannot be kept in {self.storage.url}", advice):
                 self.storage.prepare()
                 self.storage.write(name, b"")
-            except OSError as error:
-                raise LidarpoolError(
-                    f"The points cannot be kept in {self.storage.url} "
-                    f"({error.strerror or error}): make room there, or give another place with "
-                    "--parts."
-                ) from error
 
     def _go_on(self, here: dict[str, str], resume: bool, sizes: dict[str, int]) -> None:
         """Check that this run may continue the existing one."""
@@ -240,12 +231,8 @@ class RunStore:
         return (found.first, found.stop, len(found)) == (part.first, part.stop, part.rows)
 
     def _sizes(self) -> dict[str, int]:
-        try:
+        with explained(f"{self.storage.url} cannot be looked at"):
             return self.storage.sizes()
-        except OSError as error:
-            raise LidarpoolError(
-                f"{self.storage.url} cannot be looked at: {error.strerror or error}."
-            ) from error
 
     # -- reading ---------------------------------------------------------------------------
 
@@ -399,7 +386,7 @@ class RunStore:
             self._remote.check()
         self._gone = True
         self.db.close()
-        with _explained(self.place):
+        with _removing(self.place):
             return _remove(Storage.at(self.place), self.storage, self.db.meta["mark"])
 
     @contextmanager
@@ -446,7 +433,7 @@ def remove_run(folder: str | Path) -> None:
         or is a link: these stay, and the message names them.
     """
     kept = Storage.at(folder)
-    with _explained(folder), tempfile.TemporaryDirectory(prefix="lidarpool-") as temporary:
+    with _removing(folder), tempfile.TemporaryDirectory(prefix="lidarpool-") as temporary:
         if not kept.is_local:
             fetch_database(kept, Path(temporary))
         try:
@@ -499,11 +486,5 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:NAMED]) + (f" and {more:,} more" if more > 0 else "")
 
 
-@contextmanager
-def _explained(place: str | Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise LidarpoolError(
-            f"The run in {place} cannot be removed: {error.strerror or error}."
-        ) from error
+def _removing(place: str | Path) -> AbstractContextManager[None]:
+    return explained(f"The run in {place} cannot be removed")

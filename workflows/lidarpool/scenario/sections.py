@@ -20,7 +20,7 @@ from pydantic import (
 from ..base.arguments import shown
 from ..base.vocabulary import BACKENDS
 from ..columns.table import COORDINATES, OPTIONAL
-from ..export.table import EXPORTS, FORMATS, LAYOUTS, columns_needed
+from ..export.table import EXPORTS, FORMATS, LAYOUTS
 from ..scene.transform import Transform
 from ..sensor import Pose, Sensor
 from ..sensor.disc import SUBRAYS
@@ -395,7 +395,7 @@ class OutputSection(Section):
     @property
     def needs(self) -> tuple[str, ...]:
         """Names of the columns that the formats need."""
-        needed = (columns_needed(one.format, one.layout) for one in self.write)
+        needed = (FORMATS[one.format].needed(one.layout) for one in self.write)
         return tuple(dict.fromkeys(chain.from_iterable(needed)))
 
 

@@ -12,7 +12,7 @@ from trimesh.exchange.gltf import export_glb
 from trimesh.exchange.obj import export_obj
 from trimesh.exchange.ply import export_ply
 
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarpoolError, explained
 from .meshfile import GENERATOR, OWN
 from .scene import Scene
 from .transform import UP_AXES
@@ -47,10 +47,9 @@ def write_scene(path: str | Path, scene: Scene) -> Path:
     data = _encoded(path.suffix.lower(), scene)
     partial = path.with_name(f".{path.name}.partial")
     try:
-        partial.write_bytes(data)
-        partial.replace(path)
-    except OSError as error:
-        raise LidarpoolError(f"{path} cannot be written: {error.strerror}.") from error
+        with explained(f"{path} cannot be written"):
+            partial.write_bytes(data)
+            partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
     return path

@@ -1,0 +1,35 @@
+"""Archives of arrays that this package has written."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .errors import LidarpoolError
+
+
+@contextmanager
+def open_archive(path: Path) -> Iterator[Any]:
+    """Open an archive of arrays for the body; nothing in it is run.
+
+    Raises
+    ------
+    LidarpoolError
+        If the file cannot be read, or the body cannot make anything of it.
+    """
+    try:
+        # NumPy leaves a file open that it opened itself and cannot read.
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            yield archive
+    except OSError as error:
+        raise LidarpoolError(f"{path} cannot be read: {error.strerror or error}.") from error
+    except Exception as error:  # zipfile, zlib, NumPy and Scene have many
+        reason = " ".join(str(error).split())
+        raise LidarpoolError(
+            f"{path} is damaged or not of this version of lidarpool ({reason}): run the survey "
+            "again."
+        ) from error
