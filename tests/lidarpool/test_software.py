@@ -46,7 +46,7 @@ def test_the_same_sources_in_another_place_are_the_same_and_one_letter_more_is_n
 
 def test_a_process_older_than_its_files_does_not_speak_for_them(copy):
     late = time.time() + 3600
-    os.utime(copy / "lidarpool" / "scan" / "returns.py", (late, late))
+    os.utime(copy / "lidarpool" / "simulator" / "returns.py", (late, late))
     assert asked(copy) == "changed since the process started"
 
 

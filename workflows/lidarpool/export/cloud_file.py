@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.choice import one_of_each_part
-from ..base.errors import LidarpoolError
 from ..columns.cloud import CHUNK_POINTS, Cloud
 from ..columns.table import TABLE, Column
-from .ply_format import AXES, layout
+from .ply_format import AXES, mapped_rows
 
 
 class CloudFile:
@@ -34,16 +33,8 @@ class CloudFile:
     """
 
     def __init__(self, path: Path, own: Sequence[Column] = ()) -> None:
-        try:
-            start, count, dtype = layout(path)
-            # An empty file cannot be mapped.
-            self._rows: NDArray[np.void] = (
-                np.memmap(path, dtype, "r", start, (count,)) if count else np.empty(0, dtype)
-            )
-        except OSError as error:
-            raise LidarpoolError(f"{path} cannot be read: {error.strerror or error}.") from error
-        except ValueError as error:
-            raise LidarpoolError(f"{path} is not a point cloud of lidarpool: {error}.") from error
+        self._rows = mapped_rows(path)
+        dtype = self._rows.dtype
         self.table = _table(dtype, own)
         scans = self._rows["scan"] if "scan" in (dtype.names or ()) else np.empty(0, np.int32)
         some = scans[one_of_each_part(len(scans), 100_000)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from datetime import UTC, date, datetime
+from functools import partial
 from pathlib import Path
 from textwrap import shorten
 from typing import Any
@@ -27,16 +28,6 @@ _GPS_NS = 315_964_800 * 10**9  # from 1970-01-01 to 1980-01-06, the start of GPS
 _LEAP_S = 18  # that GPS time is ahead of UTC since 2017, the earliest start
 _ADJUSTED_S = 1e9  # that adjusted standard GPS time is behind GPS time
 _FAR = 2**31 - 1  # steps from the offset to the farthest point
-
-
-def write_las(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
-    """Write a LAS file; see `_write`."""
-    _write(path, cloud, sweeps, compress=False)
-
-
-def write_laz(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
-    """Write a LAZ file; see `_write`."""
-    _write(path, cloud, sweeps, compress=True)
 
 
 def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> None:
@@ -93,6 +84,10 @@ def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> N
                 writer.close()
     except lazrs.LazrsError as error:
         raise OSError(f"{error}; the disk may be full") from error
+
+
+write_las = partial(_write, compress=False)
+write_laz = partial(_write, compress=True)
 
 
 def _points(chunk: Cloud, header: laspy.LasHeader, extra: list[str], begins_s: float) -> Any:

@@ -16,7 +16,7 @@ from ..base.open3d_module import load_open3d
 from ..columns.cloud import CHUNK_POINTS, Cloud, CloudLike
 from ..columns.table import AXES as POSITION
 from ..columns.table import TABLE, check_names
-from .ply_format import AXES, as_held, header, layout, row_type
+from .ply_format import AXES, as_held, header, layout, mapped_rows, row_type
 from .sweeps import SWEEPS_FILE, Sweeps
 
 # Positions are stored in single precision if the error is below this part of the precision.
@@ -64,28 +64,14 @@ def read_cloud(path: str | Path) -> Cloud:
         If the file is missing, truncated, or not a binary PLY with x, y and z.
     """
     path = Path(path)
-    try:
-        start, count, dtype = layout(path)
-        rows = np.fromfile(path, dtype=dtype, count=count, offset=start)
-    except OSError as error:
-        raise LidarpoolError(f"{path} cannot be read: {error.strerror or error}.") from error
-    except ValueError as error:
-        raise LidarpoolError(f"{path} is not a point cloud of lidarpool: {error}.") from error
+    rows = np.array(mapped_rows(path))
     positions = np.stack([rows[axis] for axis in "xyz"], axis=1)
     names = {column.in_files: column.name for column in TABLE.values()}
-    columns = {
-        names.get(name, name): _narrowed(names.get(name, name), rows[name])
-        for name in rows.dtype.names or ()
-        if name not in AXES
-    }
+    columns = {names.get(name, name): rows[name] for name in rows.dtype.names or ()}
+    columns = {name: values for name, values in columns.items() if name not in AXES}
     beside = path.with_name(SWEEPS_FILE)
     sweeps = partial(Sweeps.load, beside) if beside.exists() else None
     return Cloud(positions, columns, sweeps=sweeps)
-
-
-def _narrowed(name: str, values: NDArray[Any]) -> NDArray[Any]:
-    """Values in the type of their column, if the file has another type."""
-    return values.astype(TABLE[name].dtype) if name in TABLE else values
 
 
 def real_type(bounds: NDArray[np.floating], precision_m: float) -> np.dtype[np.floating]:

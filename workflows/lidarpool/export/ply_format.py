@@ -93,6 +93,24 @@ def layout(path: Path) -> tuple[int, int, np.dtype[np.void]]:
     return start, count, dtype
 
 
+def mapped_rows(path: Path) -> NDArray[np.void]:
+    """Return the points of a PLY file, a row each, which stay on the disk until they are used.
+
+    Raises
+    ------
+    LidarpoolError
+        If the file cannot be read, or is not a complete binary PLY file with our properties.
+    """
+    try:
+        start, count, dtype = layout(path)
+        # An empty file cannot be mapped.
+        return np.memmap(path, dtype, "r", start, (count,)) if count else np.empty(0, dtype)
+    except OSError as error:
+        raise LidarpoolError(f"{path} cannot be read: {error.strerror or error}.") from error
+    except ValueError as error:
+        raise LidarpoolError(f"{path} is not a point cloud of lidarpool: {error}.") from error
+
+
 def _parse_header(text: str) -> tuple[int, np.dtype[np.void]]:
     """Take number and type of the rows from a header; ValueError if they are not ours."""
     elements = [line.split() for line in text.splitlines() if line.startswith("element")]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 import time
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -182,13 +182,7 @@ def common_software(
     LidarpoolError
         If no worker has the earlier one.
     """
-    asked = [worker.address for worker in workers]
-    answers = ask_workers(client, software_there(backend), asked)
-    for answer in answers.values():
-        if isinstance(answer, BaseException):
-            raise answer
-    if not answers:
-        raise TooFewWorkersError(_ALL_LEFT)
+    answers = _answers(client, software_there(backend), workers)
     if earlier and dict(earlier) not in answers.values():
         address, there = next(iter(answers.items()))
         raise LidarpoolError(
@@ -199,6 +193,19 @@ def common_software(
     counts = Counter(tuple(answer.items()) for answer in answers.values())
     most = max(counts, key=lambda one: (counts[one], one))
     return dict(earlier) if earlier else dict(most)
+
+
+def _answers(
+    client: Client, question: Callable[[], Any], workers: Sequence[WorkerInfo]
+) -> Mapping[str, Any]:
+    """Return what workers answer, by address; the first error of one is raised."""
+    answers = ask_workers(client, question, [worker.address for worker in workers])
+    for answer in answers.values():
+        if isinstance(answer, BaseException):
+            raise answer
+    if not answers:
+        raise TooFewWorkersError(_ALL_LEFT)
+    return answers
 
 
 def gpu_note(pool: Iterable[WorkerInfo], casting: Sequence[WorkerInfo], backend: str) -> str:
@@ -223,14 +230,7 @@ def common_backend(
     LidarpoolError
         If a worker lacks the requested backend.
     """
-    answers: Mapping[str, Any] = ask_workers(
-        client, available_backends, [worker.address for worker in workers]
-    )
-    for answer in answers.values():
-        if isinstance(answer, BaseException):
-            raise answer
-    if not answers:
-        raise TooFewWorkersError(_ALL_LEFT)
+    answers = _answers(client, available_backends, workers)
     if wanted == "auto":
         names = next(iter(answers.values()))
         return next(n for n in names if not any(reasons[n] for reasons in answers.values()))
