@@ -206,7 +206,7 @@ def test_the_path_plot_has_equal_axes_in_world_coordinates(planned):
 
 
 def test_a_picture_that_cannot_be_written_is_named(tmp_path, shot, monkeypatch):
-    with pytest.raises(LidarpoolError, match=r"gone.*Choose a folder"):
+    with pytest.raises(LidarpoolError, match=r"gone.*choose a folder"):
         draw_scene(shot, 9).save(tmp_path / "gone" / "scene.png")
 
     def full_disk(figure, file, **options):

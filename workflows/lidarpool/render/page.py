@@ -22,7 +22,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator
 from numpy.typing import NDArray
 
-from ..base.errors import LidarpoolError
+from ..base.errors import explained
 from . import theme
 from .shot import Shot
 
@@ -254,13 +254,9 @@ class Page:
         LidarpoolError
             If the folder does not exist or is not writable.
         """
-        try:
+        advice = "choose a folder that exists, can be written to and has room"
+        with explained(f"The picture {path} could not be written", advice):
             self.figure.savefig(path, dpi=DPI)
-        except OSError as error:
-            raise LidarpoolError(
-                f"The picture {path} could not be written: {error.strerror or error}. "
-                "Choose a folder that exists, can be written to and has room."
-            ) from error
 
     def svg(self) -> str:
         """Return the page as an element of HTML, whose ink may follow the style around it.

@@ -64,27 +64,27 @@ def refuse_to_replace(
             there = set(storage.entries())
         except NotADirectoryError:
             return
+    earlier, listed = _earlier(storage)
     if REPORT in there:
-        try:
-            report = json.loads(storage.read(REPORT))
-            earlier = {name: report["identity"][name] for name in _SURVEY}
-        except (OSError, ValueError, TypeError, LookupError):
-            earlier = {}
         here = identity()
         if earlier != {name: here[name] for name in _SURVEY}:
             raise LidarpoolError(f"{place} holds the result of another survey: {advice}")
-    listed = _listed(storage)
     names = (*FILES, *(one.file for one in formats))
     if foreign := [name for name in names if name in there and name not in listed]:
         raise LidarpoolError(f"{place} holds {foreign[0]}, which no result there lists: {advice}")
 
 
-def _listed(storage: Storage) -> frozenset[str]:
-    """Names of the files of the result in a folder: only these may be removed there."""
+def _earlier(storage: Storage) -> tuple[dict[str, str], frozenset[str]]:
+    """Identity of the result in a folder, and its files, which alone may be removed there.
+
+    Both are empty if there is no result, or none that can be read.
+    """
     try:
-        return frozenset(json.loads(storage.read(REPORT))["files"])
+        report = json.loads(storage.read(REPORT))
+        identity = {name: report["identity"][name] for name in _SURVEY}
+        return identity, frozenset(report["files"])
     except (OSError, ValueError, TypeError, LookupError):
-        return frozenset()
+        return {}, frozenset()
 
 
 def write_result(
@@ -114,7 +114,7 @@ def write_result(
         If a file cannot be written.
     """
     storage = place if isinstance(place, Storage) else None
-    earlier = _listed(storage or Storage.at(folder))
+    _, earlier = _earlier(storage or Storage.at(folder))
     # Workers write these into the storage.
     direct = [one for one in formats if one.in_pieces] if storage and workers else []
     points, sweeps = result.points, Sweeps.of(result.survey, result.scene)
