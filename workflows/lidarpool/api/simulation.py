@@ -171,6 +171,6 @@ def simulate(
 
 
 def _page_of(job: Job) -> AbstractContextManager[LiveRun]:
-    from ..live.run_page import live_run  # with viser, which takes half a second
+    from ..live.run_page import live_run  # with Matplotlib, for its colours
 
     return live_run(job)
