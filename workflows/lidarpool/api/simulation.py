@@ -16,7 +16,6 @@ from ..base.vocabulary import PATIENCE_S, WAIT_S
 from ..pipeline import Frame
 from ..plan import Planning
 from ..run.bars import bars_here
-from ..run.checks import check_backend_here
 from ..run.connection import local_client
 from ..run.job import Job
 from ..run.progress import Progress
@@ -24,6 +23,7 @@ from ..run.run import Run, make_result
 from ..run.store import RunStore
 from ..scene.scene import Scene
 from ..sensor import Survey
+from ..simulator.world import check_backend_here
 from .result import Result
 
 if TYPE_CHECKING:

@@ -7,6 +7,7 @@ ray and return, so the batches do not matter.
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -116,6 +117,12 @@ class EchoCaster:
         # Light continues so far behind a surface, not to hit it again: Embree rounds to a quarter.
         reach = np.float32(np.abs(scene.vertices).max())
         self._clear_m = max(1e-5, 4 * float(np.spacing(reach)))
+
+    def within(self, caster: World, surfaces: Surfaces) -> EchoCaster:
+        """Return the same caster with actors elsewhere."""
+        echoes = copy(self)
+        echoes._caster, echoes._surfaces = caster, surfaces
+        return echoes
 
     @staticmethod
     def needed(survey: Survey, surfaces: Surfaces) -> bool:
