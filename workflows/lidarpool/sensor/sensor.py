@@ -178,18 +178,26 @@ class Sensor:
         >>> Sensor.grid(step_deg=10).steps_of_turn(2)
         range(72, 108)
         """
+        first, stop = (self._first_step(n, self._steps_in_turn) for n in (number, number + 1))
+        return range(first, stop)
+
+    @cached_property
+    def _steps_in_turn(self) -> int:
+        return self._first_step(1, 1)
+
+    def _first_step(self, number: int, each: int) -> int:
+        """Find the first time step of a turn, if `each` turn has about so many."""
 
         def turn(step: int) -> int:
             return int(self.turns([step])[0])
 
-        found, first = [], 0
-        for wanted in (number, number + 1):
-            ahead = 1
-            while turn(first + ahead) < wanted:
-                ahead *= 2
-            first = bisect_left(range(first + ahead + 1), wanted, lo=first, key=turn)
-            found.append(first)
-        return range(*found)
+        low = high = number * each
+        back = ahead = 1
+        while low and turn(low) >= number:
+            low, back = max(0, low - back), 2 * back
+        while turn(high) < number:
+            high, ahead = high + ahead, 2 * ahead
+        return bisect_left(range(high + 1), number, lo=low, key=turn)
 
     def directions(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
         """Make the unit directions of firings (k,), in the sensor's axes: (k, channels, 3)."""

@@ -234,11 +234,14 @@ class Rig:
 
     def _rays_of(self, number: int, first: int, stop: int) -> tuple[Pattern, Pattern | None]:
         """Rays of some firings in the axes of the carrier, and their sub-rays, if they are few."""
+        sensor = self.survey.carried[number].sensor
+        if sensor.period:
+            first, stop = first % sensor.period, first % sensor.period + stop - first
         made = self._firings.get((number, first, stop))
         if made is None:
             pattern, subrays = self.pattern(number, first, stop), None
             if self._echoes is not None:
-                subrays = self._echoes.divided(self.survey.carried[number].sensor, pattern)
+                subrays = self._echoes.divided(sensor, pattern)
             if len(self._firings) >= KEPT:
                 self._firings.clear()
             made = self._firings[number, first, stop] = (pattern, subrays)
