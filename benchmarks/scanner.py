@@ -1,6 +1,6 @@
 """A scan in a loop, beside the cast alone: `python -m benchmarks.scanner [--peers PYTHON]`.
 
-A VLP-16, an OS1-128, and 1,000 robots with 64 rays each, in a city, with one thread, in turns:
+A VLP-16, an OS1-128, and 1,000 robots with 64 rays each, in a city, with one thread, in turns that are shuffled:
 
 - cast: `RayCaster.scan` of raybeam with the same rays, made before; it ends with hits;
 - ranges: `Scanner.ranges`, float32 images of ranges;
@@ -154,8 +154,8 @@ def measure(
     hits: dict[str, float] = {}
     for number in range(rounds + 1):
         poses = poses_of(count, number)
-        order = list(ways)[number % len(ways) :] + list(ways)[: number % len(ways)]
-        for way in order:
+        # Each finds caches and memory as the last one left them: not always the same one.
+        for way in np.random.default_rng(number).permutation(list(ways)).tolist():
             start = now()
             found = ways[way](poses)
             spent = now() - start

@@ -45,7 +45,7 @@ def mujoco_caster(job: Job) -> Callable[[], int]:
                 model, data, origins[k], rays[k], None, True, -1, geom[k], distance[k], None,
                 beams, far,
             )  # fmt: skip
-        return int((distance >= 0).sum())
+        return int(((distance >= 0) & (distance <= far)).sum())
 
     return cast
 
