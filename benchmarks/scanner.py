@@ -1,6 +1,7 @@
 """A scan in a loop, beside the cast alone: `python -m benchmarks.scanner [--peers PYTHON]`.
 
-A VLP-16, an OS1-128, and 1,000 robots with 64 rays each, in a city, with one thread, in turns that are shuffled:
+A VLP-16, an OS1-128, and 1,000 robots with 64 rays each, in a city, with one thread, in shuffled
+order:
 
 - cast: `RayCaster.scan` of raybeam with the same rays, made before; it ends with hits;
 - ranges: `Scanner.ranges`, float32 images of ranges;
