@@ -65,14 +65,14 @@ class Echoes(ScanReturns):
     Attributes
     ----------
     energy
-        float64 (k,): received, see `Surfaces.energy`.
+        float64 (k,): received, see `Surfaces.energy`; None if it is that of the rays as reported.
     number, returns
         uint8 (k,): number among the reported returns of its pulse, from 1, and their count.
     reported
         float64 (k,): distance with noise; `distance` has none.
     """
 
-    energy: Real
+    energy: Real | None
     number: NDArray[np.uint8]
     returns: NDArray[np.uint8]
     reported: Real
@@ -229,14 +229,16 @@ class EchoCaster:
         window: tuple[int, int],
         groups: Whole,
     ) -> Echoes:
-        """Cast rays with one return each; compute energies only for kept ones."""
+        """Cast rays with one return each; compute energies only for kept ones, and if needed."""
         found = self._caster.returns(
             sensor, self._survey.keep_every, pattern, poses, window, groups
         )
-        _, directions = poses.rays(pattern, found.ray, window[0])
-        times = poses.times(found.ray)
-        along = self._surfaces.along_normal(found.triangle, directions, times)
-        energy = self._energy(sensor, found.triangle, np.abs(along), found.distance)
+        energy = None
+        if self._noise.angle_deg:
+            _, directions = poses.rays(pattern, found.ray, window[0])
+            times = poses.times(found.ray)
+            along = self._surfaces.along_normal(found.triangle, directions, times)
+            energy = self._energy(sensor, found.triangle, np.abs(along), found.distance)
         one = np.ones(len(found), np.uint8)
         return Echoes(
             **vars(found), energy=energy, number=one, returns=one, reported=found.distance
