@@ -4,7 +4,7 @@ A VLP-16, an OS1-128, and 1,000 robots with 64 rays each, in a city, with one th
 order:
 
 - cast: `RayCaster.scan` of raybeam with the same rays, made before; it ends with hits;
-- ranges: `Scanner.ranges`, float32 images of ranges;
+- ranges, noise: `Scanner.ranges`, float32 images of ranges, and so with noise of 2 cm;
 - sweep, moving: `Scanner.sweep`, a cloud with its columns, from a pose and from a trajectory;
 - open3d: Open3D's RaycastingScene and NumPy, from poses to float32 images, as one would write it.
 
@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarpool import Scanner, Scene, Sensor, Track, load_sensor
+from lidarpool import Noise, Scanner, Scene, Sensor, Track, load_sensor
 from lidarpool.scene.city import city
 from raybeam import Pattern, RayCaster, available_backends
 
@@ -79,6 +79,8 @@ class Ours:
         self.pattern = Pattern(self.directions, None if origins is None else origins.reshape(-1, 3))
         self.caster = RayCaster(scene.vertices, scene.faces, backend, threads=1)
         self.scanner = Scanner(scene, sensor, backend=backend, threads=1)
+        noise = Noise(range_m=0.02)
+        self.noisy = Scanner(scene, sensor, noise=noise, backend=backend, threads=1)
 
     def cast(self, poses: Float) -> int:
         """Cast the rays from poses (k, 4, 4), and count the hits."""
@@ -96,6 +98,10 @@ class Ours:
     def ranges(self, poses: Float) -> Any:
         """Make images."""
         return self.scanner.ranges(poses)
+
+    def noise(self, poses: Float) -> Any:
+        """Make images with noise."""
+        return self.noisy.ranges(poses)
 
     def sweep(self, poses: Float) -> int:
         """Make the cloud of one pose."""
@@ -145,7 +151,11 @@ def measure(
     """Time all ways of one case."""
     now, count = CLOCKS[clock], robots if case == "robots" else 1
     ours = Ours(scene, sensor_of(case), backend)
-    ways: dict[str, Callable[[Float], Any]] = {"cast": ours.cast, "ranges": ours.ranges}
+    ways: dict[str, Callable[[Float], Any]] = {
+        "cast": ours.cast,
+        "ranges": ours.ranges,
+        "noise": ours.noise,
+    }
     if case != "robots":
         ways |= {"sweep": ours.sweep, "moving": ours.moving}
     if importlib.util.find_spec("open3d"):

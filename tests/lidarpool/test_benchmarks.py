@@ -93,7 +93,7 @@ def test_a_scanner_finds_what_a_cast_and_open3d_find(tmp_path, capsys):
     assert [row["case"] for row in rows] == [*scanner.CASES]
     for row in rows:
         clouds = {"sweep", "moving"} if row["poses"] == 1 else set()
-        assert row["hits"].keys() == {"cast", "ranges", "open3d"} | clouds
+        assert row["hits"].keys() == {"cast", "ranges", "noise", "open3d"} | clouds
         assert all(len(rounds) == 2 for rounds in row["seconds"].values())
         assert 0.05 < row["hits"]["cast"] < 1
         assert row["hits"]["ranges"] == pytest.approx(row["hits"]["cast"], abs=1e-9)
