@@ -163,6 +163,18 @@ def test_an_image_has_the_ranges_of_sweeps(scene, name, given, monkeypatch):
     assert np.array_equal(scanner.ranges(poses, number=4, start_s=0.2), images)
 
 
+@pytest.mark.parametrize("sensor", [VLP16, LATE, replace(GRID, head=Spin(120, step_deg=77))])
+def test_an_image_has_the_firings_of_its_turn(scene, sensor):
+    scanner = Scanner(scene, sensor, columns=["ray", "range"], backend="numpy")
+    for number in range(4):
+        [image], sweep = scanner.ranges(HERE, number=number), scanner.sweep(HERE, number=number)
+        steps = sensor.steps_of_turn(number)
+        begins = np.array([sensor.firings(step)[0] for step in steps]) * sensor.channels
+        expected = np.full(image.size, np.inf, np.float32)
+        expected[(begins - begins[0])[sweep.scan - steps.start] + sweep.ray] = sweep.range
+        np.testing.assert_allclose(image.reshape(-1), expected, rtol=1e-6)
+
+
 def test_poses_can_be_given_in_several_forms(scene):
     scanner = Scanner(scene, GRID, backend="numpy")
     places = np.array([[0, 0, 1], [1, -1, 2.0]])
@@ -187,6 +199,25 @@ def test_an_actor_stands_where_it_was_put(scene):
     scanner.move("Car", DRIVE)
     with pytest.raises(LidarpoolError, match=r"Actor 'Car': The trajectory goes from 0 to 0\.5 s"):
         scanner.sweep((0, 0, 1), start_s=9)
+
+
+@pytest.mark.parametrize("physics", [{}, PHYSICS], ids=["plain", "all effects"])
+def test_a_moved_actor_is_like_one_that_was_there_before(scene, physics):
+    """In cast, normals, and energies."""
+    clouds, images, way = [], [], Track([0, 1], [[4, -3, 0], [5, 3, 0]])
+    for first in (CAR.trajectory, way):
+        car = Actor(CAR.mesh, first)
+        scanner = Scanner(
+            scene.with_actors([Actor(box("Van", (5, 2, 2))), car]), GRID, columns=COLUMNS,
+            backend="numpy", **physics,
+        )  # fmt: skip
+        scanner.sweep((0, 0, 1))  # fills what is kept
+        scanner.move("Van", (-6, 1, 0))
+        scanner.move("Car", way)
+        clouds.append(scanner.sweep((0, 0, 1), number=2))
+        images.append(scanner.ranges((0, 0, 1), number=2))
+    assert {6, 7, 8} <= {*clouds[0].object.tolist()} and same(*clouds)
+    assert np.array_equal(*images)
 
 
 def test_a_sweep_sees_actors_where_they_were_when_it_began(scene):
