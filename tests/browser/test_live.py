@@ -129,4 +129,4 @@ def test_stop_ends_the_run_as_an_interrupt_does(client, live, new_tab):
 
 def colours(picture):
     """Colours left of the panel."""
-    return np.unique(picture[200:, :900].reshape(-1, 3), axis=0)
+    return np.unique(picture[100:, :900].reshape(-1, 3), axis=0)

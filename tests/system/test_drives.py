@@ -105,7 +105,7 @@ def test_the_drive_of_three_sensors_and_ten_actors_can_be_made(tmp_path):
     assert len(scene.actors) == 10
     assert 15e6 < survey.ray_count < 15.2e6
     for actor in scene.actors:
-        actor.check(survey.duration_ns)
+        actor.check(0.0, survey.duration_ns)
 
 
 def test_a_frame_says_whose_it_is(cluster_client):

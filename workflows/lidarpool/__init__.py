@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from .pipeline import Frame
     from .plan import Plan, Planning
     from .run.store import remove_run
+    from .scene.actors import Actor
     from .scene.mesh import Mesh
     from .scene.scene import Scene
     from .sensor import (
@@ -34,8 +35,10 @@ if TYPE_CHECKING:
     from .sensor.models import load_sensor
     from .sensor.trajectory import Track
     from .sensor.trajectory_files import load_trajectory
+    from .simulator import Scanner
 
 __all__ = [
+    "Actor",
     "Beams",
     "Cloud",
     "Column",
@@ -52,6 +55,7 @@ __all__ = [
     "Result",
     "Returns",
     "ScanSpec",
+    "Scanner",
     "Scene",
     "Sensor",
     "Spin",
@@ -77,6 +81,7 @@ _MODULES = {
     "pipeline": ("Frame",),
     "plan": ("Plan", "Planning"),
     "run.store": ("remove_run",),
+    "scene.actors": ("Actor",),
     "scene.mesh": ("Mesh",),
     "scene.scene": ("Scene",),
     "sensor.models": ("load_sensor",),
@@ -95,6 +100,7 @@ _MODULES = {
     ),
     "sensor.trajectory": ("Track",),
     "sensor.trajectory_files": ("load_trajectory",),
+    "simulator": ("Scanner",),
 }
 
 

@@ -14,7 +14,6 @@ from ..base.vocabulary import PATIENCE_S, WAIT_S
 from ..pipeline import Frame
 from ..plan import Planning
 from ..run.bars import bars_here
-from ..run.checks import check_backend_here
 from ..run.conductor import NoPage, Page, conducted
 from ..run.connection import local_client
 from ..run.job import Job
@@ -23,6 +22,7 @@ from ..run.store import RunStore
 from ..run.waiting import Waiting
 from ..scene.scene import Scene
 from ..sensor import Survey
+from ..simulator.world import check_backend_here
 from .result import Result
 
 logger = logging.getLogger(__name__)
@@ -163,6 +163,6 @@ def simulate(
 def _page(job: Job, wanted: bool) -> AbstractContextManager[Page]:
     if not wanted:
         return nullcontext(NoPage())
-    from ..live.run_page import live_run  # with viser, which takes half a second
+    from ..live.run_page import live_run  # with Matplotlib, for its colours
 
     return live_run(job)

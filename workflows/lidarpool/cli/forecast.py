@@ -28,7 +28,7 @@ from ..pipeline import GPU, LIDAR, OTHER
 from ..pipeline.database import FILE
 from ..pipeline.driver import BATCH_RAYS
 from ..report.output import ROOM_BYTES, refuse_to_replace
-from ..run.checks import check_backend_here, find_workers, gpu_note, slots_needed
+from ..run.checks import find_workers, gpu_note, slots_needed
 from ..run.cluster_file import ClusterFile
 from ..run.identity import identity_of
 from ..run.job import Job
@@ -39,6 +39,7 @@ from ..scene.scene import Scene
 from ..sensor import Survey
 from ..simulator.echoes import PATTERN_RAYS
 from ..simulator.rig import Rig
+from ..simulator.world import check_backend_here
 from .run_command import no_hits
 
 # Measured on Linux: a process of ours with Dask loaded, and the most that a triangle takes while a

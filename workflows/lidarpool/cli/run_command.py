@@ -23,7 +23,7 @@ from ..export.formats import Format
 from ..pipeline.database import FILE
 from ..report.output import CLOUD, refuse_to_replace, write_result
 from ..report.report import summary
-from ..run.checks import check_backend_here, slots_needed
+from ..run.checks import slots_needed
 from ..run.cluster_file import ClusterFile
 from ..run.conductor import NoPage, Page, conducted
 from ..run.connection import TlsFiles, connected, local_client, started_client
@@ -34,6 +34,7 @@ from ..run.store import RUN_FOLDER, RunStore, remove_run
 from ..run.waiting import Waiting
 from ..scenario.placing import seen_from
 from ..scenario.scenario import Scenario
+from ..simulator.world import check_backend_here
 from .logs import set_logs
 from .terminal import shown_progress, shown_status, tell
 from .worker_logs import WorkerLogs

@@ -13,7 +13,7 @@ from distributed import Client
 from poolpart import Partition
 
 from ..pipeline import LIDAR, Frame
-from .checks import check_backend_here
+from ..simulator.world import check_backend_here
 from .progress import Progress, Show
 from .ranges import LidarWorkers
 from .result import RunResult

@@ -25,7 +25,7 @@ from ..columns.parts import StoredCloud, mark_name, own_files, read_part, read_t
 from ..export.sweeps import Sweeps
 from ..pipeline.database import FILE, RunDatabase, parts_folder, read_place
 from ..pipeline.messages import Receipt, samples_of_scan, summary_type
-from .checks import AUTO_TAKES
+from ..simulator.world import AUTO_TAKES
 from .identity import difference, identity_of
 from .job import Job
 from .progress import Progress

@@ -7,6 +7,7 @@ ray and return, so the batches do not matter.
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -64,14 +65,14 @@ class Echoes(ScanReturns):
     Attributes
     ----------
     energy
-        float64 (k,): received, see `Surfaces.energy`.
+        float64 (k,): received, see `Surfaces.energy`; None if it is that of the rays as reported.
     number, returns
         uint8 (k,): number among the reported returns of its pulse, from 1, and their count.
     reported
         float64 (k,): distance with noise; `distance` has none.
     """
 
-    energy: Real
+    energy: Real | None
     number: NDArray[np.uint8]
     returns: NDArray[np.uint8]
     reported: Real
@@ -116,6 +117,12 @@ class EchoCaster:
         # Light continues so far behind a surface, not to hit it again: Embree rounds to a quarter.
         reach = np.float32(np.abs(scene.vertices).max())
         self._clear_m = max(1e-5, 4 * float(np.spacing(reach)))
+
+    def within(self, caster: World, surfaces: Surfaces) -> EchoCaster:
+        """Return the same caster with actors elsewhere."""
+        echoes = copy(self)
+        echoes._caster, echoes._surfaces = caster, surfaces
+        return echoes
 
     @staticmethod
     def needed(survey: Survey, surfaces: Surfaces) -> bool:
@@ -222,14 +229,16 @@ class EchoCaster:
         window: tuple[int, int],
         groups: Whole,
     ) -> Echoes:
-        """Cast rays with one return each; compute energies only for kept ones."""
+        """Cast rays with one return each; compute energies only for kept ones, and if needed."""
         found = self._caster.returns(
             sensor, self._survey.keep_every, pattern, poses, window, groups
         )
-        _, directions = poses.rays(pattern, found.ray, window[0])
-        times = poses.times(found.ray)
-        along = self._surfaces.along_normal(found.triangle, directions, times)
-        energy = self._energy(sensor, found.triangle, np.abs(along), found.distance)
+        energy = None
+        if self._noise.angle_deg:
+            _, directions = poses.rays(pattern, found.ray, window[0])
+            times = poses.times(found.ray)
+            along = self._surfaces.along_normal(found.triangle, directions, times)
+            energy = self._energy(sensor, found.triangle, np.abs(along), found.distance)
         one = np.ones(len(found), np.uint8)
         return Echoes(
             **vars(found), energy=energy, number=one, returns=one, reported=found.distance

@@ -242,7 +242,7 @@ class BatchReturns:
     @cached_property
     def intensity(self) -> NDArray[np.float64]:
         """Received energy, see `Surfaces.energy`."""
-        if self.echoes is not None:
+        if self.echoes is not None and self.echoes.energy is not None:
             return self.echoes.energy
         extinction = self.survey.extinction(self.sensor)
         return self._surfaces.energy(

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from copy import copy
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from raybeam import Pattern, ScanReturns
 
+from ..scene.actors import Actor
 from ..scene.scene import Scene
 from ..sensor import ScanSpec, Survey, Trajectory
 from .echoes import PATTERN_RAYS, EchoCaster
@@ -17,6 +20,9 @@ from .motion import Clock, Poses, check_trajectory, poses_of_firings, turned
 from .returns import BatchReturns
 from .surfaces import Surfaces
 from .world import World
+
+IMAGE_RAYS = 1 << 20  # rays of images that are cast at a time
+KEPT = 8  # turns whose rays are kept for the next images
 
 
 class _Repeated(NamedTuple):
@@ -69,6 +75,8 @@ class Rig:
             self._echoes = EchoCaster(self._world, scene, survey, self._surfaces)
         check_trajectory(survey.path)
         self._made: dict[tuple[int, bool], _Repeated] = {}  # {(sensor, whether it moves): rays}
+        # {(sensor, first firing, one past the last): rays and sub-rays}
+        self._firings: dict[tuple[int, int, int], tuple[Pattern, Pattern | None]] = {}
         for number in range(len(survey.carried)):
             self._repeated(number, survey.path.moves)
 
@@ -91,6 +99,21 @@ class Rig:
                 subrays = self._echoes.divided(sensor, pattern)
             made = self._made[number, moves] = _Repeated(by_head, pattern, subrays)
         return made
+
+    def with_actors(self, actors: tuple[Actor, ...]) -> Rig:
+        """Return the same rig with other trajectories of the actors; the trees are shared."""
+        rig = copy(self)
+        rig.scene = self.scene.with_actors(actors)
+        rig._world = self._world.with_actors(actors)
+        rig._surfaces = self._surfaces.with_actors(actors)
+        if self._echoes is not None:
+            rig._echoes = self._echoes.within(rig._world, rig._surfaces)
+        return rig
+
+    @property
+    def backend(self) -> str:
+        """Name of the ray-casting backend in use."""
+        return self._world.backend
 
     def pattern(self, number: int, first: int, stop: int) -> Pattern:
         """Rays of firings `first` to `stop` of a sensor, in the axes of its carrier."""
@@ -158,3 +181,68 @@ class Rig:
         else:
             found = self._world.returns(sensor, survey.keep_every, pattern, poses, window, groups)
         return BatchReturns(self.scene, survey, self._surfaces, specs, found, pattern, start, poses)
+
+    def ranges(
+        self,
+        specs: list[ScanSpec],
+        positions: NDArray[np.float64],
+        rotations: NDArray[np.float64] | None,
+    ) -> NDArray[np.float32]:
+        """Cast the same firings from many poses of a carrier that stands.
+
+        Parameters
+        ----------
+        specs
+            Scans of one station; the next pose has the numbers that follow theirs.
+        positions, rotations
+            (k, 3), metres, and (k, 3, 3): checked poses of the carrier.
+
+        Returns
+        -------
+        float32 (k, firings, channels)
+            Ranges of the nearest reported returns, metres; inf where there are none.
+        """
+        number = specs[0].sensor
+        sensor = self.survey.carried[number].sensor
+        first, stop = specs[0].firings[0], specs[-1].firings[1]
+        pattern, subrays = self._rays_of(number, first, stop)
+        begins = sensor.begins_ns(np.arange(first, stop, dtype=np.int64)) + specs[0].start_ns
+        begin_rays = np.array([spec.firings[0] - first for spec in specs]) * sensor.channels
+        rays = len(pattern)
+        out = np.full((len(positions), rays), np.inf, np.float32)
+        each = max(1, IMAGE_RAYS // max(rays, 1))  # poses that are cast at a time
+        for begin in range(0, len(positions), each):
+            block = slice(begin, begin + each)
+            image = out[block].reshape(-1)
+            count = len(image) // rays
+            poses = Poses(positions[block], None if rotations is None else rotations[block], rays)
+            if self.scene.actors:
+                clock = Clock(np.tile(begins, count), sensor.beams.time_ns)
+                poses = replace(poses, clock=clock)
+            window = (0, len(image))
+            if self._echoes is None:
+                low, high = sensor.min_range_m, sensor.max_range_m
+                found = self._world.scan(pattern, poses, window=window, t_min=low, t_max=high)
+                image[found.ray] = found.distance
+                continue
+            groups = (rays * np.arange(count)[:, None] + begin_rays).reshape(-1)
+            scan = specs[0].scan + begin * len(specs)
+            echoes = self._echoes.scan(sensor, scan, pattern, subrays, poses, window, groups)
+            nearest = echoes.number == 1
+            image[echoes.ray[nearest]] = echoes.reported[nearest]
+        return out.reshape(len(positions), -1, sensor.channels)
+
+    def _rays_of(self, number: int, first: int, stop: int) -> tuple[Pattern, Pattern | None]:
+        """Rays of some firings in the axes of the carrier, and their sub-rays, if they are few."""
+        sensor = self.survey.carried[number].sensor
+        if sensor.period:
+            first, stop = first % sensor.period, first % sensor.period + stop - first
+        made = self._firings.get((number, first, stop))
+        if made is None:
+            pattern, subrays = self.pattern(number, first, stop), None
+            if self._echoes is not None:
+                subrays = self._echoes.divided(sensor, pattern)
+            if len(self._firings) >= KEPT:
+                self._firings.clear()
+            made = self._firings[number, first, stop] = (pattern, subrays)
+        return made
