@@ -23,9 +23,9 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from lidarpool import Cloud, Scene, Sensor, Survey, Track
-from lidarpool.export.cloud_file import CloudFile
+from lidarpool.columns.cloud_file import CloudFile
+from lidarpool.columns.ply_format import layout
 from lidarpool.export.formats import Format
-from lidarpool.export.ply_format import layout
 from lidarpool.export.sweeps import Sweeps
 
 COLUMNS = ("time", "class", "intensity", "reflectivity", "range", "azimuth", "elevation")

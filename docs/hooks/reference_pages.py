@@ -10,8 +10,8 @@ import click
 import numpy as np
 
 from lidarpool.cli.commands import cli
+from lidarpool.columns.ply_format import held_type
 from lidarpool.columns.table import ALWAYS, AXES, OPTIONAL, SCAN, Column
-from lidarpool.export.ply_format import held_type
 from lidarpool.scenario.schema import scenario_schema
 
 # Sections in the order of a scenario file, and what stands in the sections of another.

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from lidarpool import Column, Scene, Sensor, Survey, Track
+from lidarpool.columns.cloud_file import CloudFile
+from lidarpool.columns.ply_format import header, row_type
 from lidarpool.columns.table import SCAN
-from lidarpool.export.cloud_file import CloudFile
-from lidarpool.export.ply_format import header, row_type
 from lidarpool.export.sweeps import Sweeps
 from lidarpool.live.result_page import result_view
 from lidarpool.live.server import page_server

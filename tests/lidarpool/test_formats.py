@@ -38,10 +38,10 @@ from lidarpool import (
 from lidarpool.base.open3d_module import load_open3d
 from lidarpool.base.storage import Storage
 from lidarpool.base.yamlfile import load_yaml
+from lidarpool.columns.cloud_file import CloudFile
 from lidarpool.columns.table import TABLE
 from lidarpool.export import crs, parquet, pieces
 from lidarpool.export.boxes import Boxes
-from lidarpool.export.cloud_file import CloudFile
 from lidarpool.export.crs import wkt
 from lidarpool.export.formats import Format
 from lidarpool.export.ros import START_NS

@@ -15,8 +15,8 @@ from tests.lidarpool.committing import commit
 from tests.pages import ask
 
 from lidarpool import Column, LidarpoolError, Planning, Scene, Sensor, Survey
+from lidarpool.columns.ply_format import header, row_type
 from lidarpool.columns.table import CHANNEL, OBJECT, SCAN
-from lidarpool.export.ply_format import header, row_type
 from lidarpool.live.live_points import LivePoints
 from lidarpool.live.result_page import open_result
 from lidarpool.live.run_page import LiveRun, live_run

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from lidarpool.columns.cloud import Cloud
+from lidarpool.columns.cloud_file import CloudFile
+from lidarpool.columns.ply_format import header, row_type
 from lidarpool.columns.table import SCAN, TABLE
-from lidarpool.export.cloud_file import CloudFile
-from lidarpool.export.ply_format import header, row_type
 from lidarpool.live import points
 from lidarpool.live.points import (
     TILES,

@@ -8,9 +8,9 @@ import trimesh
 from tests.pages import ask
 
 from lidarpool import LidarpoolError, Planning, Pose, Scene, Sensor, Survey, Track
+from lidarpool.columns.cloud_file import CloudFile
+from lidarpool.columns.ply_format import header, row_type
 from lidarpool.columns.table import CHANNEL, OBJECT, SCAN
-from lidarpool.export.cloud_file import CloudFile
-from lidarpool.export.ply_format import header, row_type
 from lidarpool.export.sweeps import SWEEPS_FILE, Sweeps
 from lidarpool.live.result_page import open_result, result_page, result_view, view_result
 from lidarpool.live.surface import Surface, colours_for

@@ -14,8 +14,8 @@ import pytest
 from lidarpool import Cloud, LidarpoolError, Mounted, Planning, Pose, Scene, Sensor, Survey, Track
 from lidarpool.base.storage import Storage
 from lidarpool.cli.commands import cli
+from lidarpool.columns.cloud_file import CloudFile
 from lidarpool.columns.table import Column
-from lidarpool.export.cloud_file import CloudFile
 from lidarpool.plan import best
 from lidarpool.plan.trial import run_trial
 from lidarpool.render.page import Page

@@ -128,7 +128,7 @@ class Result(RunResult):
         browser
             Whether to open a browser where there is a desktop.
         """
-        from ..export.cloud_file import CloudFile
+        from ..columns.cloud_file import CloudFile
         from ..live.result_page import result_page, result_view, wait_for_interrupt
 
         with ExitStack() as stack:

@@ -54,7 +54,7 @@ def export(
       lidarpool export lidarpool-out --format mcap --layout autoware --out bags
     """  # noqa: D301 - click wants the character, not its name
     from ..base.storage import Storage
-    from ..export.cloud_file import CloudFile
+    from ..columns.cloud_file import CloudFile
     from ..export.folder import local_result, result_folder, send
     from ..export.formats import Format
     from ..export.sweeps import SWEEPS_FILE, Sweeps

@@ -14,9 +14,9 @@ from ..base.arguments import checked
 from ..base.errors import LidarpoolError
 from ..base.open3d_module import load_open3d
 from ..columns.cloud import CHUNK_POINTS, Cloud, CloudLike
+from ..columns.ply_format import AXES, as_held, header, layout, mapped_rows, row_type
 from ..columns.table import AXES as POSITION
 from ..columns.table import TABLE, check_names
-from .ply_format import AXES, as_held, header, layout, mapped_rows, row_type
 from .sweeps import SWEEPS_FILE, Sweeps
 
 # Positions are stored in single precision if the error is below this part of the precision.

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from ..base.choice import one_of_each_part
 from ..columns.cloud import Cloud
+from ..columns.ply_format import AXES
 from ..columns.table import Column
-from ..export.ply_format import AXES
 
 Floats = NDArray[np.floating]
 Rows = NDArray[np.int64]

@@ -11,7 +11,7 @@ import click
 
 from ..base.errors import LidarpoolError
 from ..base.notebook import cell_display
-from ..export.cloud_file import CloudFile
+from ..columns.cloud_file import CloudFile
 from ..export.sweeps import SWEEPS_FILE, Sweeps
 from ..pipeline.database import FILE
 from ..run.picture_file import PICTURE_FILE, Pictured

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from poolpart import Partition
 
+from ..columns.cloud_file import CloudFile
 from ..columns.table import SCAN, TABLE
-from ..export.cloud_file import CloudFile
 from ..export.sweeps import Sweeps
 from ..pipeline import Frame
 from ..plan import best

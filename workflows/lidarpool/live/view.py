@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..columns.ply_format import AXES
 from ..columns.table import AXES as POSITION
 from ..columns.table import Column, X, Y, Z
-from ..export.ply_format import AXES
 from ..export.sweeps import Sweeps
 from ..render.closeup import CUT, around_ways, floor_and_roof
 from ..render.colouring import MOST_ENTRIES, Colouring, colours_of

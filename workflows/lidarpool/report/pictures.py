@@ -13,8 +13,8 @@ from ..base.errors import LidarpoolError, explained
 from ..base.vocabulary import PICTURES
 from ..base.words import did_you_mean
 from ..columns.cloud import Cloud
+from ..columns.cloud_file import CloudFile
 from ..columns.table import Z
-from ..export.cloud_file import CloudFile
 from ..render.closeup import CUT, around_ways, cut_out, floor_and_roof
 from ..render.page import Page
 from ..render.pictures import MOST_POINTS, draw_cloud, draw_intensity, draw_scene

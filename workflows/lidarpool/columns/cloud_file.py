@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.choice import one_of_each_part
-from ..columns.cloud import CHUNK_POINTS, Cloud
-from ..columns.table import TABLE, Column
+from .cloud import CHUNK_POINTS, Cloud
 from .ply_format import AXES, mapped_rows
+from .table import TABLE, Column
 
 
 class CloudFile:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import LidarpoolError
-from ..columns.table import Column
+from .table import Column
 
 AXES = ("x", "y", "z")
 
