@@ -104,13 +104,8 @@ _MODULES = {
 }
 
 
-def _save_cloud(*given: Any) -> list[str]:
-    from .export.formats import save
-
-    return save(*given)
-
-
-ports.save_cloud = _save_cloud
+# Imported when the first cloud is saved.
+ports.save_cloud = lambda *given: import_module(".export.formats", __name__).save(*given)
 
 
 def __getattr__(name: str) -> Any:

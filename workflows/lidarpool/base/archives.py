@@ -14,13 +14,7 @@ from .errors import LidarpoolError
 
 @contextmanager
 def open_archive(path: Path) -> Iterator[Any]:
-    """Open an archive of arrays for the body; nothing in it is run.
-
-    Raises
-    ------
-    LidarpoolError
-        If the file cannot be read, or the body cannot make anything of it.
-    """
+    """Open an archive for the body, whose errors become LidarpoolError; nothing in it is run."""
     try:
         # NumPy leaves a file open that it opened itself and cannot read.
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from dask.system import CPU_COUNT
 from dask.utils import format_bytes
 from distributed import Client
 from distributed.system import MEMORY_LIMIT
@@ -32,7 +33,7 @@ from ..run.checks import find_workers, gpu_note, slots_needed
 from ..run.cluster_file import ClusterFile
 from ..run.identity import identity_of
 from ..run.job import Job
-from ..run.local import default_workers, usable_cores
+from ..run.local import default_workers
 from ..run.store import RUN_FOLDER
 from ..scenario.sections import PoolSection
 from ..scene.scene import Scene
@@ -248,7 +249,7 @@ def _slots(
         everybody = Pool.from_client(client)
         there = {n: int(sum(w.resources.get(n, 0) for w in everybody)) for n in needed}
     else:
-        workers = default_workers(usable_cores(), len(visible_gpus()))
+        workers = default_workers(CPU_COUNT, len(visible_gpus()))
         there = {GPU: pool.gpu or workers[GPU], OTHER: pool.other or workers[OTHER]}
         there[LIDAR] = needed[LIDAR]  # one worker with as many threads
     return {name: {"needed": needed[name], "there": there.get(name, 0)} for name in needed}

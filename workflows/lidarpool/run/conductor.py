@@ -66,7 +66,8 @@ def conducted(
 ) -> Iterator[tuple[RunResult, LidarWorkers | None]]:
     """Do what is left of a run; the body gets its result.
 
-    An error or interrupt, also of the body, is noted with how to resume.
+    An error or interrupt, also of the body, is noted with how to resume. LidarpoolError if the
+    cluster lacks something or a task fails.
 
     Parameters
     ----------
@@ -83,11 +84,6 @@ def conducted(
     keep
         Whether the cluster lasts as long as the body, which also gets workers of LIDAR that write
         formats of many files; None if nothing was left to do.
-
-    Raises
-    ------
-    LidarpoolError
-        If the cluster lacks something or a task fails.
     """
     workers = None
     with store.kept_on_error(), page as live, ExitStack() as stack:

@@ -54,21 +54,9 @@ def local_client(
 ) -> AbstractContextManager[Client]:
     """Client of a cluster on this machine that lasts as long as the body.
 
-    Parameters
-    ----------
-    gpu_workers, other_workers
-        Workers of these partitions; None for what suits the machine.
-    planning
-        Whether something is planned; else there is no worker of OTHER by default.
-    collectors
-        Tasks of stage 4: with stages 1 and 3 they determine the slots of LIDAR.
-    tls
-        Encrypt what its processes say to each other, with a certificate of its own.
-
-    Raises
-    ------
-    PoolError
-        If the workers do not start, or no certificate can be made.
+    Workers as of `local_cluster`, but by default none of OTHER without `planning`. LIDAR has slots
+    for stages 1 and 3 and the `collectors`. `tls` encrypts the traffic, with a certificate of its
+    own; PoolError if none can be made, or the workers do not start.
     """
 
     @contextmanager

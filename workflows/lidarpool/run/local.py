@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from typing import Any
 
+from dask.system import CPU_COUNT
 from distributed import SpecCluster
 
 import poolpart
@@ -12,13 +12,6 @@ from poolpart.local import check_count
 from poolpart.probe import visible_gpus
 
 from ..pipeline import GPU, LIDAR, OTHER
-
-
-def usable_cores() -> int:
-    """Processor cores that this process may run on."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def default_workers(cores: int, gpus: int) -> dict[str, int]:
@@ -63,7 +56,7 @@ def local_cluster(
     PoolError
         If a number is too small, or for the reasons of `poolpart.local_cluster`.
     """
-    defaults = default_workers(usable_cores(), len(visible_gpus()))
+    defaults = default_workers(CPU_COUNT, len(visible_gpus()))
     gpu_workers = defaults[GPU] if gpu_workers is None else gpu_workers
     other_workers = defaults[OTHER] if other_workers is None else other_workers
     check_count("gpu_workers", gpu_workers)

@@ -284,7 +284,7 @@ class PoseSection(Section):
     roll_deg: Annotated[Angle, Field(description="rotation about the new x, last")] = 0.0
 
     def pose(self) -> Pose:
-        """Return the pose, world coordinates."""
+        """Return it as a pose."""
         return Pose(self.position, self.yaw_deg, self.pitch_deg, self.roll_deg)
 
 
