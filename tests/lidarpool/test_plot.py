@@ -152,7 +152,7 @@ def test_some_of_the_points_are_of_every_channel(tmp_path):
     layers, rays = 40, 500  # a ray's points follow those of the ray beside it, channel by channel
     ring = np.tile(np.arange(layers), rays).astype(np.int32)
     cloud_at(np.stack([ring] * 3, axis=1).astype(float)).save(path)
-    chosen, _ = CloudFile(path).choose(len(ring) // 20)  # every 20th would be of two rings
+    chosen = CloudFile(path).choose(len(ring) // 20)  # every 20th would be of two rings
     assert len(np.unique(chosen.positions[:, 2])) == layers
 
 

@@ -6,22 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def one_of_each_part(
-    count: int, most: int, rng: np.random.Generator | None = None
-) -> NDArray[np.int64]:
+def one_of_each_part(count: int, most: int) -> NDArray[np.int64]:
     """Choose at most `most` numbers below `count`, in order, one from each of equal parts.
 
-    The choice within each part is random: in points ordered by scan and ray, every n-th could
-    always be of the same few rings or directions.
-
-    Parameters
-    ----------
-    count, most
-        Size of the population, and of the sample; all numbers if they are no more.
-    rng
-        Random generator; without it the choice is always the same.
+    All are chosen if they are no more; else the choice within each part is random, and the same
+    each time: of points ordered by scan and ray, every n-th could be of few rings or directions.
     """
-    rng = np.random.default_rng(0) if rng is None else rng
     parts = min(count, most)
     edges = np.arange(parts + 1, dtype=np.int64) * count // max(parts, 1)
-    return rng.integers(edges[:-1], edges[1:])
+    return np.random.default_rng(0).integers(edges[:-1], edges[1:])

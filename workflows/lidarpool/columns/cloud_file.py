@@ -61,18 +61,9 @@ class CloudFile:
             columns = {column.name: rows[column.in_files] for column in self.table}
             yield Cloud(positions, columns, self.table)
 
-    def choose(self, most: int, scans: tuple[int, int] | None = None) -> tuple[Cloud, int]:
-        """Select at most so many evenly spaced points, from the first to the last scan.
-
-        Returns
-        -------
-        cloud
-            The points in order. Those without finite coordinates are left out.
-        count
-            Number of points in these scans.
-        """
-        low, high = (0, len(self)) if scans is None else self.rows_of(scans)
-        return self._cloud(self._rows[low + one_of_each_part(high - low, most)]), high - low
+    def choose(self, most: int) -> Cloud:
+        """Select at most so many evenly spaced points, and of these the finite ones, in order."""
+        return self._cloud(self._rows[one_of_each_part(len(self), most)])
 
     def row_of(self, scan: int) -> int:
         """Row of the first point of a scan, if the points are in the order of scans."""

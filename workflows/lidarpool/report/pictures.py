@@ -121,14 +121,14 @@ def picture_makers(
         )
 
     @cache
-    def points() -> tuple[Cloud, int]:
+    def points() -> Cloud:
         return CloudFile(cloud, shown.own).choose(MOST_POINTS)
 
     def draw_hits() -> Page:
         _, parents, shares, _ = part()
         hits = int(shown.hit_counts.sum())
         counts = shown.hit_counts[parents] * shares
-        places = points()[0].positions - shown.scene.origin
+        places = points().positions - shown.scene.origin
         return draw_intensity(shot(), counts, places, shown.sample_rays, hits)
 
     def draw_points() -> Page:
@@ -141,7 +141,7 @@ def picture_makers(
                 + (did_you_mean(colour, columns) or f" There are {', '.join(there)}.")
             )
         column = columns[colour]
-        return draw_cloud(shot(), *points(), column, shown.names_of(column))
+        return draw_cloud(shot(), points(), len(file), column, shown.names_of(column))
 
     makers: dict[str, Callable[[], Page]] = {
         "scene": lambda: draw_scene(shot(), shown.scene.triangles),
