@@ -163,7 +163,8 @@ class RunStore:
         self.storage = _storage(self.place, self.db.meta["parts"], durable=self.lasting)
         if self.storage.is_link:
             raise LidarpoolError(_behind_link(self.storage))
-        sizes = self._sizes()  # also an error if the place cannot be opened
+        with explained(f"{self.storage.url} cannot be looked at"):
+            sizes = self.storage.sizes()  # also an error if the place cannot be opened
         if self.kept:
             self._go_on(here, resume, sizes)
         if self._remote:
@@ -229,10 +230,6 @@ class RunStore:
                 f"{error.strerror or error}."
             ) from error
         return (found.first, found.stop, len(found)) == (part.first, part.stop, part.rows)
-
-    def _sizes(self) -> dict[str, int]:
-        with explained(f"{self.storage.url} cannot be looked at"):
-            return self.storage.sizes()
 
     # -- reading ---------------------------------------------------------------------------
 
