@@ -5,6 +5,7 @@ import subprocess
 import sys
 import time
 import urllib.request
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -20,9 +21,9 @@ from lidarpool.columns.table import CHANNEL, OBJECT, SCAN
 from lidarpool.live.live_points import LivePoints
 from lidarpool.live.result_page import open_result
 from lidarpool.live.run_page import LiveRun, live_run
+from lidarpool.run.conductor import conducted
 from lidarpool.run.job import Job
 from lidarpool.run.progress import Progress
-from lidarpool.run.run import Run
 from lidarpool.run.store import RunStore
 from lidarpool.scene.mesh import Mesh
 
@@ -110,22 +111,28 @@ def test_a_run_is_watched_from_its_first_part_to_its_path():
     planning = Planning((25, 25), (-30, -20), [(0, 0)], 2.0, trials=2, iterations=20)
     survey = Survey(poses=[(0, 0, 1), (0, 0, 3)], columns=["intensity", WETNESS])
     job = Job(SCENE, survey, planning, "numpy")
-    shown, busy = [], set()
+    shown, busy, scans, words = [], set(), [], []
     with (
         thread_cluster({"GPU": 1}, {"LIDAR": 4}, {"OTHER": 1}) as cluster,
         Client(cluster, set_as_default=False) as client,
         live_run(job, port=0, browser=False) as live,
     ):
-        store = RunStore(job)
-        live.follow(store)
-        run = Run(client, store)
 
         def show(progress):
             shown.append(progress)
             busy.update(re.findall(r"(\w+), slots busy", news(live)[1]))
 
-        result = run.drive(live.on_frame, live.with_progress(show, run.partitions))
-        live.finish(result)
+        with conducted(
+            RunStore(job),
+            lambda waiting: nullcontext(client),
+            own=False,
+            progress=nullcontext(show),
+            page=nullcontext(live),
+            tell=words.append,
+            on_frame=lambda frame: scans.append(frame.scan),
+        ) as (result, workers):
+            live.finish(result)
+        assert (scans, workers) == ([*range(survey.scan_count)], None)
         told, text = news(live)
         assert (told["over"], told["points"]) == (True, len(result.points))
         assert "done" in text
