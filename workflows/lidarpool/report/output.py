@@ -13,6 +13,7 @@ from ..base.errors import LidarpoolError, explained
 from ..base.interrupts import deferred_interrupts
 from ..base.storage import Storage, flush
 from ..base.vocabulary import PICTURES
+from ..columns.parts import StoredCloud
 from ..export.folder import LAST_FILE, staging
 from ..export.formats import Format, remove
 from ..export.sweeps import SWEEPS_FILE, Sweeps
@@ -113,10 +114,7 @@ def write_result(
     LidarpoolError
         If a file cannot be written.
     """
-    storage = place if isinstance(place, Storage) else None
-    _, earlier = _earlier(storage or Storage.at(folder))
-    # Workers write these into the storage.
-    direct = [one for one in formats if one.in_pieces] if storage and workers else []
+    target = _InStorage(place) if isinstance(place, Storage) else _InFolder(folder)
     points, sweeps = result.points, Sweeps.of(result.survey, result.scene)
     cloud = CountedCloud(points, len(result.scene.all_names))
     advice = "make room or give another folder with --out"
@@ -125,18 +123,13 @@ def write_result(
         staging(folder, place) as staged,
         nullcontext() if only_cloud else _Pictures(result, staged) as pictures,
     ):
-        exports = [one.file for one in formats]
         drawn, page = (pictures.files, [PAGE]) if pictures else ([], [])
+        exports = [one.file for one in formats]
         files = [CLOUD, *exports, *drawn, SWEEPS_FILE, *page, REPORT]
         sweeps.save(staged / SWEEPS_FILE)
         Format("ply").write(staged / CLOUD, cloud, sweeps)
-        for one in formats:
-            if one not in direct:
-                one.write(staged / one.file, points, sweeps, workers=workers)
-        if storage and direct:
-            _remove_earlier(storage, earlier, files)
-            for one in direct:
-                one.put(storage, points, sweeps, workers)
+        for one in sorted(formats, key=lambda one: one.in_pieces):
+            target.export(one, staged, points, sweeps, workers, files)
         if workers:
             result = workers.recorded(result)
         report = make_report(result, files, cloud)
@@ -145,12 +138,7 @@ def write_result(
             pictures.write_page(report, result, cloud, scenario)
         text = json.dumps(report, indent=1, allow_nan=False) + "\n"
         (staged / REPORT).write_text(text, encoding="utf-8")
-        if storage is None:
-            _publish(staged, folder, earlier, files, then)
-        else:
-            if not direct:
-                _remove_earlier(storage, earlier, files)
-            _put(staged, storage, then)
+        target.publish(staged, files, then)
     return report
 
 
@@ -199,52 +187,89 @@ class _Pictures:
         write_page(self._staged / PAGE, report, result, cloud, images, scenario)
 
 
-def _put(staged: Path, storage: Storage, then: Callable[[], object]) -> None:
-    """Put the files of a result into a storage, the report last."""
-    for name in (*_EXPORTS, *FILES):
-        if (staged / name).exists():
-            storage.put(staged / name, name)
-    with deferred_interrupts():
-        then()
+class _InFolder:
+    """A folder as the place of a result."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        _, self._earlier = _earlier(Storage.at(folder))
+
+    def export(
+        self,
+        one: Format,
+        staged: Path,
+        points: StoredCloud,
+        sweeps: Sweeps,
+        workers: LidarWorkers | None,
+        files: Collection[str],
+    ) -> None:
+        """Write a format of the cloud into the temporary folder `staged`."""
+        one.write(staged / one.file, points, sweeps, workers=workers)
+
+    def publish(self, staged: Path, files: Collection[str], then: Callable[[], object]) -> None:
+        """Move a whole result into place.
+
+        A folder with a report is a result: the earlier report is removed first, and the new one is
+        moved last. If the process is killed in between, --resume continues from the run's folder.
+        """
+        for name in files:
+            flush(staged / name)
+        with deferred_interrupts():
+            for name in (REPORT, PAGE):
+                (self._folder / name).unlink(missing_ok=True)
+            flush(self._folder)
+            for name in (*_EXPORTS, *FILES):
+                # A path of an earlier run would look like this one's; folders are not replaced.
+                if _goes(name, self._earlier, files):
+                    remove(self._folder / name)
+                if name in files:
+                    (staged / name).replace(self._folder / name)
+            flush(self._folder)
+            then()
 
 
-def _publish(
-    staged: Path,
-    folder: Path,
-    earlier: Collection[str],
-    files: Collection[str],
-    then: Callable[[], object],
-) -> None:
-    """Move a whole result into place.
+class _InStorage:
+    """A storage as the place of a result."""
 
-    A folder with a report is a result: the earlier report is removed first, and the new one is
-    moved last. If the process is killed in between, --resume continues from the run's folder.
-    """
-    for name in files:
-        flush(staged / name)
-    with deferred_interrupts():
-        for name in (REPORT, PAGE):
-            (folder / name).unlink(missing_ok=True)
-        flush(folder)
+    def __init__(self, storage: Storage) -> None:
+        self._storage, self._cleared = storage, False
+        _, self._earlier = _earlier(storage)
+
+    def export(
+        self,
+        one: Format,
+        staged: Path,
+        points: StoredCloud,
+        sweeps: Sweeps,
+        workers: LidarWorkers | None,
+        files: Collection[str],
+    ) -> None:
+        """Write a format of the cloud: directly if workers do it, else into a temporary folder."""
+        if workers is None or not one.in_pieces:
+            one.write(staged / one.file, points, sweeps)
+            return
+        self._clear(files)
+        one.put(self._storage, points, sweeps, workers)
+
+    def publish(self, staged: Path, files: Collection[str], then: Callable[[], object]) -> None:
+        """Put the files of a result into the storage, the report last."""
+        self._clear(files)
         for name in (*_EXPORTS, *FILES):
-            # A path of an earlier run would look like this one's; and folders are not replaced.
-            if _goes(name, earlier, files):
-                remove(folder / name)
-            if name in files:
-                (staged / name).replace(folder / name)
-        flush(folder)
-        then()
+            if (staged / name).exists():
+                self._storage.put(staged / name, name)
+        with deferred_interrupts():
+            then()
 
-
-def _remove_earlier(storage: Storage, earlier: Collection[str], files: Collection[str]) -> None:
-    """Remove what an earlier result has in a storage and this one would not replace."""
-    for name in (REPORT, PAGE, *_EXPORTS, *FILES):
-        if name in (REPORT, PAGE) or _goes(name, earlier, files):
-            storage.discard(name)
+    def _clear(self, files: Collection[str]) -> None:
+        """Remove once what an earlier result has there and this one would not replace."""
+        for name in () if self._cleared else (REPORT, PAGE, *_EXPORTS, *FILES):
+            if name in (REPORT, PAGE) or _goes(name, self._earlier, files):
+                self._storage.discard(name)
+        self._cleared = True
 
 
 def _goes(name: str, earlier: Collection[str], files: Collection[str]) -> bool:
-    """Whether a file of a folder is removed before a result of these files is moved there.
+    """Whether a file is removed before a result of these files is put into its place.
 
     Folders and files of formats only if they are replaced, or the earlier result lists them. If a
     killed run has removed the earlier report, they stay.
