@@ -12,17 +12,13 @@ import json
 import statistics
 import threading
 import time
+import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-import msgspec
-import viser
 from distributed import Client
-from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import connect
-from websockets.typing import Subprotocol
 
 from lidarpool import Planning, Scene, Sensor, Survey
 from lidarpool.live.run_page import live_run
@@ -31,19 +27,8 @@ from lidarpool.run.local import local_cluster
 from lidarpool.run.run import Run
 from lidarpool.run.store import RunStore
 
-# The first word of a browser to viser: where its camera is.
-CAMERA = {
-    "type": "ViewerCameraMessage",
-    "wxyz": [1.0, 0.0, 0.0, 0.0],
-    "position": [40.0, -40.0, 30.0],
-    "fov": 0.8,
-    "near": 0.1,
-    "far": 1000.0,
-    "image_height": 800,
-    "image_width": 1280,
-    "look_at": [0.0, 0.0, 0.0],
-    "up_direction": [0.0, 0.0, 1.0],
-}
+NEWS_S = 0.5  # as the page asks
+SCENE, POINTS = "surface?colour=grey", "points?colour=z&most=200000"
 
 
 def job(poses: int) -> Job:
@@ -72,21 +57,35 @@ def watched(client: Client, work: Job) -> tuple[float, int]:
 
 @contextmanager
 def looking(url: str) -> Iterator[list[int]]:
-    """Take what a page sends, as a browser would; gives the sizes of the messages."""
+    """Ask as an open page does, and take what is sent; gives the sizes of the answers."""
     taken: list[int] = []
-    version = Subprotocol(f"viser-v{viser.__version__}")
-    address = url.replace("http", "ws", 1)
-    with connect(address, subprotocols=[version], max_size=None, compression=None) as socket:
-        socket.send(msgspec.msgpack.encode(CAMERA))  # or nobody looks yet
+    ended = threading.Event()
 
-        def take() -> None:
-            with suppress(ConnectionClosed):
-                taken.extend(len(message) for message in socket)
+    def ask(what: str) -> bytes:
+        with urllib.request.urlopen(f"{url}/{what}", timeout=60) as answer:
+            found: bytes = answer.read()
+        taken.append(len(found))
+        return found
 
-        thread = threading.Thread(target=take, daemon=True)
-        thread.start()
+    def look() -> None:
+        version = None
+        with suppress(OSError):  # the page has ended
+            for what in ("", "page.js", "picture.js", "three.min.js", "state", SCENE):
+                ask(what)
+            while not ended.wait(NEWS_S):
+                told = ask("news")
+                header = json.loads(told[4 : 4 + int.from_bytes(told[:4], "little")])
+                if header["version"] != version:
+                    version = header["version"]
+                    ask(POINTS)
+
+    thread = threading.Thread(target=look, daemon=True)
+    thread.start()
+    try:
         yield taken
-    thread.join(10)
+    finally:
+        ended.set()
+        thread.join(60)
 
 
 def main(arguments: list[str] | None = None) -> dict[str, Any]:

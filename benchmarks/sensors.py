@@ -30,10 +30,10 @@ from typing import Any
 import numpy as np
 
 from lidarpool import Beams, Noise, Returns, Scene, Sensor, Spin, Survey, Track, load_sensor
-from lidarpool.scan.returns import BatchReturns
-from lidarpool.scan.rig import Rig, RigPlan
 from lidarpool.scene.actors import Actor, box
 from lidarpool.scene.city import city
+from lidarpool.simulator.returns import BatchReturns
+from lidarpool.simulator.rig import Rig
 from raybeam import available_backends
 
 from .raycast import CLOCKS, environment
@@ -192,7 +192,7 @@ def measure(
     now = CLOCKS[clock]
     crowded = traffic(scene)
     rigs = {
-        case: Rig(RigPlan(crowded if case == "ten actors" else scene, survey, backend), threads=1)
+        case: Rig(crowded if case == "ten actors" else scene, survey, backend, threads=1)
         for case, survey in surveys(name, share).items()
     }
     seconds: dict[str, list[list[float]]] = {case: [] for case in rigs}  # of casting, of all

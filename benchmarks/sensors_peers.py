@@ -36,15 +36,16 @@ def mujoco_caster(job: Job) -> Callable[[], int]:
     origins = np.ascontiguousarray(job["origins"])
     beams = len(job["directions"]) // len(origins)
     rays = np.ascontiguousarray(job["directions"].reshape(len(origins), 3 * beams))
+    far = float(job.get("far", 1e10))
     geom, distance = np.empty((len(origins), beams), np.int32), np.empty((len(origins), beams))
 
     def cast() -> int:
         for k in range(len(origins)):
             mujoco.mj_multiRay(
                 model, data, origins[k], rays[k], None, True, -1, geom[k], distance[k], None,
-                beams, 1e10,
+                beams, far,
             )  # fmt: skip
-        return int((distance >= 0).sum())
+        return int(((distance >= 0) & (distance <= far)).sum())
 
     return cast
 

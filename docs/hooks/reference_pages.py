@@ -41,6 +41,7 @@ _SECTIONS = {
 # What a reader of a package looks for first; the rest follows by the alphabet.
 _FIRST = {
     "lidarpool": (
+        "Scanner",
         *("simulate", "remove_run", "Scene", "Sensor", "Beams", "Spin", "Pose", "Survey"),
         *("Planning", "Result", "Frame", "Cloud", "Column", "read_cloud"),
     ),

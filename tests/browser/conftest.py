@@ -111,6 +111,30 @@ class Tab:
         )
         assert found, f"there is no button {label!r}"
 
+    def choose(self, title: str, value: str) -> None:
+        """Choose an entry of the first menu with this title."""
+        found = self.value(
+            "(() => { const r = [...document.querySelectorAll('.row')]"
+            f".find(r => r.firstChild.textContent === {json.dumps(title)});"
+            " const s = r?.querySelector('select');"
+            f" if (s) {{ s.value = {json.dumps(value)}; s.onchange(); }} return !!s; }})()"
+        )
+        assert found, f"there is no menu {title!r}"
+
+    def tick(self, title: str, on: bool) -> None:
+        """Set the first box whose title begins so."""
+        found = self.value(
+            "(() => { const b = [...document.querySelectorAll('label.tick')]"
+            f".find(l => l.textContent.startsWith({json.dumps(title)}))?.querySelector('input');"
+            f" if (b && b.checked !== {json.dumps(on)}) b.click(); return !!b; }})()"
+        )
+        assert found, f"there is no box {title!r}"
+
+    def key(self, name: str) -> None:
+        """Press a key."""
+        for kind in ("keyDown", "keyUp"):
+            self.call("Input.dispatchKeyEvent", type=kind, key=name)
+
     def press(self, x: float, y: float, *, shift: bool = False) -> None:
         """Click at a place of the window, pixels."""
         for kind in ("mousePressed", "mouseReleased"):

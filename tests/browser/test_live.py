@@ -10,11 +10,11 @@ import pytest
 
 from lidarpool import Scene, Survey
 from lidarpool.live.run_page import live_run
+from lidarpool.pipeline import SurveyDriver
 from lidarpool.run.connection import local_client
 from lidarpool.run.job import Job
 from lidarpool.run.run import Run
 from lidarpool.run.store import RunStore
-from lidarpool.scan import SurveyDriver
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -129,4 +129,4 @@ def test_stop_ends_the_run_as_an_interrupt_does(client, live, new_tab):
 
 def colours(picture):
     """Colours left of the panel."""
-    return np.unique(picture[200:, :900].reshape(-1, 3), axis=0)
+    return np.unique(picture[100:, :900].reshape(-1, 3), axis=0)

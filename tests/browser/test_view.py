@@ -1,4 +1,4 @@
-"""A finished result, looked at in a browser."""
+"""A finished result, looked at, played and measured in a browser."""
 
 import re
 from dataclasses import replace
@@ -6,132 +6,173 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lidarpool import Column, Scene, Track
+from lidarpool import Column, Scene, Sensor, Survey, Track
 from lidarpool.columns.table import SCAN
 from lidarpool.export.cloud_file import CloudFile
 from lidarpool.export.ply_format import header, row_type
-from lidarpool.live.looking import Eye, Filter
-from lidarpool.live.page import live_page, place_eye, redrawn
-from lidarpool.live.result_page import ResultView
-from lidarpool.run.picture_file import Pictured, SensorWay
+from lidarpool.export.sweeps import Sweeps
+from lidarpool.live.result_page import result_view
+from lidarpool.live.server import page_server
+from lidarpool.run.picture_file import Pictured, sensor_ways
 from lidarpool.scene.actors import Actor, box
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
+COUNT, SCANS = 30_000, 360
+PICTURE = "lidarpool.picture"
+WET = Column("wetness", "float32", "%", "how wet it is", source="wetness")
+
 
 @pytest.fixture
 def cloud(tmp_path):
-    """Return a file with a spiral of 30,000 points in 300 scans."""
-    turn = np.linspace(0, 20 * np.pi, 30_000)
-    wet = Column("wetness", "float32", "%", "how wet it is", source="wetness")
-    row = row_type(np.dtype(np.float32), (SCAN, wet))
-    rows = np.zeros(30_000, row)
-    rows["wetness"] = np.linspace(0, 100, 30_000)
+    """Return a file with a spiral of 30,000 points in 360 scans."""
+    turn = np.linspace(0, 20 * np.pi, COUNT)
+    rows = np.zeros(COUNT, row_type(np.dtype(np.float32), (SCAN, WET)))
+    rows["wetness"] = np.linspace(0, 100, COUNT)
     rows["x"], rows["y"], rows["z"] = 9 * np.cos(turn), 9 * np.sin(turn), turn / 8
-    rows["scan"] = np.arange(30_000) // 100
+    rows["scan"] = np.arange(COUNT) * SCANS // COUNT
     path = tmp_path / "cloud.ply"
-    path.write_bytes(header(row, 30_000) + rows.tobytes())
+    path.write_bytes(header(rows.dtype, COUNT) + rows.tobytes())
     return path
 
 
 @pytest.fixture
 def served(cloud):
-    """Return a page that shows it, at most 20,000 points at a time, and the view."""
-    with live_page("a cloud", port=0) as page:
-        view = ResultView(page, CloudFile(cloud), most=20_000)
-        with redrawn(view.draw, 0.1):
-            yield page, view
+    """Return the page of a spiral that a sensor scans in ten turns, while a box drives along x."""
+    track = Track([0, 1], [[-9, 0, 8], [9, 0, 8]])
+    scene = Scene.from_meshes([box("Floor", (20, 20, 0.1))])  # few triangles: browsers are slow
+    scene = replace(scene, actors=(Actor(box("Van", (4, 2, 2)), track),))
+    poses = Track([0, 2], [[0, -9, 4], [0, 9, 4.0]])
+    survey = Survey(Sensor.grid(layers=4), steps=SCANS, trajectory=poses)
+    hits, rays = np.zeros(scene.triangles, np.int64), np.zeros((0, 2, 3), np.float32)
+    pictured = Pictured(scene, sensor_ways(survey), hits, rays, None, None, (), survey.duration_ns)
+    sweeps = Sweeps.of(survey, scene)
+    assert (len(sweeps), sweeps.scans[-1]) == (10, SCANS)
+    view = result_view(CloudFile(cloud, [WET]), pictured, sweeps, title="a spiral")
+    with page_server(view, port=0) as page:
+        yield page
+
+
+def opened(new_tab, page, link=""):
+    """Open a page and wait until all its points are there."""
+    tab = new_tab("about:blank")
+    tab.call(
+        "Emulation.setDeviceMetricsOverride", width=1280, height=720, deviceScaleFactor=1,
+        mobile=False,
+    )  # fmt: skip
+    tab.open(page.url + link)
+    tab.wait_for(lambda text: re.search(r"[\d,]+ points", text))
+    return tab
+
+
+def drawn(tab):
+    """Count the points that are drawn."""
+    return tab.value(f"{PICTURE}.drawn")
 
 
 def test_view_shows_the_cloud_and_asks_nobody_else(served, new_tab, tmp_path):
-    page, view = served
-    tab = new_tab(page.url)
-    tab.wait_for(lambda text: "30,000 of 30,000 points, 20,000 shown" in text and "z, m" in text)
+    tab = opened(new_tab, served)
+    tab.wait_for(lambda text: "30,000 points" in text and "z, m" in text)
+    assert tab.value("document.title") == "a spiral"
     tab.wait_for(lambda _: colourful(tab.picture(tmp_path / "a.png")) > 3000)
-    picture = tab.picture(tmp_path / "a.png")
-    assert len(np.unique(picture[:, :900].reshape(-1, 3), axis=0)) > 200
-    own = (page.url, "data:", "blob:")
+    own = (served.url, "data:", "blob:")
     assert [request for request in tab.requests if not request.startswith(own)] == []
-    view._view.cloud.set_filter(Filter((("scan", 100, 149),)))
-    tab.wait_for(lambda text: re.search(r"5,000 of 30,000 points, all\s+shown", text))
-    view._view.cloud.colour.value = "wetness"
-    tab.wait_for(lambda text: "wetness" in text and "z, m" not in text)
-    tab.wait_for(lambda _: colourful(tab.picture(tmp_path / "b.png")) > 500)
+    tab.choose("colour", "wetness")
+    tab.wait_for(lambda text: "wetness, %" in text and "z, m" not in text)
+    tab.choose("colour", "not shown")
+    tab.wait_for(lambda _: drawn(tab) == 0)
     assert tab.errors == []
 
 
-def test_time_is_chosen_and_played(cloud, new_tab, tmp_path):
-    """A red sensor drives along y through the spiral, and a box along x."""
-    way = SensorWay(np.array([0, 2e9]), np.array([[0, -9, 4], [0, 9, 4.0]]), True, "nose", "VLP-16")
-    track = Track([0, 2], [[-9, 0, 8], [9, 0, 8]])
-    scene = Scene.from_meshes([box("Floor", (20, 20, 0.1))])  # few triangles: browsers are slow
-    scene = replace(scene, actors=(Actor(box("Van", (4, 2, 2)), track),))
-    hits, rays = np.zeros(scene.triangles, np.int64), np.zeros((0, 2, 3), np.float32)
-    pictured = Pictured(scene, [way], hits, rays, None, None, (), 2e9)
-    with live_page("a drive", port=0) as page:
-        view = ResultView(page, CloudFile(cloud), pictured)
-        with redrawn(view.draw, 0.1):
-            tab = new_tab(page.url)
-            tab.wait_for(lambda text: "nose: VLP-16" in text and "time, s" in text)
-            tab.click("Play")
-            tab.wait_for(lambda text: "Pause" in text)
-            van = page.scene.get_handle_by_name("/actors/0")
-            tab.wait_for(lambda _: -8 < van.position[0] < 9)
-            tab.click("Pause")
-            tab.wait_for(lambda text: "Play" in text)
-            tab.picture(tmp_path / "a.png")  # what was being drawn is drawn by now
-            at = van.position[0]
-            tab.picture(tmp_path / "b.png")
-            assert van.position[0] == at
-            assert tab.errors == []
+def test_play_shows_a_sweep_and_moves_on_and_the_arrows_step(served, new_tab):
+    tab = opened(new_tab, served)
+    tab.wait_for(lambda _: drawn(tab) == COUNT)
+    tab.key("ArrowRight")
+    tab.wait_for(lambda text: "sweep 2 of 10" in text and "3,000 points" in text)
+    tab.wait_for(lambda _: drawn(tab) == 3000)
+    assert tab.value("lidarpool.chosen.time") == pytest.approx(0.1, abs=1e-3)
+    van = f"{PICTURE}.actors[0].mesh.position.x"
+    assert tab.value(van) == pytest.approx(-9 + 1.8, abs=0.1)
+    for key, sweep in (("ArrowRight", 3), ("End", 10), ("Home", 1)):
+        tab.key(key)
+        tab.wait_for(lambda text, sweep=sweep: f"sweep {sweep} of 10" in text)
+    tab.key(" ")
+    seen = set()
+    while len(seen) < 8:  # of ten sweeps; a browser may be slow
+        seen.add(tab.wait_for(lambda text: re.search(r"sweep (\d+) of 10", text))[1])
+    tab.key(" ")
+    assert not tab.value("lidarpool.playing")
+    at = tab.value("lidarpool.chosen.time")
+    assert -9 < tab.value(van) < 9
+    tab.wait_for(lambda _: tab.value("lidarpool.chosen.time") == at)
+    image = "document.querySelector('#images canvas')"
+    tab.wait_for(lambda _: (tab.value(f"{image}?.height") or 1) > 1)
+    tab.tick("Sensor", False)
+    tab.wait_for(lambda _: drawn(tab) == 0)
+    assert tab.errors == []
 
 
-def test_points_are_clicked_at_measured_seen_from_near_and_linked_to(served, new_tab, tmp_path):
-    page, view = served
-    tab = new_tab(page.url)
-    tab.wait_for(lambda text: "20,000 shown" in text and "Click a point" in text)
-    tab.wait_for(lambda _: colourful(tab.picture(tmp_path / "a.png")) > 3000)
-    client = next(iter(page.get_clients().values()))
-    eye = Eye.of(client.camera)
-    wide, tall = client.camera.image_width, client.camera.image_height
-    (start, end), _ = eye.seen(view._even.positions[[10_000, 12_000]] - view._view.origin)
-    for shift, place, told in ((False, start, "wetness"), (True, end, "distance")):
-        x, y = (place + 1) / 2 * (wide, tall)
-        tab.press(x, y, shift=shift)
-        tab.wait_for(lambda text, told=told: re.search(rf"\b{told} \d", text))
-    # To the middle of the spiral, which has half of its points behind the camera then.
-    place_eye(client, client.camera.look_at, client.camera.look_at + np.array([0.0, 1.0, 0.0]))
-    tab.wait_for(lambda text: "more of them from near" in text)
-    view._view.cloud.set_filter(Filter((("scan", 100, 149),)))
-    tab.wait_for(lambda text: "5,000 of 30,000 points" in text)
-    link = page.link(client, view._view.choices)
-    view._view.cloud.set_filter(Filter())
-    tab.wait_for(lambda text: "20,000 shown" in text)
-    other = new_tab(link)
-    other.wait_for(lambda text: "5,000 of 30,000 points" in text)
-    newest = page.get_clients()[max(page.get_clients())].camera
-    other.wait_for(lambda _: np.allclose(newest.position, client.camera.position, atol=1e-3))
+def test_points_are_clicked_at_measured_filtered_and_linked_to(served, new_tab, tmp_path):
+    tab = opened(new_tab, served)
+    tab.wait_for(lambda _: drawn(tab) == COUNT)
+    place = (
+        f"(k => {{ const p = {PICTURE}.layers.base.told.arrays.positions.subarray(3*k, 3*k+3);"
+        f" const m = {PICTURE}.matrix.elements, c = {PICTURE}.canvas;"
+        " const [x, y, w] = [0, 1, 3].map(r => m[r]*p[0] + m[r+4]*p[1] + m[r+8]*p[2] + m[r+12]);"
+        " return [(x / w + 1) / 2 * c.clientWidth, (1 - y / w) / 2 * c.clientHeight]; })"
+    )
+    for row, shift, words in ((10_000, False, "wetness"), (12_000, True, "distance")):
+        tab.press(*tab.value(f"{place}({row})"), shift=shift)
+        tab.wait_for(lambda text, words=words: re.search(rf"\b{words}\s\d", text))
+    tab.open(served.url + "/#filter=scan,100,149&colour=wetness&camera=20,-20,9;0,0,4")
+    tab.wait_for(lambda text: re.search("4,16. points of 30,000", text) and "wetness, %" in text)
+    tab.key("t")  # from the top, without perspective
+    tab.wait_for(lambda _: tab.value(f"{PICTURE}.isParallel"))
+    tab.key("c")
+    link = tab.wait_for(lambda _: tab.value("location.hash") if "link" in tab.text else None)
+    other = opened(new_tab, served, "/" + tab.value("(history.state, location.hash)"))
+    other.wait_for(lambda text: re.search("4,16. points of 30,000", text))
+    assert "parallel" in link and other.value(f"{PICTURE}.isParallel")
+    both = [one.value(f"{PICTURE}.camera.position.toArray()") for one in (tab, other)]
+    assert both[0] == pytest.approx(both[1], abs=1e-2)
     assert tab.errors == other.errors == []
 
 
-def test_each_browser_is_dark_where_its_system_is_until_its_user_wants_otherwise(served, new_tab):
-    page, _ = served
-    scheme = "document.documentElement.dataset.mantineColorScheme"
-    light, dark = new_tab("about:blank"), new_tab("about:blank")
-    for tab, name in ((light, "light"), (dark, "dark")):
+def test_what_is_cut_off_is_not_drawn(served, new_tab, tmp_path):
+    tab = opened(new_tab, served)
+    before = tab.wait_for(lambda _: max(0, colourful(tab.picture(tmp_path / "a.png")) - 3000))
+    tab.value(f"{PICTURE}.setClip([[null, null], [null, null], [null, -1]])")
+    tab.wait_for(lambda _: colourful(tab.picture(tmp_path / "b.png")) < before / 2)
+
+
+def test_each_browser_is_dark_where_its_system_is_until_its_user_wants_otherwise(
+    served, new_tab, tmp_path
+):
+    theme = "document.documentElement.dataset.theme"
+    for name, other in (("light", "dark"), ("dark", "light")):
+        tab = new_tab("about:blank")
         media = [{"name": "prefers-color-scheme", "value": name}]
         tab.call("Emulation.setEmulatedMedia", features=media)
-        tab.open(page.url)
-        tab.wait_for(lambda text: "20,000 shown" in text)
-    dark.wait_for(lambda _: dark.value(scheme) == "dark")
-    assert light.value(scheme) == "light"
-    for client in page.get_clients():
-        page._dark[client].value = not page._dark[client].value
-    dark.wait_for(lambda _: dark.value(scheme) == "light")
-    light.wait_for(lambda _: light.value(scheme) == "dark")
+        tab.open(served.url)
+        tab.wait_for(lambda text: "30,000 points" in text)
+        assert tab.value(theme) == name
+        tab.wait_for(lambda _, tab=tab: colourful(tab.picture(tmp_path / "a.png")) > 3000)
+        corner = tab.picture(tmp_path / "a.png")[5:40, 5:40].mean()
+        assert (corner > 200) == (name == "light")
+        tab.value("document.querySelector('button[title=\"Light or dark\"]').click()")
+        assert tab.value(theme) == other
+        tab.value("localStorage.clear()")
+
+
+def test_the_page_says_that_its_server_has_ended(served, new_tab):
+    tab = opened(new_tab, served)
+    tab.wait_for(lambda _: drawn(tab) == COUNT)
+    served.close()
+    tab.key("ArrowRight")
+    tab.wait_for(lambda text: "server of this page has ended" in text)
 
 
 def colourful(picture):
     """Count the pixels left of the panel that are of a colour."""
-    part = picture[200:, :900].astype(int)
+    part = picture[60:560, 80:900].astype(int)
     return int((part.max(axis=2) - part.min(axis=2) > 60).sum())

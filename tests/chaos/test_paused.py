@@ -19,7 +19,7 @@ from tests.chaos.survey import PLANNING, Reference, disturbed, room
 import poolpart.task_locations
 from lidarpool import simulate
 from lidarpool.base.tracing import trace_to
-from lidarpool.scan import SurveyDriver
+from lidarpool.pipeline import SurveyDriver
 
 JOIN_S = 300.0
 STOP_S = 2.0  # for others to take over
@@ -51,7 +51,7 @@ def lonely(arena):
         while not (found := [a for a, w in list(workers.items()) if str(w.name) == name]):
             assert time.monotonic() < deadline, f"{name} did not join"
             time.sleep(0.05)
-        arena.client.run(lambda: bool(import_module("lidarpool.scan.stages")), workers=found)
+        arena.client.run(lambda: bool(import_module("lidarpool.pipeline.stages")), workers=found)
         arena.withdraw(partition)
         return name
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lidarpool.columns.parts import PartColumns, pack
-from lidarpool.scan.messages import Receipt, samples_of_scan, summary_type
+from lidarpool.pipeline.messages import Receipt, samples_of_scan, summary_type
 
 
 def name_of(mark, first, stop, number=0):

@@ -10,6 +10,7 @@ import pytest
 
 import lidarpool
 from lidarpool import (
+    Actor,
     Beams,
     Cloud,
     Column,
@@ -22,6 +23,7 @@ from lidarpool import (
     Planning,
     Pose,
     Returns,
+    Scanner,
     Scene,
     Sensor,
     Spin,
@@ -40,6 +42,11 @@ GRID = Sensor.grid()
 
 # Of everything public that takes arguments, calls that cannot be meant, and what is answered.
 WRONG = {
+    Actor: [
+        ("Car", "a Mesh, such as Mesh("),
+        (Mesh("Car", POINTS, FACES), Pose((0, 0, 0)), "load_trajectory("),
+        (Mesh("Car", POINTS, FACES), "drive.tum", "trajectory is 'drive.tum'"),
+    ],
     Beams: [
         ("x", "array of numbers"),
         ([0.1], [0.0], "a", "Beams.time_ns is 'a'"),
@@ -91,6 +98,26 @@ WRONG = {
         (POINTS, FACES, OWNERS, ("a",), "o", "origin is 'o'"),
     ],
     Scene.from_meshes: [("a.glb", "[Mesh('"), ([POINTS], "an array; each"), (GRID, "a Sensor")],
+    Scanner: [
+        ("hall.glb", GRID, "Scene.load('hall.glb')"),
+        (Scene.seed(), "velodyne/vlp16", "load_sensor('velodyne/vlp16')"),
+        (Scene.seed(), Survey(poses=AT), "sensor is a Survey; it must be a Sensor"),
+    ],
+    Scanner(Scene.seed(), GRID).sweep: [
+        (None, "pose is None"),
+        ("a", "such as Pose(("),
+        ((0, 1), "three"),
+    ],
+    Scanner(Scene.seed(), GRID).ranges: [
+        (None, "a list of Pose"),
+        ([[1, 2]], "(1, 2)"),
+        ([AT], "(k, 4, 4)"),
+    ],
+    Scanner(Scene.seed(), GRID).move: [
+        (3, AT[0], "name is 3"),
+        ("Car", None, "pose is None"),
+        ("Car", AT[0], "no actor 'Car'"),
+    ],
     Scene.load: [(3, "path is 3"), (["a.glb"], "text or a path"), (None, "None; it must")],
     Sensor: [
         ("vlp16", "beams"),

@@ -7,7 +7,7 @@ import shutil
 
 import numpy as np
 import pytest
-from benchmarks import leaks, planning, raycast, sensors, trees
+from benchmarks import leaks, planning, raycast, scanner, sensors, trees
 
 from lidarpool.scene.city import city
 from lidarpool.scene.scene_file import write_scene
@@ -84,6 +84,22 @@ def test_other_simulators_get_the_same_rays(tmp_path):
     assert len(job["directions"]) == survey.ray_count == 128 * len(job["origins"])
     assert np.ptp(job["origins"], axis=0)[0] == pytest.approx(20 * 0.0019, rel=0.05)
     assert job["turned"] == pytest.approx(len(job["origins"]) / 1024)
+
+
+def test_a_scanner_finds_what_a_cast_and_open3d_find(tmp_path, capsys):
+    out = tmp_path / "out.json"
+    assert scanner.main(["--quick", "--backend", "embree", "--json", str(out)]) == 0
+    rows = json.loads(out.read_text())["cases"]
+    assert [row["case"] for row in rows] == [*scanner.CASES]
+    for row in rows:
+        clouds = {"sweep", "moving"} if row["poses"] == 1 else set()
+        assert row["hits"].keys() == {"cast", "ranges", "noise", "open3d"} | clouds
+        assert all(len(rounds) == 2 for rounds in row["seconds"].values())
+        assert 0.05 < row["hits"]["cast"] < 1
+        assert row["hits"]["ranges"] == pytest.approx(row["hits"]["cast"], abs=1e-9)
+        assert row["hits"]["open3d"] == pytest.approx(row["hits"]["cast"], abs=2e-3)
+    said = capsys.readouterr().out
+    assert "mujoco: not installed" in said and said.count("the bar of 1.3 x the cast is") == 3
 
 
 def test_planning(capsys):

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from lidarpool import Cloud, Column, LidarpoolError
 from lidarpool.columns.table import ALWAYS, OPTIONAL, TABLE, chosen, stored
-from lidarpool.scan.returns import BatchReturns
+from lidarpool.simulator.returns import BatchReturns
 
 # -- the table ------------------------------------------------------------------------------------
 

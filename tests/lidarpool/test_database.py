@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from tests.lidarpool.committing import name_of
 
 from lidarpool import LidarpoolError
+from lidarpool.pipeline.database import RunDatabase
+from lidarpool.pipeline.messages import Receipt
 from lidarpool.plan import Planning, run_trial
-from lidarpool.scan.database import RunDatabase
-from lidarpool.scan.messages import Receipt
 
 SCANS = 20
 
@@ -32,7 +32,9 @@ def receipt(first, stop, number=0, rows=7, cells=(0, 0, 0, 1, 1, 1)):
 @pytest.fixture(autouse=True)
 def mark(monkeypatch):
     """Give all runs the same mark."""
-    monkeypatch.setattr("lidarpool.scan.database.secrets.token_hex", lambda size: MARK[: 2 * size])
+    monkeypatch.setattr(
+        "lidarpool.pipeline.database.secrets.token_hex", lambda size: MARK[: 2 * size]
+    )
 
 
 @pytest.fixture
@@ -229,7 +231,8 @@ def test_a_file_that_cannot_be_made(tmp_path):
 def test_one_run_at_a_time(db, tmp_path):
     db.commit([receipt(0, 5)])
     code = (
-        "import sys; from pathlib import Path; from lidarpool.scan.database import RunDatabase\n"
+        "import sys; from pathlib import Path\n"
+        "from lidarpool.pipeline.database import RunDatabase\n"
         f"try: RunDatabase(Path(sys.argv[1]), {SCANS})\n"
         "except Exception as error: print(type(error).__name__, error)\n"
     )

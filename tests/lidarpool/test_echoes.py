@@ -23,13 +23,13 @@ from lidarpool import (
     Spin,
     Survey,
 )
-from lidarpool.base.counted import normal, raw, uniform
-from lidarpool.scan.echoes import Hits, chosen, separated
-from lidarpool.scan.rig import Rig, RigPlan
 from lidarpool.scene.mesh import Mesh
 from lidarpool.scene.shapes import seed_objects
+from lidarpool.sensor.counted import normal, raw, uniform
 from lidarpool.sensor.materials import extinction, fresnel
 from lidarpool.sensor.optics import spread
+from lidarpool.simulator.echoes import Hits, chosen, separated
+from lidarpool.simulator.rig import Rig
 from raybeam import available_backends
 
 COLUMNS = ("ray", "range", "intensity", "reflectivity", "return_number", "returns", "class")
@@ -50,7 +50,7 @@ def cast(meshes, sensor=None, backend="numpy", at=(0, 0, 0), **options):
     """Points of one scan of some meshes, by column."""
     options = {"keep_every": 1, "columns": COLUMNS, **options}
     survey = Survey(sensor or beam_along_x(), poses=[at], steps=1, **options)
-    rig = Rig(RigPlan(Scene.from_meshes(meshes), survey, backend))
+    rig = Rig(Scene.from_meshes(meshes), survey, backend)
     (batch,) = rig.cast(0, 1)
     return {c.name: c.make(batch) for c in survey.stored_columns} | {"batch": batch}
 
@@ -354,12 +354,12 @@ def test_batches_and_chunks_leave_no_trace(options, path, per_turn, monkeypatch)
     sensor = Sensor(BEAMS, Spin(per_turn, step_deg=30, rate_hz=10), 0.5, 40)
     survey = Survey(sensor, steps=14, keep_every=3, columns=COLUMNS, **options, **path)
     scene = Scene.from_meshes(seed_objects(rings=8, segments=12))
-    rig = Rig(RigPlan(scene, survey, "numpy"))
+    rig = Rig(scene, survey, "numpy")
     whole = cast_between(rig, survey, [0, 28])
     assert len(whole[0]["x"]) > 200
     assert cast_between(rig, survey, [0, 1, 5, 14, 17, 28]) == whole
-    monkeypatch.setattr("lidarpool.scan.echoes.CHUNK_RAYS", 100)
-    monkeypatch.setattr("lidarpool.scan.echoes.BLOCK_RAYS", 7)
+    monkeypatch.setattr("lidarpool.simulator.echoes.CHUNK_RAYS", 100)
+    monkeypatch.setattr("lidarpool.simulator.echoes.BLOCK_RAYS", 7)
     assert cast_between(rig, survey, list(range(29))) == whole
 
 

@@ -10,9 +10,9 @@ from click.testing import CliRunner
 
 from lidarpool import LidarpoolError
 from lidarpool.cli.import_command import import_
-from lidarpool.scan.rig import Rig, RigPlan
 from lidarpool.scenario.helios import import_survey
 from lidarpool.sensor.materials import MaterialTable
+from lidarpool.simulator.rig import Rig
 
 X, Y, Z = np.eye(3)
 SQUARE = "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nf 1 2 3\nf 1 3 4\n"
@@ -288,7 +288,7 @@ def test_the_cloud_of_a_flight_lies_on_the_ground_and_knows_its_legs(imported):
     made, scene, of = imported(device, inside, around=template)
     assert made.scenario.returns.subrays == 7 and made.scenario.noise.range_m == 0
     assert made.left_out == ["maxNOR=3 of S/1: all returns of a pulse are kept"]
-    (batch,) = Rig(RigPlan(scene, of, "numpy")).cast(0, 3)
+    (batch,) = Rig(scene, of, "numpy").cast(0, 3)
     columns = {column.name: column.make(batch) for column in of.stored_columns}
     assert np.ptp(columns["z"]) <= 1 and len(columns["z"]) == 300
     assert np.allclose(columns["range"], 18.5 / np.cos(np.radians(20)), atol=0.01)

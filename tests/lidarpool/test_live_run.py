@@ -4,14 +4,15 @@ import re
 import subprocess
 import sys
 import time
+import urllib.request
 
 import numpy as np
 import pytest
 import trimesh
-from benchmarks.live import looking
 from distributed import Client
 from tests.clusters import thread_cluster
 from tests.lidarpool.committing import commit
+from tests.pages import ask
 
 from lidarpool import Column, LidarpoolError, Planning, Scene, Sensor, Survey
 from lidarpool.columns.table import CHANNEL, OBJECT, SCAN
@@ -37,22 +38,24 @@ def make_job(scans: int) -> Job:
     return Job(SCENE, Survey(Sensor.grid(), poses, steps=scans // 2, precision_m=0.5))
 
 
-def panel(live: LiveRun) -> str:
-    return re.sub(r"<[^>]*>", " ", live._text.content)
+def news(live: LiveRun):
+    """What the page is told of the run's state, and its panel as text."""
+    told = ask(live.page.url, "news")
+    return told, re.sub(r"<[^>]*>", " ", told["panel"])
 
 
 def wait_for(condition):
-    """Wait for what is drawn by itself."""
+    """Wait for what is shown by itself, as a page that asks again and again."""
     stop = time.monotonic() + LONG_S
     while not condition():
-        assert time.monotonic() < stop, "it was not drawn"
+        assert time.monotonic() < stop, "it was not shown"
         time.sleep(0.02)
 
 
 def displayed(live: LiveRun) -> int:
     """Count the points on the page."""
-    node = live.page.scene.get_handle_by_name("/cloud")
-    return 0 if node is None else len(node.points)
+    news(live)  # or nobody looks
+    return len(ask(live.page.url, "points", colour="z", most=1_000_000)["arrays"]["rows"])
 
 
 def test_points_are_bounded_and_even_and_hits_exact_where_all_parts_are_read():
@@ -87,11 +90,13 @@ def test_a_resumed_run_shows_what_the_earlier_one_has_left(tmp_path):
         commit(first, scan, [10], [7], [50])
     first.db.close()
     store = RunStore(job, tmp_path / "run", resume=True)
-    with live_run(job, port=0, browser=False) as live, looking(live.page.url):
+    with live_run(job, port=0, browser=False) as live:
         live.follow(store)
         # Before there is a cluster, what is left of the first is there to see.
-        wait_for(lambda: "600 points" in panel(live) and "60 / 100" in panel(live))
-        assert "starting" in panel(live)
+        told, text = news(live)
+        assert told["points"] == 600
+        assert "60 / 100" in text
+        assert "starting" in text
         wait_for(lambda: displayed(live) == 600)
 
 
@@ -110,7 +115,6 @@ def test_a_run_is_watched_from_its_first_part_to_its_path():
         thread_cluster({"GPU": 1}, {"LIDAR": 4}, {"OTHER": 1}) as cluster,
         Client(cluster, set_as_default=False) as client,
         live_run(job, port=0, browser=False) as live,
-        looking(live.page.url),
     ):
         store = RunStore(job)
         live.follow(store)
@@ -118,22 +122,26 @@ def test_a_run_is_watched_from_its_first_part_to_its_path():
 
         def show(progress):
             shown.append(progress)
-            busy.update(live._busy)
+            busy.update(re.findall(r"(\w+), slots busy", news(live)[1]))
 
         result = run.drive(live.on_frame, live.with_progress(show, run.partitions))
         live.finish(result)
-        total = f"{len(result.points):,} points"
-        wait_for(lambda: "done" in panel(live) and total in panel(live) and "2 / 2" in panel(live))
-        wait_for(lambda: displayed(live) == len(result.points))
-        for name in ("/sensors/0", "/poses", "/rays", "/path", "/discs/0"):
-            wait_for(lambda name=name: live.page.scene.get_handle_by_name(name) is not None)
-        live._view._scene_colour.value = "hits"
-        wait_for(lambda: "hits per square metre" in live._view._scene_legend.content)
-        cloud = live._points.cloud
+        told, text = news(live)
+        assert (told["over"], told["points"]) == (True, len(result.points))
+        assert "done" in text
+        assert displayed(live) == len(result.points)
+        state = ask(live.page.url, "state")
+        assert state["path"]["corners"] == result.plan.path.tolist()
+        assert len(state["arrays"]["rays"]) > 0
+        hits = ask(live.page.url, "surface", colour="hits")
+        assert "hits per square metre" in hits["legend"]["title"]
+        wet, energy = (
+            ask(live.page.url, "points", colour=name, most=1_000_000)["arrays"]["colours"]
+            for name in ("wetness", "intensity")
+        )
     assert busy == {"GPU", "LIDAR", "OTHER"}
     assert shown[-1].collected == survey.scan_count
-    assert np.array_equal(cloud["wetness"], cloud["intensity"])
-    assert live._frames[-1].scan == survey.scan_count - 1
+    assert np.array_equal(wet, energy)
 
 
 def progress(seconds, done, **more):
@@ -150,41 +158,44 @@ def live():
         yield live
 
 
-def test_the_panel_tells_stages_pace_points_and_slots(live):
-    assert "starting" in live._panel()
+def test_the_panel_tells_stages_pace_and_what_is_waited_for(live):
+    assert "starting" in news(live)[1]
     live.on_progress(progress(0.0, 0))
-    live._busy = {"GPU": (1, 2)}
     live.on_progress(progress(5.0, 50))
-    text = re.sub(r"<[^>]*>", "|", live._panel())
-    for words in ("running|, 5 s, 10 scans/s, 5 s left", "50 / 100", "GPU, slots busy||1 / 2"):
+    text = re.sub(r" +", " ", news(live)[1])
+    for words in ("running , 5 s, 10 scans/s, 5 s left", "50 / 100"):
         assert words in text
     live.on_progress(progress(6.0, 60, waits_for="<GPU>"))
-    assert "waiting for slots of &lt;GPU&gt;" in live._panel()
+    assert "waiting for slots of &lt;GPU&gt;" in news(live)[1]
 
 
-def test_a_run_ends_as_by_an_interrupt(live):
+def test_a_run_is_stopped_as_by_an_interrupt(live):
     live.on_progress(progress(1.0, 1))
-    live.stopped.set()
+    order = {"X-Lidarpool": "1"}
+    request = urllib.request.Request(f"{live.page.url}/stop", data=b"", headers=order)
+    urllib.request.urlopen(request, timeout=LONG_S).close()
+    assert news(live)[0]["stopping"]
     with pytest.raises(KeyboardInterrupt):
         live.on_progress(progress(2.0, 2))
 
 
-def test_a_page_that_stays_shows_the_file_of_the_cloud(live, tmp_path):
+def test_a_page_that_stays_shows_the_file_of_the_cloud_and_its_sweeps(live, tmp_path):
     rows = np.zeros(3000, row_type(np.dtype(np.float32), (SCAN, CHANNEL, OBJECT)))
     rows["x"] = np.linspace(5, 6, 3000)
     path = tmp_path / "cloud.ply"
     path.write_bytes(header(rows.dtype, len(rows)) + rows.tobytes())
-    live.follow(RunStore(live._job))
+    live.follow(RunStore(make_job(100)))
     live.on_progress(progress(1.0, 1))
+    before = news(live)[0]["ends"]
     live.stopped.set()  # it stays no longer than that
-    with looking(live.page.url):
-        live.stay(path)
-        wait_for(lambda: displayed(live) == 3000)
-        wait_for(lambda: "3,000 of 3,000 points, all shown" in panel(live))
+    live.stay(path)
+    assert news(live)[0]["ends"] > before  # the page asks for all again
+    assert displayed(live) == 3000
+    assert "sweep_scans" in ask(live.page.url, "state")["arrays"]
 
 
 def test_neither_help_nor_a_run_brings_what_it_does_not_need():
-    """NumPy, Dask and Pydantic take a second, viser and Matplotlib another one."""
+    """NumPy, Dask and Pydantic take a second, and Matplotlib another one."""
 
     def loaded(modules: str) -> set[str]:
         code = f"import sys, {modules}; print(*sys.modules, sep='\\n')"
@@ -193,7 +204,7 @@ def test_neither_help_nor_a_run_brings_what_it_does_not_need():
             subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
         )
 
-    pages = {"viser", "matplotlib", "open3d", "lidarpool.live.run_page"}
+    pages = {"lidarpool.live.server", "matplotlib", "open3d", "lidarpool.live.run_page"}
     assert pages.isdisjoint(loaded("lidarpool.cli.run_command"))
     heavy = {"numpy", "dask", "pydantic", "poolpart", "rich"}
     assert heavy.isdisjoint(loaded("lidarpool.cli.commands"))

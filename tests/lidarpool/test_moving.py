@@ -21,12 +21,12 @@ from lidarpool import (
 )
 from lidarpool.run.identity import identity_of
 from lidarpool.run.job import Job
-from lidarpool.scan import world
-from lidarpool.scan.motion import into_axes
-from lidarpool.scan.rig import Rig, RigPlan
 from lidarpool.scene.actors import Actor, box
 from lidarpool.scene.mesh import Mesh
 from lidarpool.sensor.optics import Returns
+from lidarpool.simulator import world
+from lidarpool.simulator.motion import into_axes
+from lidarpool.simulator.rig import Rig
 
 WALL_M = 8.0
 PRECISION_M = 0.001
@@ -44,7 +44,7 @@ MOUNT = Pose((1.2, 0.1, 0.4), 20, 5, -3)
 
 def made(survey, scene, backend="numpy"):
     """Columns of all points that a survey gives: {name: (n,)}."""
-    batches = list(Rig(RigPlan(scene, survey, backend)).cast(0, survey.scan_count))
+    batches = list(Rig(scene, survey, backend).cast(0, survey.scan_count))
     return {
         column.name: np.concatenate([column.make(batch) for batch in batches])
         for column in survey.stored_columns
@@ -122,7 +122,7 @@ def test_an_actor_is_where_it_is_at_the_time_of_each_ray(street, name, backend):
     sensor = load_sensor("velodyne/vlp16")
     options = {"keep_every": 1, "columns": COLUMNS, "precision_m": 1e-3, **SURVEYS[name]}
     survey = Survey(sensor, **options)
-    rig = Rig(RigPlan(replace(street, actors=(CAR,)), survey, backend))
+    rig = Rig(replace(street, actors=(CAR,)), survey, backend)
     batches = list(rig.cast(0, survey.scan_count))
     seen = 0
     for batch in batches:
@@ -139,7 +139,7 @@ def test_an_actor_is_where_it_is_at_the_time_of_each_ray(street, name, backend):
         assert (batch.triangle[on] >= 4).all()
         seen += on.sum()
     assert seen > 500
-    plain = Rig(RigPlan(street, survey, backend)).cast(0, survey.scan_count)
+    plain = Rig(street, survey, backend).cast(0, survey.scan_count)
     for batch, without in zip(batches, plain, strict=True):
         both = {}
         for found in (batch, without):
@@ -211,7 +211,7 @@ def test_no_ray_meets_an_actor_that_is_not_asked_about_it(street, monkeypatch, n
 
 def test_however_scans_are_batched_actors_have_the_same_bits(street):
     survey = Survey(load_sensor("velodyne/vlp16"), trajectory=DRIVE, columns=COLUMNS)
-    rig = Rig(RigPlan(replace(street, actors=(CAR,)), survey, "numpy"))
+    rig = Rig(replace(street, actors=(CAR,)), survey, "numpy")
     count = survey.scan_count
     whole = cast_between(rig, survey, [0, count])
     assert cast_between(rig, survey, [0, 1, 7, 30, count - 3, count]) == whole

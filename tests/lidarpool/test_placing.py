@@ -9,7 +9,6 @@ import pytest
 import trimesh
 from trimesh import creation
 
-from lidarpool.scan.rig import Rig, RigPlan
 from lidarpool.scenario.placing import inside_note, place, poses_around
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.city import city
@@ -20,6 +19,7 @@ from lidarpool.scene.surroundings import Surroundings, is_open
 from lidarpool.scene.terrain import terrain
 from lidarpool.sensor import Mounted, Sensor, Survey
 from lidarpool.sensor.models import load_sensor
+from lidarpool.simulator.rig import Rig
 
 GRID = Mounted(Sensor.grid())
 
@@ -80,7 +80,7 @@ def test_an_object_is_seen_from_around_it_and_only_from_outside(name, far):
         replace(pose, position=tuple(at)) for pose, at in zip(placed.poses, poses, strict=True)
     ]
     survey = Survey(Sensor.grid(), local)
-    rig = Rig(RigPlan(scene, survey, "auto"))
+    rig = Rig(scene, survey, "auto")
     points = []
     for number in range(5):
         returns = list(rig.cast(36 * number, 36 * (number + 1)))

@@ -97,7 +97,7 @@ def test_foreign_objects_stay(unfinished):
 
 
 def test_one_of_another_format(unfinished, monkeypatch):
-    monkeypatch.setattr("lidarpool.scan.database.FORMAT", 99)
+    monkeypatch.setattr("lidarpool.pipeline.database.FORMAT", 99)
     with pytest.raises(LidarpoolError, match=rf"^{unfinished}/run.db is damaged \(it is of format"):
         RunStore(JOB, unfinished, resume=True)
 
@@ -136,7 +136,7 @@ def test_a_run_that_is_taken_over_ends_and_leaves_all_to_the_other(how, url):
     late.save(now=True)
     before = left(url)
     with (
-        pytest.raises(LidarpoolError, match=f"goes on with what is in {url}") as caught,
+        pytest.raises(LidarpoolError, match=f"taken over or deleted {url}") as caught,
         early.kept_on_error(),
     ):
         early.save(now=True)

@@ -15,6 +15,7 @@ from lxml import html
 
 from lidarpool import Cloud, Planning, Result, Scene, Survey
 from lidarpool.base.task_book import TaskBook
+from lidarpool.pipeline import COLLECT, GENERATE, INTERSECT, SORT
 from lidarpool.plan import best
 from lidarpool.plan.trial import run_trial
 from lidarpool.report.cloud_numbers import CountedCloud
@@ -22,7 +23,6 @@ from lidarpool.report.page.page import OBJECTS_MOST, write_page
 from lidarpool.report.page.timeline import ROWS_MOST
 from lidarpool.report.report import make_report
 from lidarpool.run.trials import TRIAL
-from lidarpool.scan import COLLECT, GENERATE, INTERSECT, SORT
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.mesh import Mesh
 from lidarpool.sensor import Sensor

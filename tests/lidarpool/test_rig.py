@@ -9,11 +9,11 @@ import pytest
 from tests.lidarpool.casting import Cart, cast_between
 
 from lidarpool import Beams, Column, Mounted, Pose, Scene, Sensor, Spin, Survey
-from lidarpool.scan.failures import naming_scans
-from lidarpool.scan.rig import Rig, RigPlan
+from lidarpool.pipeline.failures import naming_scans
 from lidarpool.scene.shapes import seed_objects
 from lidarpool.sensor.models import load_sensor
 from lidarpool.sensor.optics import Returns
+from lidarpool.simulator.rig import Rig
 from poolpart import WorkerLeft
 from raybeam import RayCaster
 
@@ -111,7 +111,7 @@ def rays_of_scan(survey, scan):
 def test_what_is_cast_is_what_each_ray_by_itself_meets(name, scene):
     survey = SURVEYS[name]
     caster = RayCaster(scene.vertices, scene.faces, backend="numpy")
-    batches = list(Rig(RigPlan(scene, survey, "numpy")).cast(0, survey.scan_count))
+    batches = list(Rig(scene, survey, "numpy").cast(0, survey.scan_count))
     assert [len(batch.specs) for batch in batches] == [14, 14], "a batch for each station"
     scans = 0
     for batch in batches:
@@ -154,7 +154,7 @@ def test_what_is_cast_is_what_each_ray_by_itself_meets(name, scene):
 @pytest.mark.parametrize("name", SURVEYS | MODELS)
 def test_however_scans_are_batched_their_columns_have_the_same_bits(name, scene):
     survey = (SURVEYS | MODELS)[name]
-    rig = Rig(RigPlan(scene, survey, "numpy"))
+    rig = Rig(scene, survey, "numpy")
     whole = cast_between(rig, survey, [0, 28])
     assert cast_between(rig, survey, [0, 1, 5, 14, 17, 28]) == whole
     assert cast_between(rig, survey, list(range(29))) == whole

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import pytest
 
 from lidarpool import LidarpoolError
-from lidarpool.scan import watch
-from lidarpool.scan.watch import Watch
+from lidarpool.pipeline import watch
+from lidarpool.pipeline.watch import Watch
 
 
 @pytest.fixture

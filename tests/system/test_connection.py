@@ -69,8 +69,8 @@ def test_workers_are_forked_from_one_process_also_in_place_of_others():
             time.sleep(0.1)
         (server,) = set(client.run(os.getppid).values())
         assert psutil.Process(server).ppid() == os.getpid()
-        modules = client.run(lambda: {"lidarpool.scan.stages", "open3d"} & sys.modules.keys())
-        assert list(modules.values()) == [{"lidarpool.scan.stages"}] * 2
+        modules = client.run(lambda: {"lidarpool.pipeline.stages", "open3d"} & sys.modules.keys())
+        assert list(modules.values()) == [{"lidarpool.pipeline.stages"}] * 2
     assert set(psutil.Process(server).children()) <= others
 
 

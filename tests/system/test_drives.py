@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from lidarpool import Mounted, Pose, Scene, Sensor, Survey, Track, read_cloud, simulate
-from lidarpool.scan.rig import Rig, RigPlan
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.city import city
 from lidarpool.scene.scene_file import write_scene
+from lidarpool.simulator.rig import Rig
 
 ROOT = Path(__file__).parents[2]
 
@@ -105,7 +105,7 @@ def test_the_drive_of_three_sensors_and_ten_actors_can_be_made(tmp_path):
     assert len(scene.actors) == 10
     assert 15e6 < survey.ray_count < 15.2e6
     for actor in scene.actors:
-        actor.check(survey.duration_ns)
+        actor.check(0.0, survey.duration_ns)
 
 
 def test_a_frame_says_whose_it_is(cluster_client):
@@ -133,7 +133,7 @@ def test_a_drive_with_actors_on_a_cluster(town, lidarpool, cluster, no_pictures)
     scenario = Scenario.load(town / "drive.yaml")
     scene = scenario.build_scene()
     survey = scenario.survey(scene)
-    batches = list(Rig(RigPlan(scene, survey, report["backend"])).cast(0, survey.scan_count))
+    batches = list(Rig(scene, survey, report["backend"]).cast(0, survey.scan_count))
     for column in survey.stored_columns[3:]:
         made = np.concatenate([column.make(batch) for batch in batches])
         assert np.array_equal(cloud[column.name], made), column.name

@@ -11,11 +11,11 @@ from typing import Any
 import pytest
 from distributed import Client
 
+import lidarpool.pipeline.long_stages
+import lidarpool.pipeline.workers
 import lidarpool.run.trials
-import lidarpool.scan.long_stages
-import lidarpool.scan.workers
 from lidarpool import Frame, LidarpoolError, Planning, Scene, Sensor, Survey, simulate
-from lidarpool.scan.failures import words_on_memory
+from lidarpool.pipeline.failures import words_on_memory
 
 SURVEY = Survey(Sensor.grid(rays_per_revolution=360, layers=8, step_deg=2), [(0, 0, 1)], steps=180)
 POISON = 57
@@ -64,7 +64,7 @@ def test_a_scan_that_kills_its_worker_is_named_and_all_others_are_kept(
 
 @pytest.mark.slow
 def test_summaries_that_kill_the_sorter_end_the_run(client, sabotage, monkeypatch, left_over):
-    monkeypatch.setattr(lidarpool.scan.long_stages, "DEATHS_MOST", 2)
+    monkeypatch.setattr(lidarpool.pipeline.long_stages, "DEATHS_MOST", 2)
     sabotage("sort.get", POISON)
     with pytest.raises(LidarpoolError, match=r"stage \w+ was started 3 times, and each time"):
         simulate(Scene.seed(), SURVEY, client=client)
@@ -73,7 +73,7 @@ def test_summaries_that_kill_the_sorter_end_the_run(client, sabotage, monkeypatc
 
 @pytest.mark.slow
 def test_a_scene_that_kills_its_workers_ends_the_run(client, monkeypatch, left_over):
-    monkeypatch.setattr(lidarpool.scan.workers, "_preparation", lambda *_: _deadly())
+    monkeypatch.setattr(lidarpool.pipeline.workers, "_preparation", lambda *_: _deadly())
     with pytest.raises(LidarpoolError, match="preparing the scene on the GPU workers has killed"):
         simulate(Scene.seed(), SURVEY, client=client)
     assert left_over(client) == ([], [], [])

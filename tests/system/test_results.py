@@ -113,7 +113,7 @@ def test_its_page_and_that_of_its_run(result, scene, cluster_client, monkeypatch
     monkeypatch.setattr("lidarpool.live.result_page.wait_for_interrupt", look)
     result.view(port=0, browser=False)
     frames = []
-    monkeypatch.setattr("lidarpool.live.page.open_browser", lambda url: True)
+    monkeypatch.setattr("lidarpool.live.server.open_browser", lambda url: True)
     simulate(
         scene, Survey(SENSOR, [(0, 0, 1)], 2), client=cluster_client, on_frame=frames.append,
         live=True,

@@ -41,8 +41,8 @@ DRIVERS = """
 import json, os, signal, sys, traceback
 import lidarpool.cli.run_command, lidarpool.report.output, lidarpool.report.pictures as pictures
 from lidarpool.__main__ import main
-from lidarpool.scan.database import RunDatabase
-from lidarpool.scan.driver import SurveyDriver
+from lidarpool.pipeline.database import RunDatabase
+from lidarpool.pipeline.driver import SurveyDriver
 from lidarpool.base.tracing import trace_to
 
 pictures.take_shot = lambda *_, **__: None

@@ -162,22 +162,22 @@ def raise_at(scan: int | None, scan_of=None):
             "stage generate failed: scan 0: FloatingPointError",
         ),
         (
-            "lidarpool.scan.rig.Rig.cast",
+            "lidarpool.simulator.rig.Rig.cast",
             raise_at(None),
             r"stage intersect, scan (\d+) failed: scan \1: FloatingPointError",
         ),
         (
-            "lidarpool.scan.world.RayCaster",
+            "lidarpool.simulator.world.RayCaster",
             raise_at(None),
             "preparing the scene on the GPU workers failed: .*the mirror is loose",
         ),
         (
-            "lidarpool.scan.stages.pack",
+            "lidarpool.pipeline.stages.pack",
             raise_at(None),
             r"stage collect-\d failed: scan \d+: FloatingPointError",
         ),
         (
-            "lidarpool.scan.stages._scans",
+            "lidarpool.pipeline.stages._scans",
             raise_at(None),
             "stage sort failed: the mirror is loose",
         ),

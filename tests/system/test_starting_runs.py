@@ -13,8 +13,8 @@ from distributed import Client, Future
 
 import lidarpool.run.checks
 from lidarpool import Frame, LidarpoolError, Scene, Sensor, Survey, simulate
+from lidarpool.pipeline.workers import CastingWorkers
 from lidarpool.run.checks import common_backend
-from lidarpool.scan.workers import CastingWorkers
 from poolpart import Pool, worker_identities
 
 SURVEY = Survey(Sensor.grid(rays_per_revolution=180, layers=16, step_deg=10), [(0, 0, 1)], steps=36)

@@ -23,7 +23,7 @@ if __name__ == "__main__":
     command("check", "s.yaml")
     command("export", "out", "-f", "pcd", "-f", "laz")
     command("plot", "out", "--colour", "object")
-    with result_page(*open_result(Path("out")), port=0, browser=False):
+    with result_page(open_result(Path("out")), port=0, browser=False):
         print("shown")
     points = simulate(Scene.seed(), Survey(poses=[(0, 0, 1)], keep_every=5)).points
     assert len(points) == len(read_cloud("out/cloud.ply"))

@@ -12,9 +12,10 @@ if TYPE_CHECKING:
     from .columns.cloud import Cloud
     from .columns.table import Column
     from .export.ply import read_cloud
+    from .pipeline import Frame
     from .plan import Plan, Planning
     from .run.store import remove_run
-    from .scan import Frame
+    from .scene.actors import Actor
     from .scene.mesh import Mesh
     from .scene.scene import Scene
     from .sensor import (
@@ -33,8 +34,10 @@ if TYPE_CHECKING:
     from .sensor.models import load_sensor
     from .sensor.trajectory import Track
     from .sensor.trajectory_files import load_trajectory
+    from .simulator import Scanner
 
 __all__ = [
+    "Actor",
     "Beams",
     "Cloud",
     "Column",
@@ -51,6 +54,7 @@ __all__ = [
     "Result",
     "Returns",
     "ScanSpec",
+    "Scanner",
     "Scene",
     "Sensor",
     "Spin",
@@ -73,9 +77,10 @@ _MODULES = {
     "columns.cloud": ("Cloud",),
     "columns.table": ("Column",),
     "export.ply": ("read_cloud",),
+    "pipeline": ("Frame",),
     "plan": ("Plan", "Planning"),
     "run.store": ("remove_run",),
-    "scan": ("Frame",),
+    "scene.actors": ("Actor",),
     "scene.mesh": ("Mesh",),
     "scene.scene": ("Scene",),
     "sensor.models": ("load_sensor",),
@@ -94,6 +99,7 @@ _MODULES = {
     ),
     "sensor.trajectory": ("Track",),
     "sensor.trajectory_files": ("load_trajectory",),
+    "simulator": ("Scanner",),
 }
 
 

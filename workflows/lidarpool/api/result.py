@@ -1,4 +1,4 @@
-"""What a run gives, and everything that the command makes of it."""
+"""A run's result, with the outputs of `lidarpool run`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _SHOWN, _SIZE = ("intensity", "cloud"), (800, 500)
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Result(RunResult):
-    """What a run gives, and everything that the command makes of it.
+    """A run's result, with the outputs of `lidarpool run`.
 
     A notebook shows it as a table with two pictures.
     """
@@ -129,11 +129,13 @@ class Result(RunResult):
             Whether to open a browser where there is a desktop.
         """
         from ..export.cloud_file import CloudFile
-        from ..live.result_page import result_page, wait_for_interrupt
+        from ..live.result_page import result_page, result_view, wait_for_interrupt
 
         with ExitStack() as stack:
             file = CloudFile(self._cloud_file, self._pictured.own)
-            stack.enter_context(result_page(file, self._pictured, port=port, browser=browser))
+            sweeps = None if self.points.sweeps is None else self.points.sweeps()
+            view = result_view(file, self._pictured, sweeps)
+            stack.enter_context(result_page(view, port=port, browser=browser))
             if cell_display() is None:
                 wait_for_interrupt()
             else:

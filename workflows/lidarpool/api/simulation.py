@@ -13,17 +13,17 @@ from distributed import Client
 
 from ..base.arguments import checked
 from ..base.vocabulary import PATIENCE_S, WAIT_S
+from ..pipeline import Frame
 from ..plan import Planning
 from ..run.bars import bars_here
-from ..run.checks import check_backend_here
 from ..run.connection import local_client
 from ..run.job import Job
 from ..run.progress import Progress
 from ..run.run import Run, make_result
 from ..run.store import RunStore
-from ..scan import Frame
 from ..scene.scene import Scene
 from ..sensor import Survey
+from ..simulator.world import check_backend_here
 from .result import Result
 
 if TYPE_CHECKING:
@@ -171,6 +171,6 @@ def simulate(
 
 
 def _page_of(job: Job) -> AbstractContextManager[LiveRun]:
-    from ..live.run_page import live_run  # with viser, which takes half a second
+    from ..live.run_page import live_run  # with Matplotlib, for its colours
 
     return live_run(job)

@@ -129,7 +129,7 @@ def _hints(thing: Any) -> dict[str, Any]:
 def _check(name: str, value: object, hint: Any) -> None:
     if not _fits(value, hint):
         words = _words(hint)
-        such = [example for of, example in _EXAMPLES.items() if of in words.split()]
+        such = [_EXAMPLES[word] for word in words.split() if word in _EXAMPLES]
         example = f"[{such[0]}]" if such and words.startswith("a list") else "".join(such[:1])
         words += f", such as {example}" if example else ""
         raise LidarpoolError(f"{name} is {shown(value)}; it must be {words}.")

@@ -17,7 +17,7 @@ class LidarpoolError(Exception):
 
 
 class Mistakes:
-    """What is wrong with something, to be told of at once and not one after the other."""
+    """Collects errors and reports them together."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []

@@ -29,7 +29,7 @@ def start_fork_server() -> bool:
     """
     if sys.platform != "linux":
         return False
-    forkserver.set_forkserver_preload(["lidarpool.scan.forked"])
+    forkserver.set_forkserver_preload(["lidarpool.pipeline.forked"])
     before = dict(os.environ)
     os.environ.update(_ENVIRONMENT)
     try:

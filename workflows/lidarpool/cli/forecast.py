@@ -24,21 +24,22 @@ from ..base.errors import LidarpoolError
 from ..columns.cloud import CHUNK_POINTS
 from ..columns.storage import Storage
 from ..export.formats import Format
+from ..pipeline import GPU, LIDAR, OTHER
+from ..pipeline.database import FILE
+from ..pipeline.driver import BATCH_RAYS
 from ..report.output import ROOM_BYTES, refuse_to_replace
-from ..run.checks import check_backend_here, find_workers, gpu_note, slots_needed
+from ..run.checks import find_workers, gpu_note, slots_needed
 from ..run.cluster_file import ClusterFile
 from ..run.identity import identity_of
 from ..run.job import Job
 from ..run.local import default_workers, usable_cores
 from ..run.store import RUN_FOLDER
-from ..scan import GPU, LIDAR, OTHER
-from ..scan.database import FILE
-from ..scan.driver import BATCH_RAYS
-from ..scan.echoes import PATTERN_RAYS
-from ..scan.rig import Rig, RigPlan
 from ..scenario.sections import PoolSection
 from ..scene.scene import Scene
 from ..sensor import Survey
+from ..simulator.echoes import PATTERN_RAYS
+from ..simulator.rig import Rig
+from ..simulator.world import check_backend_here
 from .run_command import no_hits
 
 # Measured on Linux: a process of ours with Dask loaded, and the most that a triangle takes while a
@@ -210,7 +211,7 @@ def _drive(survey: Survey) -> dict[str, Any] | None:
 
 def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> Sample:
     """Estimate hits and points of a survey by casting some of its scans, all if they are few."""
-    rig = Rig(RigPlan(scene, survey, backend))
+    rig = Rig(scene, survey, backend)
     all_rays = survey.ray_count * survey.returns.subrays
     count = np.clip(SAMPLE_RAYS * survey.scan_count // all_rays, *SAMPLE_SCANS)
     rays = hits = points = 0

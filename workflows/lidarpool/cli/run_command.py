@@ -20,9 +20,11 @@ from ..base.words import counted
 from ..columns.storage import Storage
 from ..export.folder import local_result, result_folder
 from ..export.formats import Format
+from ..pipeline import LIDAR
+from ..pipeline.database import FILE
 from ..report.output import CLOUD, refuse_to_replace, write_result
 from ..report.report import summary
-from ..run.checks import TooFewWorkersError, check_backend_here, slots_needed
+from ..run.checks import TooFewWorkersError, slots_needed
 from ..run.cluster_file import ClusterFile
 from ..run.connection import TlsFiles, connected, local_client, started_client
 from ..run.identity import identity_of
@@ -32,10 +34,9 @@ from ..run.result import RunResult
 from ..run.run import Run, make_result
 from ..run.store import RUN_FOLDER, RunStore, remove_run
 from ..run.waiting import Waiting
-from ..scan import LIDAR
-from ..scan.database import FILE
 from ..scenario.placing import seen_from
 from ..scenario.scenario import Scenario
+from ..simulator.world import check_backend_here
 from .logs import set_logs
 from .terminal import shown_progress, shown_status, tell
 from .worker_logs import WorkerLogs

@@ -32,8 +32,9 @@ def view(result: Path | Storage, port: int, no_browser: bool) -> None:
       lidarpool view lidarpool-out/cloud.ply --no-browser
     """  # noqa: D301 - click wants the character, not its name
     from ..export.folder import local_result
+    from ..export.sweeps import SWEEPS_FILE
     from ..live.result_page import CLOUD, view_result
     from ..run.picture_file import PICTURE_FILE
 
-    with local_result(result, (CLOUD, PICTURE_FILE)) as made:
+    with local_result(result, (CLOUD, PICTURE_FILE, SWEEPS_FILE)) as made:
         view_result(made, port=port, browser=not no_browser)

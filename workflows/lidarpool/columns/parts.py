@@ -139,6 +139,36 @@ class PartColumns:
         scans = np.arange(self.first, self.stop, dtype=np.int32)
         return np.repeat(scans, self.counts)
 
+    def cloud(
+        self,
+        table: Sequence[Column],
+        precision_m: float,
+        origin: NDArray[np.float64],
+        rows: NDArray[np.integer] | slice = slice(None),
+        sweeps: Callable[[], Any] | None = None,
+    ) -> Cloud:
+        """Points of the part, or some of them.
+
+        Parameters
+        ----------
+        table
+            Columns of the cloud beside the positions.
+        precision_m
+            Size of the cells that positions were rounded to.
+        origin
+            World position of the scene's local origin, (3,), metres.
+        rows
+            Of the part.
+        sweeps
+            As of `Cloud`.
+        """
+        cells = np.stack([self.columns[axis.name][rows] for axis in AXES], axis=1)
+        columns = {
+            c.name: self.scan_column()[rows] if c is SCAN else self.columns[c.name][rows]
+            for c in table
+        }
+        return Cloud(positions(cells, precision_m, origin), columns, tuple(table), sweeps)
+
 
 def pack(part: PartColumns) -> bytearray:
     """Encode a part: the same content gives the same bytes."""
@@ -326,15 +356,7 @@ class StoredCloud(Savable):
 
     def cloud_of(self, part: PartColumns, rows: NDArray[np.integer] | slice = slice(None)) -> Cloud:
         """Points of a part, or some of them."""
-        cells = np.stack([part.columns[axis.name][rows] for axis in AXES], axis=1)
-        columns = {"scan": part.scan_column()[rows]}
-        columns |= {c.name: part.columns[c.name][rows] for c in self.table if c is not SCAN}
-        return Cloud(
-            positions(cells, self._precision_m, self._origin),
-            columns,
-            self.table,
-            self.sweeps,
-        )
+        return part.cloud(self.table, self._precision_m, self._origin, rows, self.sweeps)
 
     def chunks(self, points: int = CHUNK_POINTS, first: int = 0) -> Iterator[Cloud]:
         """Read the cloud in order, from row `first` on, so many points at a time.

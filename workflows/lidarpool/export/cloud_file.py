@@ -5,6 +5,7 @@ from __future__ import annotations
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,9 +94,10 @@ class CloudFile:
         of = self._rows["scan"]
         return bisect_left(of, scans[0]), bisect_right(of, scans[1])
 
-    def piece(self, first: int, last: int) -> Cloud:
-        """Points of some rows, in order. Those without finite coordinates are left out."""
-        return self._cloud(self._rows[first:last])
+    def values(self, name: str, rows: NDArray[np.int64] | slice) -> NDArray[Any]:
+        """Values of a column, or of x, y or z, in some rows; those of a slice stay on the disk."""
+        files = {column.name: column.in_files for column in self.table}
+        return np.asarray(self._rows[files.get(name, name)][rows])
 
     def _cloud(self, rows: NDArray[np.void]) -> Cloud:
         positions = np.stack([rows[axis] for axis in AXES], axis=1, dtype=np.float64)

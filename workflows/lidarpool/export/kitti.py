@@ -87,7 +87,7 @@ def _row(turn: Floats) -> str:
 
 
 def _labels(sweeps: Sweeps, sweep: int, boxes: Boxes) -> str:
-    """Lines of label_2: nobody has cut or looked at them, and there is no picture.
+    """Lines of label_2, without a picture; truncation and occlusion are not computed.
 
     The place is the middle of the underside; boxes are turned about the camera's y alone.
     """

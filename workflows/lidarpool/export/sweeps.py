@@ -317,13 +317,9 @@ def plain_names(names: Iterable[str]) -> list[str]:
 
 def _of_head(sensor: Sensor, steps: int) -> tuple[NDArray[np.int64], Floats]:
     """First time step of each of so many sweeps, and their starts since that of the station."""
-    begins = sensor.begins_ns(np.array([sensor.firings(step)[0] for step in range(steps)]))
-    rate_hz = getattr(sensor.head, "rate_hz", None)
-    if rate_hz is None:  # a user's head: its cycle is unknown
-        return np.arange(steps), begins + sensor.lead_ns
-    turn = np.floor((begins - sensor.start_ns) * (rate_hz / 1e9) + 1e-6)
-    firsts = np.flatnonzero(np.diff(turn, prepend=-1))
-    return firsts, begins[firsts] + sensor.lead_ns
+    firsts = np.flatnonzero(np.diff(sensor.turns(np.arange(steps)), prepend=-1))
+    begins = sensor.begins_ns(np.array([sensor.firings(step)[0] for step in firsts.tolist()]))
+    return firsts, begins + sensor.lead_ns
 
 
 def _poses(survey: Survey, station: int, since: Floats) -> tuple[Floats, Floats]:

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud
 from ..columns.parts import read_part
+from ..pipeline import Receipt
 from ..run.result import RunResult
 from ..run.store import RunStore
-from ..scan import Receipt
 
 LIVE_POINTS = 150_000  # in the browser at a time
 PARTS_NOTED = 64  # parts that wait to be read; of more, every second is skipped

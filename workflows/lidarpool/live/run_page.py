@@ -1,19 +1,20 @@
-"""The live page of a run: during the run, and until it is closed.
+"""The page of a run: during the run, and until it is closed.
 
-The run calls it in its own thread, and never waits for a browser: news are recorded, and drawn in
-another thread from time to time, within a small share of a core.
+The run calls it in its own thread, and never waits for a browser: news are recorded, and parts
+are read in another thread from time to time, within a small share of a core.
 """
 
 from __future__ import annotations
 
-import math
+import logging
+import threading
 import time
 from collections import deque
-from collections.abc import Callable, Hashable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from html import escape
 from pathlib import Path
-from threading import Event
 
 import click
 import numpy as np
@@ -23,47 +24,47 @@ from poolpart import Partition
 
 from ..columns.table import SCAN, TABLE
 from ..export.cloud_file import CloudFile
+from ..export.sweeps import Sweeps
+from ..pipeline import Frame
 from ..plan import best
 from ..run.job import Job
 from ..run.picture_file import Pictured, sensor_ways
 from ..run.progress import STAGES, Progress, Show, in_words, is_sure, time_in_words
 from ..run.result import RunResult
 from ..run.store import RunStore
-from ..scan import Frame
 from ..sensor.materials import MaterialTable
-from .blocks import VIEW_POINTS, Blocks
 from .live_points import LivePoints
-from .page import PORT, LivePage, announced, live_page, redrawn
-from .view import NO_RAYS, View
+from .points import HeldPoints
+from .server import PORT, Answer, Arguments, PageServer, announced, page_server
+from .view import View
 
-DRAW_EVERY_S = 0.2
-BUSY_SHARE, IDLE_SHARE = 0.06, 0.7  # of a core, while the run goes on and when it is over
+READ_EVERY_S, READING_SHARE = 0.2, 0.06  # of a core, to read parts while the run goes on
+ASKED_WITHIN_S = 10.0  # a page that asked no longer ago is open
 ASK_EVERY_S = 2.0  # how busy the partitions are
 FRAMES_SHOWN = 40  # whose rays are shown
+_LAST_S = 30.0  # to wait for what is read last
+_NO_RAYS = np.zeros((0, 2, 3), np.float32)
 
-_BOX = '<div style="padding:0 0.8em 0.6em;font-size:0.85em;font-variant-numeric:tabular-nums">'
+_LOGGER = logging.getLogger(__name__)
 
 
 class LiveRun:
     """Connects a run and its page, in both directions."""
 
-    def __init__(self, page: LivePage, job: Job) -> None:
-        self.page, self._job = page, job
-        self.stopped = Event()  # by a user of the page; --resume continues
-        self._text = page.gui.add_html("")
-        self._stop = page.gui.add_button("Stop", color="red")
-        self._stop.on_click(lambda _: self.stopped.set())
-        survey, scene, ways = job.survey, job.scene, sensor_ways(job.survey)
+    page: PageServer
+
+    def __init__(self, job: Job) -> None:
+        self._job = job
+        self.stopped = threading.Event()  # by a user of the page; --resume continues
+        survey, scene = job.survey, job.scene
         table, nothing = MaterialTable.of(survey.materials, scene.all_names), np.zeros(0, np.int64)
         pictured = Pictured(
-            scene, ways, nothing, NO_RAYS, job.planning, None, (), survey.duration_ns, (),
-            table.reflectance,
+            scene, sensor_ways(survey), nothing, _NO_RAYS, job.planning, None, (),
+            survey.duration_ns, (), table.reflectance,
         )  # fmt: skip
-        self._models = pictured.models
-        self._view = View(page, (SCAN, *survey.stored_columns), pictured)
+        self._view = View("lidarpool", None, (SCAN, *survey.stored_columns), pictured)
+        self._view.hits = self._hits
         self._starting = "starting"  # the state before there is any progress
-        self._newest = ""  # sensor and time of the newest frame
-        self._shown = -1  # the last scan whose time was sent to the page
         self._store: RunStore | None = None
         self._points: LivePoints | None = None
         self._progress: Progress | None = None
@@ -72,8 +73,9 @@ class LiveRun:
         self._partitions: Mapping[str, Partition] = {}
         self._busy: dict[str, tuple[int, int]] = {}  # {partition: busy slots, all slots}
         self._ask_at = 0.0
+        self._asked_at = 0.0  # when a page last asked for news
         self._over = False
-        self._rays: NDArray[np.float32] | None = None  # of all the run, at its end
+        self._ends = 0  # how often something came at the run's end that the page must ask for
 
     # -- the run's side, in its thread ---------------------------------------------------
 
@@ -124,20 +126,23 @@ class LiveRun:
         """Show the whole result at the end of the run; its parts may then be removed."""
         if self._points is not None:
             self._points.finish(result)
-        self._rays = result.sample_rays
+            self._view.show(HeldPoints(self._points.cloud) if self._points.cloud else None)
+        self._view.rays = result.sample_rays
+        self._view.path = None if result.plan is None else result.plan.path
+        if self._progress is not None:
+            self._progress = replace(self._progress, points=len(result.points))
         self._busy, self._over = {}, True
-        self._stop.label = "Close"
+        self._ends += 1
 
     def stay(self, cloud: Path) -> None:
         """Keep the page until Ctrl-C or its button.
 
-        More points are read from the written `cloud`, because the parts are gone.
+        Points are read from the written `cloud`, because the parts are gone.
         """
         own = [column for column in self._job.survey.stored_columns if column.name not in TABLE]
-        file = CloudFile(cloud, own)
-        if self._points is not None:
-            self._points.show(file.choose(VIEW_POINTS)[0])
-        self._view.cloud.blocks = Blocks(file, self._job.scene.origin, VIEW_POINTS)
+        self._view.sweeps = Sweeps.of(self._job.survey, self._job.scene)
+        self._view.show(CloudFile(cloud, own))
+        self._ends += 1
         click.echo(f"the live page stays at {self.page.url}; Ctrl-C ends it", err=True)
         with suppress(KeyboardInterrupt):
             while not self.stopped.wait(0.2):  # one without limit is not left on Ctrl-C everywhere
@@ -145,41 +150,64 @@ class LiveRun:
 
     # -- the page's side -----------------------------------------------------------------
 
-    def draw(self) -> float:
-        """Draw what is new; returns the share of a core that this may take."""
-        if self.page.get_clients():  # those that connect later are drawn for then
-            self._text.content = self._panel()
-            cloud, version, hits, path = None, 0, 0, None
-            if (points := self._points) is not None:
-                points.gather()
-                cloud, version, hits, path = points.cloud, points.version, points.hits, self._path()
+    def read_parts(self) -> None:
+        """Read some of the parts that were committed, if a page is open."""
+        points = self._points
+        if points is None or self._over or time.monotonic() > self._asked_at + ASKED_WITHIN_S:
+            return
+        before = points.version
+        points.gather()
+        if points.version != before and points.cloud is not None and not self._over:
+            self._view.show(HeldPoints(points.cloud))
+
+    def answer(self, what: str, asked: Arguments, abandoned: Callable[[], bool]) -> Answer:
+        """Answer a question of the page."""
+        if what == "news":
+            self._asked_at = time.monotonic()
+            return self._news()
+        header, arrays = self._view.answer(what, asked, abandoned)
+        if what == "state":
+            some = not isinstance(self._view.points, CloudFile)
+            header |= {"live": True, "sampled": some, "points": self._count}
+        return header, arrays
+
+    def order(self, what: str) -> None:
+        """Stop the run, or end the page that stays."""
+        if what != "stop":
+            raise KeyError(what)
+        self.stopped.set()
+
+    def _news(self) -> Answer:
+        view, frames = self._view, list(self._frames)
+        newest = frames[-1] if frames and not self._over else None
+        time_s = None if newest is None else self._job.survey.begins_ns(newest.scan) / 1e9
+        if view.path is None and not self._over:
+            view.path = self._planned()
+        header = {
+            "version": view.version,
+            "points": self._count,
             # It is large, and changes visibly only with a tenth more hits.
-            grown = round(math.log1p(hits) / math.log(1.1)), self._over
-            self._view.draw(cloud, version, self._hits, grown, *self._newest_rays(), path)
-        return IDLE_SHARE if self._over else BUSY_SHARE
+            "hits_version": round(10 * np.log1p(self._points.hits)) if self._points else 0,
+            "rays_version": -1 if newest is None else newest.scan,
+            "time": time_s,
+            "panel": self._panel(),
+            "path": view.planned,
+            "over": self._over,
+            "ends": self._ends,
+            "stopping": self.stopped.is_set(),
+        }
+        return header, {"rays": _rays_of(frames) if newest is not None else view.rays_shown}
+
+    @property
+    def _count(self) -> int:
+        """Points that were committed."""
+        return 0 if self._progress is None else self._progress.points
 
     def _hits(self) -> NDArray[np.float64]:
         faces = len(self._job.scene.faces)
         return np.zeros(faces) if self._points is None else self._points.hit_counts()
 
-    def _newest_rays(self) -> tuple[NDArray[np.float32], Hashable]:
-        """Rays of the newest frames, or some of all in the end, and a version of them."""
-        frames = list(self._frames)
-        if frames and frames[-1].scan != self._shown:
-            self._shown = frames[-1].scan
-            time_ns = self._job.survey.begins_ns(self._shown)
-            self._view.set_time(time_ns)
-            of = f"{frames[-1].sensor}, " if frames[-1].sensor else ""
-            self._newest = f"newest scan: {of}at {time_ns / 1e9:,.4g} s"
-        if self._rays is not None:
-            return self._rays, "all"
-        starts = [np.full_like(frame.samples, frame.pose.position) for frame in frames]
-        if not frames:
-            return NO_RAYS, 0
-        ends = np.concatenate([frame.samples for frame in frames])
-        return np.stack([np.concatenate(starts), ends], axis=1), self._shown
-
-    def _path(self) -> NDArray[np.float64] | None:
+    def _planned(self) -> NDArray[np.float64] | None:
         """Return the planned path, once all trials have ended."""
         planning, store = self._job.planning, self._store
         if planning is None or store is None or len(store.db.trials) < self._job.trials:
@@ -187,24 +215,20 @@ class LiveRun:
         return best(store.db.trials, planning).path
 
     def _panel(self) -> str:
-        """Write the progress of the run."""
-        progress, points = self._progress, self._points
+        """Write the progress of the run, as HTML."""
+        progress = self._progress
         if progress is None:
-            return f"{_BOX}<b>{self._starting}</b></div>"
+            return f"<b>{self._starting}</b>"
         lines = [f"<b>{self._words(progress)}</b>, {progress.seconds:,.0f} s{self._pace(progress)}"]
+        if self._over:
+            return lines[0]
         lines += [
             _bar(label, getattr(progress, count), getattr(progress, total))
             for label, count, total in STAGES
             if getattr(progress, total)
         ]
-        lines.append(escape(self._models))
-        lines += [escape(self._newest)] if self._newest and not self._over else []
-        shown = len(points.cloud) if points is not None and points.cloud is not None else 0
-        some = "" if shown == progress.points else f", {shown:,} of them displayed"
-        of_file = self._view.cloud.facts if self._view.cloud.blocks is not None else []
-        lines += of_file or [f"<b>{progress.points:,} points</b>{some}"]
         lines += [_bar(f"{escape(name)}, slots busy", *slots) for name, slots in self._busy.items()]
-        return _BOX + "".join(f"<div>{line}</div>" for line in lines) + "</div>"
+        return "".join(f"<div>{line}</div>" for line in lines)
 
     def _words(self, progress: Progress) -> str:
         if self._over:
@@ -227,24 +251,53 @@ class LiveRun:
         return words
 
 
+def _rays_of(frames: list[Frame]) -> NDArray[np.float32]:
+    """Return some rays (n, 2, 3) of frames, local."""
+    starts = [np.full_like(frame.samples, frame.pose.position) for frame in frames]
+    ends = np.concatenate([frame.samples for frame in frames])
+    return np.stack([np.concatenate(starts), ends], axis=1).astype(np.float32)
+
+
 def _bar(label: str, done: int, whole: int) -> str:
     share = 100 * done / max(whole, 1)
     return (
-        '<div style="display:flex;margin-top:0.35em">'
-        f'<span style="flex:1">{label}</span><span>{done:,} / {whole:,}</span></div>'
-        '<div style="height:0.3em;border-radius:2px;background:rgba(128,134,142,0.3)">'
-        f'<div style="height:100%;border-radius:2px;width:{share:.1f}%;background:#2f7fd6">'
-        "</div></div>"
+        f'<div class="bar"><div><span>{label}</span><span>{done:,} / {whole:,}</span></div>'
+        f'<i><b style="width:{share:.1f}%"></b></i></div>'
     )
 
 
 @contextmanager
 def live_run(job: Job, *, port: int = PORT, browser: bool = True) -> Iterator[LiveRun]:
-    """Serve the live page of a run while the body runs; see `live_page` and `announced`."""
-    with live_page("lidarpool", port) as page:
-        live = LiveRun(page, job)
-        with (
-            announced(page, f"live page: {page.url}", browser),
-            redrawn(live.draw, DRAW_EVERY_S),
-        ):
+    """Serve the page of a run while the body runs; see `announced`."""
+    live = LiveRun(job)
+    with page_server(live, port) as page:
+        live.page = page
+        with announced(page, f"live page: {page.url}", browser), _repeated(live.read_parts):
             yield live
+
+
+@contextmanager
+def _repeated(read: Callable[[], None]) -> Iterator[None]:
+    """Call a function repeatedly in a thread while the body runs, within a share of a core.
+
+    An error is logged, and ends the reading but not the body.
+    """
+    ended = threading.Event()
+
+    def run() -> None:
+        try:
+            while not ended.is_set():
+                started = time.thread_time()
+                read()
+                took = time.thread_time() - started  # processor time: waiting does not count
+                ended.wait(max(READ_EVERY_S, took / READING_SHARE - took))
+        except Exception:
+            _LOGGER.exception("the page shows no new points any more")
+
+    thread = threading.Thread(target=run, name="lidarpool-live", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join(_LAST_S)

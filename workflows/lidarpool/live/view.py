@@ -1,472 +1,448 @@
-"""The 3D view of a page: scene, cloud, sensors, rays and path, and their controls."""
+"""What a page shows of a survey: its answers to the page's questions."""
 
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable, Hashable, Sequence
-from contextlib import suppress
-from dataclasses import replace
-from html import escape
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
-from ..columns.cloud import Cloud
-from ..columns.table import Column
+from ..columns.table import AXES as POSITION
+from ..columns.table import Column, X, Y, Z
+from ..export.ply_format import AXES
+from ..export.sweeps import Sweeps
 from ..render.closeup import CUT, around_ways, floor_and_roof
-from ..render.theme import CLAY, object_colours, rgb
-from ..run.picture_file import Pictured, ways_of
+from ..render.colouring import MOST_ENTRIES, Colouring, colours_of
+from ..render.theme import mapped, object_colours
+from ..run.picture_file import Pictured, SensorWay, ways_of
+from ..scene.actors import Actor
 from ..sensor.trajectory import quaternions_of
-from .cloud_view import HIDDEN, CloudView
-from .colouring import as_bytes
-from .labels import Labels
-from .looking import Filter, Limits, within
-from .page import LivePage, place_eye
-from .surface import MeshNode, Surface, below, colours_for
+from .legend import Legend, as_bytes, legend_of
+from .points import Eye, Filter, PointFinder, Points, Rows, Scans, positions, within
+from .server import Answer, Arguments
+from .surface import Surface, colours_for
 
 Floats = NDArray[np.float64]
-Rays = NDArray[np.float32]  # (n, 2, 3), metres, local
-NO_RAYS: Rays = np.zeros((0, 2, 3), np.float32)
-NO_TRIANGLES = np.zeros((0, 3, 3), np.float32)
-MOST_POSES = 1000  # that have a ball
+Bounds = tuple[Floats, Floats]  # the local origin, (3,), and a box (2, 3) from there
+
+MOST_POINTS = 20_000_000  # in an answer
 MOST_RAYS = 150  # more rays would hide the surfaces
+_SAMPLE = 100_000  # points that colour scales and limits are taken from
+_HITS_SAMPLE = 500_000  # points that tell where on large triangles the hits are
+_MOST_NAMES = 2000  # in a menu
+_ACTOR_PLACES = 1000
+_IMAGE_WIDTH, _IMAGE_ROWS = 1024, 128  # most columns; rows of sensors with few or many channels
+_FEW, _MANY = 4, 512
+_NARROW = math.radians(300)  # a sensor that sees less is no spinning one
+_NS = 1e9
 
-_RED, _PALE = (224, 24, 45), (232, 140, 150)
-_PATH, _DISC = (20, 150, 90), (120, 130, 150)
-# As shares of the scene's diagonal.
-_BALL, _POSE, _END = 0.009, 0.0054, 0.008
-_MOVES = 0.4  # of that: motion in a large scene is shown from near
-_PLAY_S = (6.0, 60.0)  # limits of the playing time of a survey
 
-
+@dataclass(eq=False)
 class View:
-    """Scene, cloud, sensors, rays and path on a page, with their controls.
+    """A survey on a page, or a cloud alone.
 
-    One thread draws everything, in the scene's local coordinates. Unchanged things are not drawn
-    again. `table` has the columns of the cloud. For a cloud alone, without `pictured`, `around` is
-    the world position of the local origin, (3,), and the cloud's box (2, 3) from there.
+    Parameters
+    ----------
+    title
+        Of the page.
+    points
+        The points, or None before there are any.
+    table
+        Columns beside the positions.
+    pictured, sweeps
+        What else is known of the survey.
+    hits
+        Returns the hits of each triangle, (f,).
+    rays
+        float32 (n, 2, 3): ends of some rays, metres, local.
+    note
+        A remark on what is shown.
     """
 
-    def __init__(
-        self,
-        page: LivePage,
-        table: Sequence[Column],
-        pictured: Pictured | None,
-        around: tuple[Floats, Floats] | None = None,
-    ) -> None:
-        self._page = page
-        self._scene = None if pictured is None else pictured.scene
-        self._reflectance = None if pictured is None else pictured.reflectance
-        self._planning = None if pictured is None else pictured.planning
-        self._sensors = () if pictured is None else pictured.sensors
-        self._actors = () if self._scene is None else self._scene.actors
-        self._first_actor = 0 if self._scene is None else len(self._scene.names)
-        self._ends_ns = 0.0 if pictured is None else pictured.duration_ns
-        self._poses = np.concatenate([np.empty((0, 3)), *(way.positions for way in self._sensors)])
-        self.origin, bounds = around or _whole(pictured, self._poses)
-        self._ground = float(bounds[0, 2])
-        near = around_ways(bounds, ways_of(self._sensors, self._actors, self._ends_ns))
-        from_near = near is not None
-        near = bounds if near is None else near
-        self._size_m = float(np.linalg.norm(near[1] - near[0])) or 1.0
-        self._labels = Labels(page)
-        names = {} if pictured is None else {c.name: pictured.names_of(c) for c in table}
-        self.cloud = CloudView(page, self._labels, table, names, self.origin, self._size_m)
-        self._drawn: dict[str, Hashable] = {}  # {name: its inputs when it was drawn}
-        # {limits of the objects: surface}; of all, and of those that were shown last
-        self._surfaces: dict[Limits, Surface] = {}
-        self._mesh = MeshNode(page, "/scene")
-        self._rays: Any = None  # viser shows no lines without points
-        self._markers: list[Any] = []  # of the sensors, once the time is known
-        self._bodies: list[Any] = []  # of the actors
-        self._linked: dict[str, Any] = {}  # {name in a link: slider or menu}
-        self._time: Any = None  # slider, where anything moves
-        self._follow: Any = None  # checkbox, where a sensor moves
-        self._trail: Any = None  # slider, where points have a time
-        self._followed: Floats | None = None  # last position of the carrier
-        self._playing = False
-        self._moved_at = 0.0  # when the time was last moved on by playing
-        page.frame_scene(near)
-        self._add_controls(bounds, any(column.name == "time" for column in table))
-        if from_near:  # towers would hide the street
-            self._cut.value = min(float(near[1, 2] + self.origin[2]), self._top)
-        self._add_poses()
-        self._add_actors()
+    title: str
+    points: Points | None
+    table: Sequence[Column]
+    pictured: Pictured | None = None
+    sweeps: Sweeps | None = None
+    hits: Callable[[], NDArray[Any]] | None = None
+    rays: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2, 3), np.float32))
+    note: str = ""
 
-    def _add_controls(self, bounds: Floats, timed: bool) -> None:
-        gui = self._page.gui
-        low, high = (bounds[:, 2] + self.origin[2]).tolist()
-        step = 10.0 ** math.floor(math.log10(max(high - low, 1e-3) / 50))
-        first, self._top = (
-            round(step * math.floor(low / step), 6),
-            round(step * (math.floor(high / step) + 1), 6),
-        )
-        carried = any(way.moves for way in self._sensors)
-        if self._ends_ns > 0 and (self._actors or carried):
-            self._add_time(self._ends_ns / 1e9, carried, timed)
-        self.cloud.add_colour()
-        if self._scene is not None:
-            colours = colours_for(self._scene, self._reflectance)
-            self._scene_colour = gui.add_dropdown("scene colour", (*colours, HIDDEN))
-            self._scene_legend = gui.add_html("")
-            self._linked["scene"] = self._scene_colour
-        self.cloud.add_filter()
-        with gui.add_folder("view", expand_by_default=False):
-            sides = (*self._page.SIDES, *(("sensor",) if self._sensors else ()))
-            gui.add_button_group("look", sides).on_click(self._look)
-            self._cut: Any = gui.add_slider("cut above, m", first, self._top, step, self._top)
-            self._point_size = gui.add_slider("point size", 0.1, 4.0, 0.1, 1.0)
-            if self._scene is not None:
-                self._show_rays = gui.add_checkbox("rays", initial_value=True)
-            gui.add_button("Save picture").on_click(self._save)
-            gui.add_button("Link to this view").on_click(self._link)
-            self._link_text = gui.add_html("")
-        self._linked |= {"cut": self._cut, "colour": self.cloud.colour}
+    def __post_init__(self) -> None:
+        self.version = 0  # of the points
+        self.path = None if self.pictured is None or self.pictured.plan is None else (
+            self.pictured.plan.path
+        )  # fmt: skip
+        self.origin, self._bounds = self._around()
+        rest = {column.name: column for column in self.table if column not in POSITION}
+        self.columns = {"z": Z, "x": X, "y": Y, **rest}  # to colour and filter by
+        self._lock = threading.Lock()
+        self._surface: Surface | None = None
+        self._range_limits: dict[int, tuple[float, float]] = {}  # {sensor: ends of the scale}
+        self.show(self.points)
 
-    def _add_time(self, duration_s: float, carried: bool, timed: bool) -> None:
-        gui, step = self._page.gui, 10.0 ** math.floor(math.log10(duration_s / 200))
-        end = round(step * math.ceil(duration_s / step), 9)  # as many digits are shown as it has
-        self._time = self._linked["time"] = gui.add_slider("time, s", 0.0, end, step, 0.0)
-        self._play = gui.add_button("Play")
-        self._play.on_click(lambda _: self._start_or_stop())
-        if carried:
-            self._follow = gui.add_checkbox(
-                "follow", initial_value=False, hint="the carrier, with the camera"
-            )
-        if timed:
-            self._trail = self._linked["last"] = gui.add_slider(
-                "last, s", 0.0, end, step, 0.0, hint="of the points, up to the time; 0: all"
-            )
+    def show(self, points: Points | None) -> None:
+        """Show other points."""
+        self.points = points
+        self._finder = None if points is None else PointFinder(points, self.origin)
+        self._colourings: dict[tuple[str, Filter], Colouring] = {}
+        self.version += 1
+
+    # -- what is known of the survey -----------------------------------------------------
+
+    @cached_property
+    def sensors(self) -> Sequence[SensorWay]:
+        """Positions of the sensors: exact, or those at the beginnings of their sweeps."""
+        if self.pictured is not None:
+            return self.pictured.sensors
+        sweeps, ways = self.sweeps, []
+        if sweeps is None or sweeps.coordinates != "world":
+            return ()
+        for number, name in enumerate(sweeps.sensors):
+            own = sweeps.sensor == number
+            places = sweeps.pose.positions[own] - self.origin
+            moves = len(np.unique(places, axis=0)) > len(places) / 2 > 1
+            ways.append(SensorWay(sweeps.begins_ns[own], places, moves, name))
+        return ways
 
     @property
-    def cut(self) -> float | None:
-        """Height above which nothing is shown, metres; None to show all."""
-        value = self._cut.value
-        return None if value >= self._top else float(value) - float(self.origin[2])
-
-    def _changed(self, name: str, *state: Hashable) -> bool:
-        """Whether to draw something with these inputs."""
-        changed = self._drawn.get(name) != state
-        self._drawn[name] = state
-        return changed
-
-    def draw(
-        self,
-        cloud: Cloud | None,
-        version: Hashable,
-        hits: Callable[[], NDArray[Any]] = lambda: np.zeros(0),
-        hits_version: Hashable = 0,
-        rays: Rays = NO_RAYS,
-        rays_version: Hashable = 0,
-        path: Floats | None = None,
-    ) -> None:
-        """Draw what has changed, as the versions tell.
-
-        `cloud` is an evenly spaced sample of the points, in world coordinates; `hits` returns the
-        hits of each triangle, (f,); `path` is the planned path, (n, 2) metres.
-        """
-        self._draw_time()
-        self._draw_scene(hits, hits_version, cloud)
-        if self._scene is not None:
-            self._draw_rays(rays, rays_version)
-        if path is not None and self._changed("path"):
-            self._draw_path(path)
-        if cloud is not None:
-            self.cloud.show(cloud, version)
-            if self._trail is not None:
-                length, at = self._trail.value, self._time.value
-                limits = ((at - length) * 1e9, at * 1e9) if length > 0 else None
-                self.cloud.trail = Filter().with_limits("time", limits)
-            self.cloud.draw(self.cut, self._point_size.value, self._playing)
-        self._labels.draw()
-
-    def _draw_scene(
-        self, hits: Callable[[], NDArray[Any]], version: Hashable, cloud: Cloud | None
-    ) -> None:
-        """Show the surfaces of all objects, or of those that the filter keeps."""
-        self._mesh.settle()
-        if self._scene is None:
-            return
-        if not self._surfaces:
-            self._surfaces[None] = Surface(self._scene, self._reflectance)
-            self._look_around(self._surfaces[None])
-        colour, only = self._scene_colour.value, self.cloud.filter.of("object")
-        seen = version if colour == "hits" else 0
-        if self._changed("scene", seen, self.cut, colour, only):
-            rows = within(self._scene.face_object, only)
-            corners, colours, legend = NO_TRIANGLES, np.zeros((0, 3), np.uint8), ""
-            if colour != HIDDEN and rows.any():
-                counts, places = np.zeros(0), NO_TRIANGLES[:, 0]
-                if colour == "hits":
-                    counts, places = hits()[rows], self._on_scene(cloud, only)
-                corners, colours, legend = self._surface(only, rows).coloured(
-                    colour, counts, places
-                )
-            corners, kept = below(corners, self.cut)
-            self._scene_legend.content = legend
-            self._mesh.show(corners, colours[kept])
-            self._colour_actors(colour == "object")
-
-    def _surface(self, only: Limits, rows: NDArray[np.bool_]) -> Surface:
-        """Surface of the objects within these limits, whose triangles are these (f,)."""
-        scene, whole = self._scene, self._surfaces[None]
-        assert scene is not None
-        if only not in self._surfaces:
-            part = replace(scene, faces=scene.faces[rows], face_object=scene.face_object[rows])
-            self._surfaces = {None: whole, only: Surface(part, self._reflectance)}
-        return self._surfaces[only]
-
-    def _colour_actors(self, own: bool) -> None:
-        """Give actors their objects' colours, or grey."""
-        count = self._first_actor + len(self._bodies)
-        colours = object_colours(count) if own else np.tile(rgb(CLAY), (count, 1))
-        for body, colour in zip(self._bodies, as_bytes(colours[self._first_actor :]), strict=True):
-            body.color = tuple(colour.tolist())
-
-    def _on_scene(self, cloud: Cloud | None, only: Limits) -> NDArray[np.float32]:
-        """Positions (n, 3) of points on static objects, local."""
-        if cloud is None:
-            return NO_TRIANGLES[:, 0]
-        places = (cloud.positions - self.origin).astype(np.float32)
-        if "object" in cloud.columns and self._scene is not None:
-            static = cloud["object"] < len(self._scene.names)
-            places = places[static & within(cloud["object"], only)]
-        return places
-
-    def _look_around(self, surface: Surface) -> None:
-        """Cut a building open if the sensors stand in one, and find the floor."""
-        floor, roof = floor_and_roof(surface.coarse, self._poses)
-        self._ground = self._ground if floor is None else floor
-        if roof is not None and (self.cut is None or roof < self.cut):
-            top = float(self._poses[:, 2].max())
-            height = top + CUT * (roof - top) + float(self.origin[2])
-            self._cut.value = min(max(height, self._cut.min), self._top)
-
-    def _draw_rays(self, rays: Rays, version: Hashable) -> None:
-        """Show some of the rays if they end below the cut and no object is looked at alone."""
-        cut = self.cut
-        shown = self._show_rays.value and self.cloud.filter.of("object") is None
-        if not self._changed("rays", version, cut, shown):
-            return
-        if cut is not None:
-            rays = rays[(rays[:, :, 2] <= cut).all(axis=1)]
-        rays = rays[:: len(rays) // MOST_RAYS + 1]
-        if self._rays is not None:
-            self._rays.visible = shown and len(rays) > 0
-            if self._rays.visible:
-                self._rays.points = rays
-        elif shown and len(rays):
-            self._rays = self._page.scene.add_line_segments(
-                "/rays", rays, _PALE, thickness=1.0, thickness_units="screen"
-            )
-
-    def _start_or_stop(self) -> None:
-        self._playing, self._moved_at = not self._playing, time.monotonic()
-        self._play.label = "Pause" if self._playing else "Play"
-
-    def set_time(self, time_ns: float) -> None:
-        """Show sensors and actors at a time, unless a user plays another."""
-        if self._time is None:
-            self._place(time_ns)
-        elif not self._playing:
-            self._time.value = time_ns / 1e9
-
-    def _draw_time(self) -> None:
-        """Show sensors and actors at the chosen or played time."""
-        while (choices := self._page.opened_link()) is not None:
-            self.choose(choices)
-        if self._time is None:
-            return
-        if self._playing:
-            now = time.monotonic()
-            speed = self._time.max / float(np.clip(self._time.max, *_PLAY_S))
-            at = self._time.value + (now - self._moved_at) * speed
-            self._moved_at, self._time.value = now, at % self._time.max
-        self._place(self._time.value * 1e9)
-
-    def _place(self, time_ns: float) -> None:
-        time_ns = min(time_ns, self._ends_ns)  # the slider ends at a round number
-        only = self.cloud.filter.of("object")
-        hidden = self._scene is not None and self._scene_colour.value == HIDDEN
-        if not self._changed("time", time_ns, only, hidden):
-            return
-        scene = self._page.scene
-        for number, way in enumerate(self._sensors[len(self._markers) :], len(self._markers)):
-            name = f"/sensors/{number}"
-            radius = _BALL * self._size_m * (_MOVES if way.moves else 1.0)
-            self._markers.append(scene.add_icosphere(name, radius, _RED, cast_shadow=False))
-        self._follow_carrier(time_ns)
-        moving = [way for way in self._sensors if way.moves]
-        if moving:  # those of one carrier are near each other
-            names = ", ".join(way.name for way in moving if way.name) or "sensor"
-            self._labels.put(names, moving[0].at(time_ns))
-        for way in self._sensors:
-            if not way.moves:
-                self._labels.put(way.name or "sensor", way.at(time_ns))
-        with self._page.atomic():
-            for marker, way in zip(self._markers, self._sensors, strict=True):
-                marker.position = way.at(time_ns)
-            for number, (body, actor) in enumerate(zip(self._bodies, self._actors, strict=True)):
-                positions, rotations = actor.trajectory.poses(0, np.array([time_ns]))
-                body.position = positions[0]
-                if rotations is not None:
-                    body.wxyz = np.roll(quaternions_of(rotations)[0], 1)
-                wanted = bool(within(self._first_actor + number, only))
-                body.visible = wanted and not hidden
-                top = positions[0] + [0.0, 0.0, float(actor.mesh.vertices[:, 2].max())]
-                self._labels.put(actor.name, top if wanted else None)
-
-    def _follow_carrier(self, time_ns: float) -> None:
-        """Move all cameras as the carrier has moved."""
-        if self._follow is None:
-            return
-        before, self._followed = self._followed, self._carrier(time_ns)
-        if self._follow.value and before is not None:
-            for client in self._page.get_clients().values():  # the camera looks along
-                client.camera.position = client.camera.position + self._followed - before
-
-    def _carrier(self, time_ns: float) -> Floats:
-        """Position of the first moving sensor, or of the first of all, (3,)."""
-        way = next((way for way in self._sensors if way.moves), self._sensors[0])
-        return way.at(time_ns)
-
-    def _look(self, event: Any) -> None:
-        """Move the camera of a browser to a side, or behind the sensor."""
-        if event.client is None:
-            return
-        if event.target.value != "sensor":
-            self._page.look_from(event.client, event.target.value)
-            return
-        time_ns, step = 0.0 if self._time is None else self._time.value * 1e9, 0.02 * self._ends_ns
-        at = self._carrier(time_ns)
-        way = self._carrier(time_ns + step) - self._carrier(time_ns - step)
-        length = float(np.linalg.norm(way[:2]))
-        ahead = np.array([*way[:2] / length, 0.0]) if length > 1e-6 else np.array([1.0, 0.0, 0.0])
-        back = 5 * _BALL * self._size_m  # and up: it would hide everything
-        eye = at - back * ahead + [0.0, 0.0, back / 2]
-        place_eye(event.client, eye, at + 0.1 * self._size_m * ahead)
-
-    def _link(self, event: Any) -> None:
-        """Show a browser the link to its current view."""
-        if event.client is not None:
-            url = escape(self._page.link(event.client, self.choices))
-            self._link_text.content = (
-                '<div style="padding:0 0.8em;font-size:0.7em;word-break:break-all;'
-                f'user-select:all;max-height:6em;overflow-y:auto">{url}</div>'
-            )
+    def _actors(self) -> Sequence[Actor]:
+        return () if self.pictured is None else self.pictured.scene.actors
 
     @property
-    def choices(self) -> list[tuple[str, str]]:
-        """(name, value) of the current choices, for `choose`."""
-        values = {name: control.value for name, control in self._linked.items()}
-        chosen = [(n, v if isinstance(v, str) else f"{v:g}") for n, v in values.items()]
-        limits = self.cloud.filter.limits
-        return chosen + [("only", f"{name},{low!r},{high!r}") for name, low, high in limits]
+    def _duration_ns(self) -> float:
+        if self.pictured is not None and self.pictured.duration_ns:
+            return self.pictured.duration_ns
+        if self.sweeps is None or not len(self.sweeps):
+            return 0.0
+        begins = np.unique(self.sweeps.begins_ns)
+        return float(begins[-1] + (np.diff(begins).min() if len(begins) > 1 else 0))
 
-    def choose(self, choices: Sequence[tuple[str, str]]) -> None:
-        """Apply the choices of a link; invalid ones are ignored."""
-        wanted = Filter()
-        for name, value in choices:
-            control = self._linked.get(name)
-            with suppress(ValueError):
-                if name == "only":
-                    column, low, high = value.split(",")
-                    if column in self.cloud.columns:
-                        wanted = wanted.with_limits(column, (float(low), float(high)))
-                elif control is None:
-                    continue
-                elif not isinstance(control.value, str):
-                    control.value = min(max(control.min, float(value)), control.max)
-                elif value in control.options:
-                    control.value = value
-        self.cloud.set_filter(wanted)
+    def _names(self, column: str) -> Sequence[str]:
+        """Names of the values 0, 1, 2, … of a column, if any."""
+        if self.pictured is not None and column in self.columns:
+            return self.pictured.names_of(self.columns[column])
+        if self.sweeps is not None and column == "sensor":
+            return self.sweeps.sensors
+        if self.sweeps is not None and column == "object":
+            return (*self.sweeps.objects, *self.sweeps.actors)
+        return ()
 
-    def _save(self, event: Any) -> None:
-        if event.client is not None:
-            self._page.save_picture(event.client)
+    def _around(self) -> Bounds:
+        """Local origin and the box of all that is shown."""
+        if self.pictured is None:
+            return _of_points(self.points)
+        scene, planning = self.pictured.scene, self.pictured.planning
+        places = np.concatenate([scene.bounds, *(way.positions for way in self.pictured.sensors)])
+        low, high = places.min(axis=0), places.max(axis=0)
+        if planning is not None:
+            ends = np.array([planning.start, planning.target])
+            low[:2] = np.minimum(low[:2], ends.min(axis=0))
+            high[:2] = np.maximum(high[:2], ends.max(axis=0))
+        return scene.origin, np.stack([low, high])
 
-    def _add_actors(self) -> None:
+    # -- answers -------------------------------------------------------------------------
+
+    def answer(self, what: str, asked: Arguments, abandoned: Callable[[], bool]) -> Answer:
+        """Answer a question of the page."""
+        answers: Mapping[str, Callable[[Arguments, Callable[[], bool]], Answer]] = {
+            "state": lambda *_: self._state(),
+            "points": self._points,
+            "point": lambda asked, _: self._point(int(asked["row"])),
+            "column": lambda asked, _: self._column(asked["name"]),
+            "surface": lambda asked, _: self._scene(asked["colour"]),
+            "range": lambda asked, _: self._range(int(asked["sweep"])),
+        }
+        return answers[what](asked, abandoned)
+
+    def order(self, what: str) -> None:
+        """There is nothing to order."""
+        raise KeyError(what)
+
+    def _state(self) -> Answer:
+        """Tell all but points and surfaces."""
+        near = around_ways(self._bounds, ways_of(self.sensors, self._actors, self._duration_ns))
+        arrays: dict[str, NDArray[Any]] = {"rays": self.rays_shown}
+        for number, way in enumerate(self.sensors):
+            arrays[f"sensor{number}_times"] = way.times_ns / _NS
+            arrays[f"sensor{number}_places"] = way.positions
         for number, actor in enumerate(self._actors):
-            body = self._page.scene.add_mesh_simple(
-                f"/actors/{number}",
-                actor.mesh.vertices,
-                actor.mesh.faces,
-                flat_shading=True,
-                side="double",
-                cast_shadow=False,
-                receive_shadow=False,
-            )
-            self._bodies.append(body)
+            arrays |= _actor_arrays(f"actor{number}", actor, self._duration_ns)
+        if self.sweeps is not None:
+            arrays["sweep_scans"] = self.sweeps.scans.astype(np.float64)
+            arrays["sweep_begins"] = self.sweeps.begins_ns / _NS
+            arrays["sweep_sensor"] = self.sweeps.sensor
+        scene, pictured = None, self.pictured
+        if pictured is not None:
+            scene = list(colours_for(pictured.scene, pictured.reflectance))
+        objects = len(self._names("object"))
+        header = {
+            "title": self.title,
+            "version": self.version,
+            "points": 0 if self.points is None else len(self.points),
+            "columns": [
+                {"name": name, "unit": "s" if column.unit == "ns" else column.unit,
+                 "meaning": column.meaning} for name, column in self.columns.items()
+            ],
+            "origin": self.origin.tolist(),
+            "box": (self._bounds if near is None else near).tolist(),
+            "bounds": self._bounds.tolist(),
+            "cut": None if near is None else float(near[1, 2]),
+            "scene": scene,
+            "sensors": [
+                {"name": way.name, "model": way.model, "moves": way.moves} for way in self.sensors
+            ],
+            "actors": [{"name": actor.name} for actor in self._actors],
+            "actor_colours": as_bytes(object_colours(objects))[
+                objects - len(self._actors) :
+            ].tolist(),
+            "statics": objects - len(self._actors),
+            "duration": self._duration_ns / _NS,
+            "path": self.planned,
+            "note": self.note,
+        }  # fmt: skip
+        return header, arrays
 
-    def _add_poses(self) -> None:
-        """Show trajectories of moving sensors as lines, and positions of others as balls."""
-        for number, way in enumerate(self._sensors):
-            if way.moves and len(way.positions) > 1:
-                line = np.stack([way.positions[:-1], way.positions[1:]], axis=1)
-                self._page.scene.add_line_segments(
-                    f"/ways/{number}", line, _RED, thickness=3.0, thickness_units="screen"
-                )
-        standing = [place for way in self._sensors if not way.moves for place in way.positions]
-        if not standing:
-            return
-        count = min(len(standing), MOST_POSES)
-        some = np.array(standing)[np.linspace(0, len(standing) - 1, count).astype(np.int64)]
-        ball = trimesh.creation.icosphere(subdivisions=2, radius=_POSE * self._size_m)
-        self._page.scene.add_batched_meshes_simple(
-            "/poses",
-            ball.vertices,
-            ball.faces,
-            batched_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
-            batched_positions=some,
-            batched_colors=_RED,
-            lod="off",
-            cast_shadow=False,
-            receive_shadow=False,
-        )
+    @property
+    def rays_shown(self) -> NDArray[np.float32]:
+        """Not too many rays, (n, 2, 3)."""
+        return self.rays[:: len(self.rays) // MOST_RAYS + 1]
 
-    def _draw_path(self, path: Floats) -> None:
-        """Show a path, (n, 2) in metres, and its obstacles over the ground."""
-        scene, size = self._page.scene, self._size_m
-        corners = np.column_stack([path, np.full(len(path), self._ground + 0.004 * size)])
-        scene.add_line_segments(
-            "/path",
-            np.stack([corners[:-1], corners[1:]], axis=1),
-            _PATH,
-            thickness=4.0,
-            thickness_units="screen",
-        )
-        for name, at in (("start", corners[0]), ("target", corners[-1])):
-            scene.add_icosphere(f"/path/{name}", _END * size, _PATH, position=at, cast_shadow=False)
-            self._labels.put(name, at)
-        if self._planning is None:
-            return
-        height = 0.002 * size
-        for number, ((x, y), radius) in enumerate(
-            zip(self._planning.centres.tolist(), self._planning.radii.tolist(), strict=True)
-        ):
-            scene.add_cylinder(
-                f"/discs/{number}",
-                radius,
-                height,
-                _DISC,
-                radial_segments=48,
-                opacity=0.35,
-                cast_shadow=False,
-                receive_shadow=False,
-                position=(x, y, self._ground + height / 2),
-            )
+    @property
+    def planned(self) -> dict[str, Any] | None:
+        """The planned path and its obstacles, if there is one."""
+        if self.path is None or self.pictured is None:
+            return None
+        planning = self.pictured.planning
+        discs: list[Any] = []
+        if planning is not None:
+            discs = np.column_stack([planning.centres, planning.radii]).tolist()
+        return {"corners": self.path.tolist(), "discs": discs}
+
+    def _points(self, asked: Arguments, abandoned: Callable[[], bool]) -> Answer:
+        """Points for a filter, ranges of scans and a camera, and their colours."""
+        finder, version = self._finder, self.version
+        wanted = Filter.read(asked.get("filter", ""), list(self.columns))
+        name = asked["colour"]
+        column = self.columns[name]
+        if finder is None:
+            return {"version": version, "count": 0, "legend": None}, _nothing()
+        eye = Eye.read(asked["eye"]) if "eye" in asked else None
+        scans = _scans(asked["scans"]) if "scans" in asked else None
+        most = max(1, min(int(asked["most"]), MOST_POINTS))
+        rows, count = finder.find(most, wanted, scans, eye, abandoned)
+        colouring = self._colouring(finder, name, wanted, abandoned)
+        values = finder.points.values(name, rows)
+        colours = np.full((len(rows), 4), 255, np.uint8)
+        colours[:, :3] = as_bytes(colouring.paint(values))
+        legend: Legend = legend_of(colouring) | {"column": name, "meaning": column.meaning}
+        arrays: dict[str, NDArray[Any]] = {
+            "positions": (positions(finder.points, rows) - self.origin).astype(np.float32),
+            "colours": colours,
+            "rows": rows.astype(np.uint32),
+        }
+        return {"version": version, "count": count, "legend": legend}, arrays
+
+    def _colouring(
+        self, finder: PointFinder, name: str, wanted: Filter, abandoned: Callable[[], bool]
+    ) -> Colouring:
+        """Colour scale for all points that a filter keeps, whatever scans are shown."""
+        known = self._colourings
+        if (name, wanted) not in known:
+            rows, _ = finder.find(_SAMPLE, wanted, None, None, abandoned)
+            values = finder.points.values(name, rows)
+            known[name, wanted] = colours_of(values, self.columns[name], self._names(name))
+        return known[name, wanted]
+
+    def _sample(self, name: str) -> tuple[Rows, NDArray[Any]]:
+        """Rows of an evenly spaced sample and their finite values of a column."""
+        if self._finder is None:
+            return np.empty(0, np.int64), np.empty(0)
+        rows, _ = self._finder.find(_SAMPLE)
+        values = self._finder.points.values(name, rows)
+        known = np.isfinite(values)
+        return rows[known], values[known]
+
+    def _column(self, name: str) -> Answer:
+        """Tell what a column can be filtered by: its limits, or its labels."""
+        column = self.columns[name]
+        _, values = self._sample(name)
+        names, found = self._names(name), np.unique(values)
+        few = len(found) <= (_MOST_NAMES if names else MOST_ENTRIES) and name != "scan"
+        if column.kind == "label" and len(found) and few:
+            labels = [
+                [names[value] if 0 <= value < len(names) else f"{name} {value}", value]
+                for value in found.astype(np.int64).tolist()
+            ]
+            return {"labels": labels}, {}
+        unit = _NS if column.unit == "ns" else 1.0
+        low, high = (float(found[0]), float(found[-1])) if len(found) else (0.0, 1.0)
+        whole = values.dtype.kind in "iu" and unit == 1.0
+        return {"low": low / unit, "high": high / unit, "unit": unit, "whole": whole}, {}
+
+    def _point(self, row: int) -> Answer:
+        """Tell the position of a point, world coordinates, and all its columns in words."""
+        points = self.points
+        if points is None or not 0 <= row < len(points):
+            raise KeyError(row)
+        one = np.array([row])
+        shown = [
+            [column.name, self._in_words(column, points.values(column.name, one)[0])]
+            for column in self.columns.values()
+            if column not in POSITION
+        ]
+        place = [float(points.values(axis, one)[0]) for axis in AXES]
+        return {"place": place, "columns": shown}, {}
+
+    def _in_words(self, column: Column, value: Any) -> str:
+        names = self._names(column.name)
+        if column.kind == "label" and 0 <= value < len(names):
+            return names[int(value)] or str(value)
+        if column.unit == "ns":
+            return f"{int(value) / 1e9:.9f} s"
+        number = f"{value:.6g}" if np.issubdtype(type(value), np.floating) else f"{value}"
+        return f"{number} {column.unit}".rstrip()
+
+    def _scene(self, colour: str) -> Answer:
+        """Triangles of the scene in their colours; where its floor is, and where to cut it open."""
+        pictured = self.pictured
+        if pictured is None:
+            raise KeyError("surface")
+        with self._lock:  # one browser after the other: it may take long, once
+            surface = self._surface = self._surface or Surface(pictured.scene, pictured.reflectance)
+        counts, places = np.zeros(len(pictured.scene.faces)), np.zeros((0, 3), np.float32)
+        if colour == "hits":
+            counts = counts if self.hits is None else np.asarray(self.hits())
+            places = self._on_statics()
+        arrays, legend = surface.coloured(colour, counts, places)
+        arrays["objects"] = arrays["objects"].astype(np.int32)
+        return {"legend": legend} | self._look_around, arrays
+
+    @cached_property
+    def _look_around(self) -> dict[str, float | None]:
+        """Height of the floor; and where to cut a building if the sensors stand in one."""
+        surface, pictured = self._surface, self.pictured
+        poses = [way.positions for way in self.sensors if len(way.positions)]
+        if surface is None or pictured is None or not poses:
+            return {"floor": None, "roof_cut": None}
+        places = np.concatenate(poses)
+        floor, roof = floor_and_roof(surface.coarse, places)
+        if roof is not None:
+            top = float(places[:, 2].max())
+            roof = top + CUT * (roof - top)
+        return {"floor": floor, "roof_cut": roof}
+
+    def _on_statics(self) -> NDArray[np.float32]:
+        """Positions (n, 3) of some points on static objects, local."""
+        if self._finder is None or self.pictured is None:
+            return np.zeros((0, 3), np.float32)
+        rows, _ = self._finder.find(_HITS_SAMPLE)
+        if "object" in self.columns:
+            owners = self._finder.points.values("object", rows)
+            rows = rows[within(owners, (0, len(self.pictured.scene.names) - 1))]
+        return (positions(self._finder.points, rows) - self.origin).astype(np.float32)
+
+    def _range(self, sweep: int) -> Answer:
+        """Range image of a sweep: rows are channels from above, columns go from left to right."""
+        sweeps, finder = self.sweeps, self._finder
+        if sweeps is None or not 0 <= sweep < len(sweeps):
+            raise KeyError(sweep)
+        first, last = (int(scan) for scan in sweeps.scans[sweep : sweep + 2])
+        rows = np.empty(0, np.int64)
+        if finder is not None:
+            rows, _ = finder.find(MOST_POINTS, scans=((first, last - 1),))
+        image = np.zeros((1, 1, 4), np.uint8)
+        limits = (0.0, 1.0)
+        if len(rows) and finder is not None:
+            places = sweeps.in_sensor(sweep, positions(finder.points, rows))
+            channels = None
+            if "channel" in self.columns:
+                channels = finder.points.values("channel", rows).astype(np.int64)
+            number = int(sweeps.sensor[sweep])
+            ranges = np.linalg.norm(places, axis=1)
+            if number not in self._range_limits:  # one scale for all sweeps of a sensor
+                low, high = np.percentile(ranges, [1, 99])
+                self._range_limits[number] = float(low), float(high)
+            limits = self._range_limits[number]
+            image = range_image(places, ranges, channels, limits)
+        header = {"low": limits[0], "high": limits[1], "sensor": int(sweeps.sensor[sweep])}
+        return header, {"image": image}
 
 
-def _whole(pictured: Pictured | None, poses: Floats) -> tuple[Floats, Floats]:
-    """Local origin, and the box (2, 3) around scene, sensors at (p, 3) and ends of the path."""
-    assert pictured is not None
-    places = np.concatenate([pictured.scene.bounds, poses])
-    low, high = places.min(axis=0), places.max(axis=0)
-    if pictured.planning is not None:
-        ends = np.array([pictured.planning.start, pictured.planning.target])
-        low[:2] = np.minimum(low[:2], ends.min(axis=0))
-        high[:2] = np.maximum(high[:2], ends.max(axis=0))
-    return pictured.scene.origin, np.stack([low, high])
+def range_image(
+    places: Floats,
+    ranges: Floats,
+    channels: NDArray[np.int64] | None,
+    limits: tuple[float, float],
+) -> NDArray[np.uint8]:
+    """Range image of points in their sensor's axes, RGBA (rows, columns, 4), the nearest ahead.
+
+    Rows are channels, the highest above, or steps of elevation if the sensor has few or very
+    many. Columns are steps of azimuth from left to right. Empty pixels are transparent.
+    """
+    azimuth = np.arctan2(places[:, 1], places[:, 0])
+    left, right = float(azimuth.max()), float(azimuth.min())
+    if left - right > _NARROW:
+        left, right = math.pi, -math.pi
+    if channels is not None and _FEW <= (count := int(channels.max()) + 1) <= _MANY:
+        line = count - 1 - channels
+    else:
+        elevation = np.arcsin(places[:, 2] / np.maximum(ranges, 1e-9))
+        span = float(np.ptp(elevation)) or 1.0
+        count = _IMAGE_ROWS
+        line = ((elevation.max() - elevation) * ((count - 1) / span)).astype(np.int64)
+    width = int(np.clip(np.bincount(line).max() * (2 * math.pi / _NARROW), 32, _IMAGE_WIDTH))
+    across = ((left - azimuth) * (width / max(left - right, 1e-9))).astype(np.int64)
+    image = np.zeros((count, width, 4), np.uint8)
+    order = np.argsort(-ranges, kind="stable")  # the nearest is written last
+    low, high = limits
+    shade = np.clip((ranges - low) / max(high - low, 1e-9), 0, 1)
+    colours = np.full((len(ranges), 4), 255, np.uint8)
+    colours[:, :3] = as_bytes(mapped("viridis_r", shade))
+    image[line[order], np.minimum(across, width - 1)[order]] = colours[order]
+    return image
+
+
+def _of_points(points: Points | None) -> Bounds:
+    """Origin in whole metres near the points, and their box without a few outliers."""
+    places = np.empty((0, 3))
+    if points is not None:
+        rows, _ = PointFinder(points, np.zeros(3)).find(_SAMPLE)
+        places = positions(points, rows)
+    if not len(places):
+        return np.zeros(3), np.array([[-1.0, -1.0, 0.0], [1.0, 1.0, 1.0]])
+    box = np.percentile(places, [0.5, 99.5], axis=0)
+    origin = np.where(np.abs(box[0]) > 10_000, np.round(box[0]), 0.0)
+    return origin, box - origin
+
+
+def _actor_arrays(name: str, actor: Actor, duration_ns: float) -> dict[str, NDArray[Any]]:
+    """Mesh of an actor, and its poses over time."""
+    times = np.linspace(0, max(duration_ns, 1.0), _ACTOR_PLACES)
+    places, rotations = actor.trajectory.poses(0, times)
+    turns = np.eye(3)[None].repeat(len(times), axis=0) if rotations is None else rotations
+    return {
+        f"{name}_corners": actor.mesh.vertices[actor.mesh.faces].astype(np.float32),
+        f"{name}_times": times / _NS,
+        f"{name}_places": places,
+        f"{name}_turns": quaternions_of(turns),
+    }
+
+
+def _scans(text: str) -> Scans:
+    """Read ranges of scans, ``first-last,first-last``."""
+    pairs = (entry.split("-") for entry in text.split(",") if entry)
+    return tuple((int(first), int(last)) for first, last in pairs)
+
+
+def _nothing() -> dict[str, NDArray[Any]]:
+    return {
+        "positions": np.zeros((0, 3), np.float32),
+        "colours": np.zeros((0, 4), np.uint8),
+        "rows": np.zeros(0, np.uint32),
+    }

@@ -38,6 +38,8 @@ class Colouring:
         Whether the scale is.
     labels
         (name, colour): existing labels, those with most points first if there are many.
+    values
+        Values of the column that the labels stand for.
     paint
         Returns colours (m, 3) of other values (m,) of the column on the same scale.
     """
@@ -49,6 +51,7 @@ class Colouring:
     limits: tuple[float, float] | None = None
     logarithmic: bool = False
     labels: tuple[tuple[str, NDArray[np.float64]], ...] = ()
+    values: tuple[int, ...] = ()
     paint: Callable[[NDArray[Any]], NDArray[np.float64]] = field(
         default=lambda values: np.full((len(values), 3), _GREY), repr=False
     )
@@ -85,8 +88,9 @@ def colours_of(values: NDArray[Any], column: Column, names: Sequence[str] = ()) 
                 return np.asarray(palette[values.astype(np.int64) % len(palette)])
 
             return Colouring(
-                label(values), column.name, "", column.meaning, labels=labels, paint=label
-            )
+                label(values), column.name, "", column.meaning, labels=labels,
+                values=tuple(found.tolist()), paint=label,
+            )  # fmt: skip
         spread = (0, 100)
     known, unit, size = np.isfinite(values), column.unit, 1.0
     middle, low, high = 0.5, 0.0, 1.0

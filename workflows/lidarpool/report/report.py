@@ -15,9 +15,9 @@ import numpy as np
 from .._version import __version__
 from ..base.task_book import StageTotals, union
 from ..columns.storage import Storage
+from ..pipeline import COLLECT, EXPORT, GENERATE, INTERSECT, SORT
 from ..run.result import RunResult
 from ..run.trials import TRIAL
-from ..scan import COLLECT, EXPORT, GENERATE, INTERSECT, SORT
 from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
 from .cloud_numbers import CountedCloud

@@ -16,15 +16,13 @@ from raybeam import available_backends
 
 from .._version import __version__
 from ..base.errors import LidarpoolError
-from ..base.interrupts import deferred_interrupts
 from ..base.software import difference, software, software_there
-from ..base.words import did_you_mean
-from ..scan import COLLECT, GENERATE, GPU, LIDAR, OTHER, SORT
+from ..pipeline import COLLECT, GENERATE, GPU, LIDAR, OTHER, SORT
 from ..scene.scene import Scene
 from ..sensor import Survey
+from ..simulator.world import AUTO_TAKES
 from .waiting import Waiting
 
-AUTO_TAKES = "Backend 'auto' takes one that works."
 LOOK_EVERY_S = 0.2
 _ALL_LEFT = "The workers of partition 'GPU' left before the run started: their logs say why."
 
@@ -48,20 +46,6 @@ def check_precision(scene: Scene, survey: Survey) -> None:
         raise LidarpoolError(
             f"precision_m {survey.precision_m} is too fine for a scene that reaches {reach:.0f} m "
             f"from its origin: use at least {reach / 2**31:.2g}."
-        )
-
-
-def check_backend_here(wanted: str, advice: str = AUTO_TAKES) -> None:
-    """Refuse a backend that this machine lacks, before a local cluster is started for it."""
-    # An interrupt during the import of an extension module would look like a missing one.
-    with deferred_interrupts():
-        backends = {"auto": "", **available_backends()}
-    if wanted not in backends:
-        hint = did_you_mean(wanted, backends) or f" There are {', '.join(backends)}."
-        raise LidarpoolError(f"There is no backend {wanted!r}.{hint}")
-    if backends[wanted]:
-        raise LidarpoolError(
-            f"Backend {wanted!r} cannot be used here: {backends[wanted]}. {advice}"
         )
 
 

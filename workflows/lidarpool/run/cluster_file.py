@@ -19,7 +19,7 @@ from ..base.errors import LidarpoolError
 from ..base.interrupts import deferred_interrupts
 from ..base.words import counted, did_you_mean
 from ..base.yamlfile import read_yaml
-from ..scan import GPU, LIDAR, OTHER
+from ..pipeline import GPU, LIDAR, OTHER
 from ..scenario.validation_errors import validation_errors
 
 # A scheduler that SSH has started outlives a driver that was killed: it ends when it has been

@@ -1,4 +1,4 @@
-"""Clients of clusters: of one on this machine that is started for it, or of one that is there."""
+"""Clients for a local cluster started for the run, or for an existing cluster."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def local_client(
                 lidar_slots=2 + collectors,
                 other_workers=other_workers if planning or other_workers else 0,
                 security=tls,
-                dashboard_port=None,  # nobody is told of it, and Bokeh takes half a second
+                dashboard_port=None,  # its address is never printed, and Bokeh takes half a second
             )
             stack.callback(cluster.close)
             client = stack.enter_context(Client(cluster, set_as_default=False))

@@ -53,7 +53,7 @@ class Job:
     def __post_init__(self) -> None:
         MaterialTable.of(self.survey.materials, self.scene.all_names)  # that they fit
         for actor in self.scene.actors:
-            actor.check(self.survey.duration_ns)
+            actor.check(0.0, self.survey.duration_ns)
         check_precision(self.scene, self.survey)
         limits = {"queue_capacity": 1, "collectors": 1, "wait_s": 0, "patience_s": 0}
         for name, least in limits.items():

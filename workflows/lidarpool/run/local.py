@@ -11,7 +11,7 @@ import poolpart
 from poolpart.local import check_count
 from poolpart.probe import visible_gpus
 
-from ..scan import GPU, LIDAR, OTHER
+from ..pipeline import GPU, LIDAR, OTHER
 
 
 def usable_cores() -> int:

@@ -17,8 +17,8 @@ from ..base.errors import LidarpoolError
 from ..base.software import call_alike, software
 from ..base.task_book import TaskBook
 from ..export.pieces import RangeWriter, Span, Written
-from ..scan import EXPORT, LIDAR, Watch
-from ..scan.failures import raise_if_failed
+from ..pipeline import EXPORT, LIDAR, Watch
+from ..pipeline.failures import raise_if_failed
 from .result import RunResult
 
 LOOK_EVERY_S = 0.01

@@ -1,8 +1,8 @@
 """The database of a run that is kept in storage which is no disk, such as an object store.
 
 SQLite writes to disks only, so the database is in a temporary folder of the driver, and a copy of
-it is put into the storage every few seconds. Whoever goes on from a copy casts again what was
-committed after it; the parts of that are in no database, and are removed in the end.
+it is put into the storage every few seconds. A run resumed from a copy recasts what was committed
+after it. No database names the parts of those scans; they are removed at the end.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 
 from ..base.errors import LidarpoolError
 from ..columns.storage import Storage
-from ..scan.database import FILE, RunDatabase
+from ..pipeline.database import FILE, RunDatabase
 
 OWNER = "run.owner"  # the mark of the run that may write the copy
 COPY_EVERY_S = 5.0
@@ -25,8 +25,8 @@ COPY_REST = 20  # a copy that takes a second is followed by none for so many sec
 class RemoteRun:
     """A run in storage: copies of its database, and who may write them.
 
-    A run that goes on from what another has left takes it over. Should that be alive after all,
-    it finds out before its next copy, and ends.
+    A resumed run takes over what an earlier run left. If the earlier run is still alive, it detects
+    this before its next copy, and ends.
 
     Parameters
     ----------
@@ -74,12 +74,11 @@ class RemoteRun:
         with self._explained():
             try:
                 self.lost = self.storage.read(OWNER) != self._mark
-            except FileNotFoundError:  # a later one was done with it
+            except FileNotFoundError:  # a later run has finished and deleted it
                 self.lost = True
         if self.lost:
             raise LidarpoolError(
-                f"Another run, which was started later, goes on with what is in {self.storage.url} "
-                "or has dropped it: this one has ended."
+                f"A later run has taken over or deleted {self.storage.url}: this one has ended."
             )
 
     @contextmanager

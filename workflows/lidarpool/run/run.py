@@ -22,8 +22,7 @@ from poolpart import (
 
 from ..base.errors import LidarpoolError
 from ..base.task_book import TaskBook
-from ..plan import best
-from ..scan import (
+from ..pipeline import (
     GPU,
     LIDAR,
     OTHER,
@@ -32,6 +31,7 @@ from ..scan import (
     SurveyDriver,
     Watch,
 )
+from ..plan import best
 from .checks import find_workers, gpu_note
 from .progress import Progress
 from .result import RunResult

@@ -23,9 +23,9 @@ from ..columns.cloud import Cloud
 from ..columns.parts import StoredCloud, mark_name, own_files, read_part, read_tally, unpack
 from ..columns.storage import Storage, is_url
 from ..export.sweeps import Sweeps
-from ..scan.database import FILE, RunDatabase, parts_folder, read_place
-from ..scan.messages import Receipt, samples_of_scan, summary_type
-from .checks import AUTO_TAKES
+from ..pipeline.database import FILE, RunDatabase, parts_folder, read_place
+from ..pipeline.messages import Receipt, samples_of_scan, summary_type
+from ..simulator.world import AUTO_TAKES
 from .identity import difference, identity_of
 from .job import Job
 from .progress import Progress

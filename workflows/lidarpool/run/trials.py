@@ -14,8 +14,8 @@ from poolpart import Partition, fetch_available, look_for_tasks, recorded
 from ..base.errors import LidarpoolError
 from ..base.software import call_alike
 from ..base.task_book import TaskBook
+from ..pipeline.failures import was_killed
 from ..plan import Planning, Trial, run_trial
-from ..scan.failures import was_killed
 
 TRIAL = "trial"
 ROUNDS_MOST = 3  # submissions of a trial whose workers die

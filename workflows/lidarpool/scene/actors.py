@@ -7,12 +7,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..base.arguments import checked_fields
 from ..base.errors import LidarpoolError
-from ..sensor import Trajectory
+from ..sensor import Stations, Trajectory
+from ..sensor.trajectory import CENTRE
 from .mesh import Mesh
+
+_AT_ZERO = Stations((CENTRE,))
 
 
 @dataclass(frozen=True, eq=False)
+@checked_fields
 class Actor:
     """A moving object.
 
@@ -22,11 +27,11 @@ class Actor:
         Its triangles in its own axes (x ahead, z up), and its name.
     trajectory
         Poses of its axes, in the scene's local coordinates; its only station begins with the
-        survey.
+        survey. By default it stands at zero, until `Scanner.move` moves it.
     """
 
     mesh: Mesh
-    trajectory: Trajectory
+    trajectory: Trajectory = _AT_ZERO
 
     @property
     def name(self) -> str:
@@ -39,15 +44,15 @@ class Actor:
         vertices = self.mesh.vertices if rotations is None else self.mesh.vertices @ rotations[0].T
         return Mesh(self.name, vertices + positions[0], self.mesh.faces)
 
-    def check(self, duration_ns: float) -> None:
-        """Check that its trajectory covers a survey; LidarpoolError if not."""
+    def check(self, begin_ns: float, end_ns: float) -> None:
+        """Check that its trajectory covers a time; LidarpoolError if not."""
         try:
-            self.trajectory.poses(0, np.array([0.0, duration_ns]))
+            self.trajectory.poses(0, np.array([begin_ns, end_ns], np.float64))
         except LidarpoolError as error:
             words = str(error).rstrip(".")
             raise LidarpoolError(
-                f"Actor {self.name!r}: {words}: let its trajectory begin before the survey and end "
-                "after it."
+                f"Actor {self.name!r}: {words}: let its trajectory begin before the first scan and "
+                "end after the last."
             ) from error
 
 

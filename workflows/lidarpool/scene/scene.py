@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -178,6 +179,24 @@ class Scene:
             names=unique_names([mesh.name for mesh in parts]),
             origin=origin,
         )
+
+    def with_actors(self, actors: Iterable[Actor]) -> Scene:
+        """Return the same scene with other actors; the triangles are not copied.
+
+        Raises
+        ------
+        LidarpoolError
+            If something is no actor.
+        """
+        found = tuple(actors)
+        for actor in found:
+            if not isinstance(actor, Actor):
+                raise LidarpoolError(
+                    f"actors holds {shown(actor)}; each must be an Actor(mesh, trajectory)."
+                )
+        scene = copy(self)
+        object.__setattr__(scene, "actors", found)
+        return scene
 
     @property
     def all_names(self) -> tuple[str, ...]:

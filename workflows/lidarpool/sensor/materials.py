@@ -65,7 +65,7 @@ class Material:
         check_numbers(self, {"reflectance": (0, 1), "semantic_class": (0, 65_535)})
 
     def named(self, name: str) -> bool:
-        """Whether an object is made of it."""
+        """Whether this material applies to an object."""
         return any(name == pattern or fnmatchcase(name, pattern) for pattern in self.objects)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.arguments import checked_fields
-from ..base.counted import normal, uniform
+from .counted import normal, uniform
 from .materials import at_right_angles
 from .optics import check_numbers
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..base.arguments import checked, checked_fields
 from ..base.errors import LidarpoolError
@@ -148,6 +149,55 @@ class Sensor:
         Successive steps have no gap or overlap; numbers continue from turn to turn.
         """
         return self.head.firings(step)
+
+    def turns(self, steps: ArrayLike) -> NDArray[np.int64]:
+        """Return the number of the turn, or frame, in which each time step (k,) begins: (k,).
+
+        A head without `rate_hz`, which may be a user's, has a turn in each step.
+        """
+        numbers = np.asarray(steps, np.int64)
+        rate_hz = getattr(self.head, "rate_hz", None)
+        if rate_hz is None:
+            return numbers
+        begins = self.begins_ns(np.array([self.firings(step)[0] for step in numbers.tolist()]))
+        turn = np.floor((begins - self.start_ns) * (rate_hz / 1e9) + 1e-6)
+        return turn.astype(np.int64)
+
+    def turn_ns(self, number: int) -> float:
+        """Return when a turn, or frame, begins, nanoseconds since the head started."""
+        rate_hz = getattr(self.head, "rate_hz", None)
+        if rate_hz is not None:
+            return float(number * 1e9 / rate_hz)
+        return float(self.head.times_ns(np.array([self.firings(number)[0]]))[0])
+
+    def steps_of_turn(self, number: int) -> range:
+        """Time steps of a turn, or frame.
+
+        Examples
+        --------
+        >>> Sensor.grid(step_deg=10).steps_of_turn(2)
+        range(72, 108)
+        """
+        first, stop = (self._first_step(n, self._steps_in_turn) for n in (number, number + 1))
+        return range(first, stop)
+
+    @cached_property
+    def _steps_in_turn(self) -> int:
+        return self._first_step(1, 1)
+
+    def _first_step(self, number: int, each: int) -> int:
+        """Find the first time step of a turn, if `each` turn has about so many."""
+
+        def turn(step: int) -> int:
+            return int(self.turns([step])[0])
+
+        low = high = number * each
+        back = ahead = 1
+        while low and turn(low) >= number:
+            low, back = max(0, low - back), 2 * back
+        while turn(high) < number:
+            high, ahead = high + ahead, 2 * ahead
+        return bisect_left(range(high + 1), number, lo=low, key=turn)
 
     def directions(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
         """Make the unit directions of firings (k,), in the sensor's axes: (k, channels, 3)."""

@@ -15,10 +15,10 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from ...base.words import counted
+from ...pipeline import COLLECT, EXPORT, GENERATE, INTERSECT, SORT
 from ...render.page import shortened, without_common_prefix
 from ...run.result import RunResult
 from ...run.trials import TRIAL
-from ...scan import COLLECT, EXPORT, GENERATE, INTERSECT, SORT
 from ...scenario.scenario import Scenario
 from ..cloud_numbers import CountedCloud
 from . import words

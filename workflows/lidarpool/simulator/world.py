@@ -7,24 +7,43 @@ axes of each pose selects them.
 
 from __future__ import annotations
 
+from copy import copy
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from raybeam import Pattern, RayCaster, ScanReturns
+from raybeam import Pattern, RayCaster, ScanReturns, available_backends
 
+from ..base.errors import LidarpoolError
+from ..base.interrupts import deferred_interrupts
+from ..base.words import did_you_mean
 from ..scene.actors import Actor
 from ..scene.scene import Scene
-from ..sensor import Sensor
+from ..sensor import Sensor, Trajectory
 from .motion import Poses, into_axes
 
+AUTO_TAKES = "Backend 'auto' takes one that works."
 CELL_RAYS = 1 << 10  # rays in a cell of a still sensor, which are fired at nearly one time
 CELLS = 64  # cells that share one look at an actor's trajectory
 NEAR_M = 1.0  # rays of a cell start no farther than this from its position
 TURN = 2e-3  # radians: rays of a cell deviate at most so much from the pattern in its pose
 
 Float = NDArray[np.float64]
+
+
+def check_backend_here(wanted: str, advice: str = AUTO_TAKES) -> None:
+    """Refuse a backend that this machine lacks, before a local cluster is started for it."""
+    # An interrupt during the import of an extension module would look like a missing one.
+    with deferred_interrupts():
+        backends = {"auto": "", **available_backends()}
+    if wanted not in backends:
+        hint = did_you_mean(wanted, backends) or f" There are {', '.join(backends)}."
+        raise LidarpoolError(f"There is no backend {wanted!r}.{hint}")
+    if backends[wanted]:
+        raise LidarpoolError(
+            f"Backend {wanted!r} cannot be used here: {backends[wanted]}. {advice}"
+        )
 
 
 class World:
@@ -51,6 +70,19 @@ class World:
             self._actors.append(_Cast(actor, faces, options))
             faces += len(actor.mesh.faces)
         self._faces = faces
+
+    @property
+    def backend(self) -> str:
+        """Name of the backend in use."""
+        return self._caster.backend
+
+    def with_actors(self, actors: tuple[Actor, ...]) -> World:
+        """Return the same world with other trajectories of the actors; the trees are shared."""
+        world = copy(self)
+        world._actors = [
+            cast.on(actor.trajectory) for cast, actor in zip(self._actors, actors, strict=True)
+        ]
+        return world
 
     def scan(
         self,
@@ -198,6 +230,12 @@ class _Cast:
         self._caster = RayCaster(vertices, actor.mesh.faces, **options)
         self._centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
         self.radius = float(np.linalg.norm(vertices - self._centre, axis=1).max())
+
+    def on(self, way: Trajectory) -> _Cast:
+        """Return the same actor on another trajectory."""
+        other = copy(self)
+        other._way = way
+        return other
 
     def centre(self, times: Float) -> Float:
         """Centre of its bounding sphere, of `radius`, at times (m,): (m, 3)."""

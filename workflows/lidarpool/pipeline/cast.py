@@ -11,11 +11,11 @@ from poolpart import Recorder, TaskRecord
 
 from ..base.tracing import trace
 from ..columns.parts import PartColumns
+from ..simulator.returns import BatchReturns, columns_of
 from .failures import naming_scans
 from .messages import samples_of_scan, summary_type
 from .names import GPU, INTERSECT
-from .returns import BatchReturns
-from .rig import rig_of
+from .rigs import rig_of
 
 
 @dataclass(frozen=True)
@@ -63,31 +63,11 @@ def intersect(handle: str, first: int, stop: int, run: str = "") -> CastBatch:
     with naming_scans(first, stop - 1):
         found = list(rig.cast(first, stop))
         trace("intersect.cast", run=run, stage=INTERSECT, scans=scans)
-        part = _part(first, found)
+        part = columns_of(found)
         summaries = np.concatenate([_summaries(returns) for returns in found])
     batch = CastBatch(part, summaries, recorder.done(stop - first))
     trace("intersect.end", run=run, stage=INTERSECT, scans=scans)
     return batch
-
-
-def _part(first: int, found: list[BatchReturns]) -> PartColumns:
-    columns = {
-        column.name: _joined([column.make(returns) for returns in found])
-        for column in found[0].survey.stored_columns
-    }
-    tally = np.sum([np.asarray(returns.found.tally) for returns in found], axis=0)
-    triangles = np.flatnonzero(tally)
-    return PartColumns(
-        first,
-        _joined([returns.counts for returns in found]),
-        columns,
-        triangles.astype(np.int32),
-        tally[triangles].astype(np.int64),
-    )
-
-
-def _joined(arrays: list[NDArray]) -> NDArray:  # type: ignore[type-arg]
-    return np.ascontiguousarray(arrays[0]) if len(arrays) == 1 else np.concatenate(arrays)
 
 
 def _summaries(returns: BatchReturns) -> NDArray[np.void]:

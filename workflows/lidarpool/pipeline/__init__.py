@@ -3,7 +3,7 @@
 from .driver import SurveyDriver
 from .messages import Frame, Receipt
 from .names import COLLECT, EXPORT, GENERATE, GPU, INTERSECT, LIDAR, OTHER, SORT
-from .rig import RigPlan
+from .rigs import RigPlan
 from .watch import Watch
 
 __all__ = [

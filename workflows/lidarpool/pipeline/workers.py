@@ -15,7 +15,7 @@ from poolpart import Partition, Whereabouts, fetch_available, look_for_tasks
 from ..base.errors import LidarpoolError
 from ..base.software import difference, software_there
 from .failures import raise_if_failed, was_killed, words_on_memory
-from .rig import RigPlan, drop_rig
+from .rigs import RigPlan, drop_rig
 
 LOOK_EVERY_S = 1.0
 SETUP_DEATHS = 4  # workers in a row that may die while they prepare themselves
@@ -215,7 +215,7 @@ def _preparation(backend: str, wanted: dict[str, str]) -> Callable[[str, bytes],
         slots = {name: int(count) for name, count in worker.state.total_resources.items()}
         here = software()
         if here == wanted:
-            from lidarpool.scan.rig import set_up
+            from lidarpool.pipeline.rigs import set_up
 
             set_up(handle, packed)
         return {"worker": str(worker.name), "software": here, "slots": slots}

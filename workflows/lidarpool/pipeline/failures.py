@@ -10,7 +10,7 @@ from distributed import Client, Future, KilledWorker
 from poolpart import WorkerLeft
 
 from ..base.errors import LidarpoolError
-from .rig import RigMissing
+from .rigs import RigMissing
 
 ASK_S = 10.0  # for an error's text, which the scheduler has
 

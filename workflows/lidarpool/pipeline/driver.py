@@ -44,7 +44,7 @@ from .failures import raise_if_failed, rig_is_missing, was_killed, words_on_memo
 from .long_stages import LongStages, Work
 from .messages import Frame, Receipt, samples_of_scan, summary_type
 from .names import COLLECT, GENERATE, GPU, INTERSECT, LIDAR, SORT
-from .rig import RigPlan
+from .rigs import RigPlan
 from .stages import collect, generate, sort_frames
 from .workers import CastingWorkers
 

@@ -45,13 +45,14 @@ class Clock:
 
 @dataclass(frozen=True)
 class Poses:
-    """Poses of rays for `RayCaster.scan`."""
+    """Poses of rays for `RayCaster.scan`: of the sensor's head, or else of its carrier."""
 
     positions: Float
     rotations: Float | None = None
     rays_per_pose: int | None = None
     motion: Motion | None = None
     clock: Clock | None = None
+    by_head: bool = False
 
     @cached_property
     def given(self) -> dict[str, Any]:
@@ -81,7 +82,14 @@ class Poses:
             late = np.repeat(motion.delays, subrays)
             motion = Motion(late, motion.velocities[poses], motion.rates[poses])
         rotations = None if self.rotations is None else self.rotations[poses]
-        return Poses(self.positions[poses], rotations, each * subrays, motion, clock)
+        return replace(
+            self,
+            positions=self.positions[poses],
+            rotations=rotations,
+            rays_per_pose=each * subrays,
+            motion=motion,
+            clock=clock,
+        )
 
     def rays(
         self, pattern: Pattern, ray: NDArray[np.integer[Any]], start: int = 0
@@ -103,7 +111,7 @@ def check_trajectory(path: Trajectory) -> None:
 
 
 def poses_of_firings(
-    carried: Mounted, path: Trajectory, station: int, first: int, stop: int
+    carried: Mounted, path: Trajectory, station: int, first: int, stop: int, late_ns: float = 0.0
 ) -> Poses:
     """Poses of a sensor's beams in firings `first` to `stop`.
 
@@ -113,11 +121,12 @@ def poses_of_firings(
     Later beams of a firing start from the carrier's position at their time: it moves evenly from
     each firing to the next. A pose for each beam would cost as much as casting it.
 
-    There is no motion if the carrier stands, or if all beams of a firing are fired at once.
+    There is no motion if the carrier stands, or if all beams of a firing are fired at once. The
+    carrier is where it is `late_ns` nanoseconds after the firings' own times.
     """
     sensor = carried.sensor
     firings = np.arange(first, stop + 1, dtype=np.int64)
-    times = np.minimum(sensor.begins_ns(firings) + sensor.lead_ns, path.duration_ns)
+    times = np.minimum(sensor.begins_ns(firings) + sensor.lead_ns + late_ns, path.duration_ns)
     positions, turns = path.poses(station, times)
     positions = raybeam.poses.by_number(positions)
     turns = np.broadcast_to(np.eye(3), (len(times), 3, 3)) if turns is None else turns
@@ -139,12 +148,21 @@ def poses_of_firings(
         places = places + into_axes(centre, rotations.transpose(0, 2, 1))
     delays = (sensor.beams.time_ns - sensor.lead_ns) / 1e9
     if not path.moves or not delays.any():
-        return Poses(places, rotations, sensor.channels)
+        return Poses(places, rotations, sensor.channels, by_head=spins is not None)
     seconds = np.diff(times)[:, None] / 1e9
     seconds[seconds == 0] = np.inf  # a last firing at the very end: it stands
     velocities = np.diff(positions, axis=0) / seconds
     rates = _turned_by(turns[:-1], turns[1:]) / seconds
-    return Poses(places, rotations, sensor.channels, Motion(delays, velocities, rates))
+    motion = Motion(delays, velocities, rates)
+    return Poses(places, rotations, sensor.channels, motion, by_head=spins is not None)
+
+
+def turned(vectors: Float, rotation: Float | None) -> Float:
+    """Rotate vectors (n, 3) by a matrix, with a fixed order of rounding, unlike BLAS."""
+    if rotation is None:
+        return vectors
+    x, y, z = vectors.T
+    return np.stack([(x * a + y * b) + z * c for a, b, c in rotation], axis=1)
 
 
 def into_axes(vectors: Float, rotations: Float | None) -> Float:

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from raybeam import Pattern, ScanReturns
 
-from ..sensor import ScanSpec
+from ..columns.parts import PartColumns
+from ..scene.scene import Scene
+from ..sensor import ScanSpec, Survey
 from ..sensor.materials import at_right_angles
 from .echoes import Echoes
-from .motion import Poses
-
-if TYPE_CHECKING:
-    from .rig import Rig
+from .motion import Poses, turned
+from .surfaces import Surfaces
 
 
 class BatchReturns:
@@ -27,8 +26,8 @@ class BatchReturns:
 
     Parameters
     ----------
-    rig
-        Sensor, scene and survey.
+    scene, survey, surfaces
+        The scene, the survey, and the scene's surfaces.
     specs
         The scans; the firings of each follow those of the one before.
     found
@@ -41,20 +40,21 @@ class BatchReturns:
 
     def __init__(
         self,
-        rig: Rig,
+        scene: Scene,
+        survey: Survey,
+        surfaces: Surfaces,
         specs: list[ScanSpec],
         found: ScanReturns,
         pattern: Pattern,
         start: int,
         poses: Poses,
     ) -> None:
-        self.scene, self.survey = rig.scene, rig.survey
-        self.carried = rig.survey.carried[specs[0].sensor]
+        self.scene, self.survey = scene, survey
+        self.carried = survey.carried[specs[0].sensor]
         self.sensor = self.carried.sensor
         self.specs, self.found = specs, found
         self.echoes = found if isinstance(found, Echoes) else None
-        self._surfaces = rig.surfaces
-        self._by_head = rig.by_head[specs[0].sensor]
+        self._surfaces = surfaces
         self._pattern, self._start = pattern, start
         self._poses = poses
 
@@ -187,7 +187,7 @@ class BatchReturns:
         ends = self._pattern.directions[self._rows] * self.range[:, None]
         if origins is not None:
             ends += origins[self._rows]
-        if not self._by_head:
+        if not self._poses.by_head:
             ends -= self.carried.mount.position
         elif self.sensor.centre is not None:
             ends += self.sensor.centre
@@ -195,7 +195,7 @@ class BatchReturns:
 
     def _to_sensor(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
         """Turn vectors (n, 3) in the axes of the carrier, or the head, to those of the sensor."""
-        if self._by_head:
+        if self._poses.by_head:
             spins = self.sensor.spins(self._firings)
             assert spins is not None  # or the rig would not cast by head
             (cos, sin), (x, y, z) = (a.take(self._number) for a in spins), vectors.T
@@ -242,7 +242,7 @@ class BatchReturns:
     @cached_property
     def intensity(self) -> NDArray[np.float64]:
         """Received energy, see `Surfaces.energy`."""
-        if self.echoes is not None:
+        if self.echoes is not None and self.echoes.energy is not None:
             return self.echoes.energy
         extinction = self.survey.extinction(self.sensor)
         return self._surfaces.energy(
@@ -271,11 +271,22 @@ class BatchReturns:
         return self._surfaces.materials.semantic_class[self.object]
 
 
-def turned(
-    vectors: NDArray[np.float64], rotation: NDArray[np.float64] | None
-) -> NDArray[np.float64]:
-    """Rotate vectors (n, 3) by a matrix, with a fixed order of rounding, unlike BLAS."""
-    if rotation is None:
-        return vectors
-    x, y, z = vectors.T
-    return np.stack([(x * a + y * b) + z * c for a, b, c in rotation], axis=1)
+def columns_of(found: list[BatchReturns]) -> PartColumns:
+    """Make the columns of consecutive scans, and count the hits of each triangle."""
+    columns = {
+        column.name: _joined([column.make(returns) for returns in found])
+        for column in found[0].survey.stored_columns
+    }
+    tally = np.sum([np.asarray(returns.found.tally) for returns in found], axis=0)
+    triangles = np.flatnonzero(tally)
+    return PartColumns(
+        found[0].specs[0].scan,
+        _joined([returns.counts for returns in found]),
+        columns,
+        triangles.astype(np.int32),
+        tally[triangles].astype(np.int64),
+    )
+
+
+def _joined(arrays: list[NDArray]) -> NDArray:  # type: ignore[type-arg]
+    return np.ascontiguousarray(arrays[0]) if len(arrays) == 1 else np.concatenate(arrays)

@@ -7,6 +7,7 @@ ray and return, so the batches do not matter.
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -64,14 +65,14 @@ class Echoes(ScanReturns):
     Attributes
     ----------
     energy
-        float64 (k,): received, see `Surfaces.energy`.
+        float64 (k,): received, see `Surfaces.energy`; None if it is that of the rays as reported.
     number, returns
         uint8 (k,): number among the reported returns of its pulse, from 1, and their count.
     reported
         float64 (k,): distance with noise; `distance` has none.
     """
 
-    energy: Real
+    energy: Real | None
     number: NDArray[np.uint8]
     returns: NDArray[np.uint8]
     reported: Real
@@ -113,10 +114,15 @@ class EchoCaster:
         self._caster, self._survey, self._surfaces = caster, survey, surfaces
         self._noise, self._one_each = survey.noise, _one_each(survey, surfaces)
         self._faces = surfaces.triangles
-        self._divided: dict[int, Pattern] = {}  # {id of a pattern that is kept: its sub-rays}
         # Light continues so far behind a surface, not to hit it again: Embree rounds to a quarter.
         reach = np.float32(np.abs(scene.vertices).max())
         self._clear_m = max(1e-5, 4 * float(np.spacing(reach)))
+
+    def within(self, caster: World, surfaces: Surfaces) -> EchoCaster:
+        """Return the same caster with actors elsewhere."""
+        echoes = copy(self)
+        echoes._caster, echoes._surfaces = caster, surfaces
+        return echoes
 
     @staticmethod
     def needed(survey: Survey, surfaces: Surfaces) -> bool:
@@ -125,14 +131,15 @@ class EchoCaster:
         noisy = max(noise.range_m, noise.range_per_m, noise.angle_deg) > 0
         return noisy or not _one_each(survey, surfaces)
 
-    def divide(self, sensor: Sensor, pattern: Pattern) -> None:
-        """Make the sub-rays of a repeated pattern once, if they are few."""
+    def divided(self, sensor: Sensor, pattern: Pattern) -> Pattern | None:
+        """Make the sub-rays of a repeated pattern, if they are few and always the same."""
         subrays = self._survey.returns.subrays
-        few = len(pattern) * subrays <= PATTERN_RAYS
-        if few and subrays > 1 and not self._noise.angle_deg:
-            beam = self._beam(sensor)
-            beams = self._beams(beam, pattern, 0, Keys(0, np.zeros(1, int)), 0, len(pattern))
-            self._divided[id(pattern)] = beams
+        if len(pattern) * subrays > PATTERN_RAYS or self._noise.angle_deg:
+            return None
+        if subrays == 1:
+            return pattern
+        keys = Keys(0, np.zeros(1, int))
+        return self._beams(self._beam(sensor), pattern, 0, keys, 0, len(pattern))
 
     def _beam(self, sensor: Sensor) -> Real:
         divergence, _ = self._survey.returns.of(sensor.optics)
@@ -143,6 +150,7 @@ class EchoCaster:
         sensor: Sensor,
         scan: int,
         pattern: Pattern,
+        divided: Pattern | None,
         poses: Poses,
         window: tuple[int, int],
         groups: Whole,
@@ -157,6 +165,8 @@ class EchoCaster:
             Number of the first scan.
         pattern, poses, window, groups
             As of `RayCaster.scan`; each group is a scan.
+        divided
+            Sub-rays of the pattern, if they were made before.
         """
         noise, first, rays = self._noise, window[0], window[1] - window[0]
         keys = Keys(scan, groups)
@@ -167,7 +177,7 @@ class EchoCaster:
             found = self._once(sensor, pattern, poses, (first, first + rays), groups)
         else:
             _, gap_m = self._survey.returns.of(sensor.optics)
-            beam, divided = self._beam(sensor), self._divided.get(id(pattern))
+            beam = self._beam(sensor)
             if len(beam) == 1 and not noise.angle_deg:
                 divided = pattern
             unit = poses.rays_per_pose or 1
@@ -219,14 +229,16 @@ class EchoCaster:
         window: tuple[int, int],
         groups: Whole,
     ) -> Echoes:
-        """Cast rays with one return each; compute energies only for kept ones."""
+        """Cast rays with one return each; compute energies only for kept ones, and if needed."""
         found = self._caster.returns(
             sensor, self._survey.keep_every, pattern, poses, window, groups
         )
-        _, directions = poses.rays(pattern, found.ray, window[0])
-        times = poses.times(found.ray)
-        along = self._surfaces.along_normal(found.triangle, directions, times)
-        energy = self._energy(sensor, found.triangle, np.abs(along), found.distance)
+        energy = None
+        if self._noise.angle_deg:
+            _, directions = poses.rays(pattern, found.ray, window[0])
+            times = poses.times(found.ray)
+            along = self._surfaces.along_normal(found.triangle, directions, times)
+            energy = self._energy(sensor, found.triangle, np.abs(along), found.distance)
         one = np.ones(len(found), np.uint8)
         return Echoes(
             **vars(found), energy=energy, number=one, returns=one, reported=found.distance

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from functools import cached_property
+from copy import copy
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..scene.actors import Actor
 from ..scene.scene import Scene
 from ..sensor.materials import Material, MaterialTable, at_right_angles
 
@@ -36,20 +38,16 @@ class Surfaces:
     def __init__(self, scene: Scene, materials: tuple[Material, ...]) -> None:
         self._scene, self._actors = scene.solid(), scene.actors
         self._standing = len(scene.names)  # objects
+        # Made on first use, for copies with other actors as well.
+        self._normals = cache(partial(_unit_normals, self._scene))
         self.triangles = len(self._scene.faces)
         self.materials = MaterialTable.of(materials, scene.all_names)
 
-    @cached_property
-    def _normals(self) -> NDArray[np.float32]:
-        """Unit normals of all triangles, one row for each axis, the fastest layout."""
-        out = np.empty((3, len(self._scene.faces)), np.float32)
-        for begin in range(0, out.shape[1], BLOCK_FACES):
-            faces = self._scene.faces[begin : begin + BLOCK_FACES]
-            a, b, c = self._scene.vertices[faces].transpose(1, 0, 2)
-            normals = np.cross(b - a, c - a)
-            lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-            out[:, begin : begin + BLOCK_FACES] = (normals / np.maximum(lengths, 1e-300)).T
-        return out
+    def with_actors(self, actors: tuple[Actor, ...]) -> Surfaces:
+        """Return the same surfaces with other trajectories of the actors."""
+        surfaces = copy(self)
+        surfaces._actors = actors
+        return surfaces
 
     def normals(self, triangle: Triangles, times: Real | NDArray[np.int64]) -> Real:
         """Return the unit normals of triangles (n,): (n, 3), in single precision.
@@ -57,7 +55,7 @@ class Surfaces:
         Normals of actors are rotated by the actor's pose at the times (n,), nanoseconds.
         """
         normals = np.empty((3, len(triangle)))
-        for axis, out in zip(self._normals, normals, strict=True):
+        for axis, out in zip(self._normals(), normals, strict=True):
             out[:] = axis.take(triangle)
         objects = self.objects(triangle) if self._actors else None
         for number, actor in enumerate(self._actors, self._standing):
@@ -86,6 +84,18 @@ class Surfaces:
         """
         scattered = self.materials.scattered(self.objects(triangle), cosine)
         return np.asarray(scattered * at_right_angles(distance, extinction))
+
+
+def _unit_normals(scene: Scene) -> NDArray[np.float32]:
+    """Make unit normals of all triangles, one row for each axis, the fastest layout: (3, f)."""
+    out = np.empty((3, len(scene.faces)), np.float32)
+    for begin in range(0, out.shape[1], BLOCK_FACES):
+        faces = scene.faces[begin : begin + BLOCK_FACES]
+        a, b, c = scene.vertices[faces].transpose(1, 0, 2)
+        normals = np.cross(b - a, c - a)
+        lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+        out[:, begin : begin + BLOCK_FACES] = (normals / np.maximum(lengths, 1e-300)).T
+    return out
 
 
 def products(one: Real, other: Real) -> Real:

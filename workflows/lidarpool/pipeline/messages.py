@@ -41,7 +41,7 @@ class Receipt:
     Parameters
     ----------
     offer
-        Number of its offer; see `scan.batches`.
+        Number of its offer; see `pipeline.batches`.
     first, stop
         Its scans.
     name

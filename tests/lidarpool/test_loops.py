@@ -1,0 +1,103 @@
+"""The examples that scan in a loop: an environment of Gymnasium, and a node of ROS 2."""
+
+from __future__ import annotations
+
+import re
+import runpy
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+from lidarpool import Pose, Scene, Survey, load_sensor
+from lidarpool.export.ros import write_mcap
+from lidarpool.export.sweeps import Sweeps
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+class Env:
+    """What the example needs of `gymnasium.Env`."""
+
+    def reset(self, *, seed=None, options=None):
+        self.np_random = np.random.default_rng(seed)
+
+
+class Box:
+    """What it needs of `gymnasium.spaces.Box`."""
+
+    def __init__(self, low, high):
+        self.low, self.high, self.shape = low, high, low.shape
+
+    def contains(self, values):
+        return values.dtype == np.float32 and values.shape == self.shape and (
+            (self.low <= values) & (values <= self.high)
+        ).all()  # fmt: skip
+
+
+@pytest.fixture
+def robot_env(monkeypatch):
+    """The example, with Gymnasium or with what stands in for it."""
+    try:
+        import gymnasium  # noqa: F401
+    except ImportError:
+        stand_in = ModuleType("gymnasium")
+        stand_in.Env, stand_in.spaces = Env, SimpleNamespace(Box=Box)
+        monkeypatch.setitem(sys.modules, "gymnasium", stand_in)
+    return runpy.run_path(str(EXAMPLES / "robot_env.py"), run_name="robot_env")
+
+
+def test_a_robot_reaches_its_goal_by_its_ranges(capsys, robot_env):
+    runpy.run_path(str(EXAMPLES / "robot_env.py"), run_name="__main__")
+    said = re.fullmatch(
+        r"(\d+) steps, reward (.*), (.*) m from the goal\n", capsys.readouterr().out
+    )
+    steps, reward, left = map(float, said.groups())
+    assert 340 < steps < 400 and 68 < reward < 74 and left < 1
+
+
+def test_episodes_repeat_and_end_at_walls(robot_env):
+    env = robot_env["RobotEnv"]()
+    first, _ = env.reset(seed=3)
+    assert env.observation_space.contains(first) and first[:64].min() < 15
+    second, reward, ended, cut, _ = env.step(np.float32([1, 0.5]))
+    assert abs(reward) <= 0.11 and not ended and not cut
+    again, _ = env.reset(seed=3)
+    assert np.array_equal(again, first)
+    assert np.array_equal(env.step(np.float32([1, 0.5]))[0], second)
+    nearest = env.reset(seed=3)[0][:64].argmin()
+    env.yaw += nearest * 2 * np.pi / 64
+    for _ in range(400):
+        _, reward, ended, cut, _ = env.step(np.float32([2, 0]))
+        if ended:
+            break
+    assert ended and reward < -9, "it drove into what was nearest"
+
+
+def test_a_node_publishes_what_a_bag_holds(tmp_path):
+    node = runpy.run_path(str(EXAMPLES / "ros2_scanner.py"), run_name="ros2_scanner")
+    scene, pose = Scene.seed(), Pose((0.5, 0.2, 1), 30)
+    cloud = node["scanner_of"](scene, "velodyne/vlp16").sweep(pose)
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    types = store.types
+    kinds = SimpleNamespace(
+        PointField=types["sensor_msgs/msg/PointField"],
+        PointCloud2=lambda data, **given: types["sensor_msgs/msg/PointCloud2"](
+            data=np.frombuffer(data, np.uint8), **given
+        ),
+    )
+    header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](10**9, 0), "lidar")
+    message = node["message_of"](cloud, 0, header, kinds)
+    columns = ["intensity", "time"]
+    survey = Survey(load_sensor("velodyne/vlp16"), [pose], columns=columns, coordinates="sensor")
+    write_mcap(tmp_path / "a.mcap", cloud, Sweeps.of(survey, scene), "velodyne")
+    with AnyReader([tmp_path / "a.mcap"], default_typestore=store) as bag:
+        [(connection, _, written)] = bag.messages(
+            [c for c in bag.connections if "points" in c.topic]
+        )
+        assert store.serialize_cdr(message, connection.msgtype) == bytes(written)
+    assert len(message.data) == 22 * len(cloud) > 10_000

@@ -1,0 +1,378 @@
+"""What a page shows of a finished result: its points, scene, sensors, sweeps and planning."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from tests.pages import ask
+
+from lidarpool import LidarpoolError, Planning, Pose, Scene, Sensor, Survey, Track
+from lidarpool.columns.table import CHANNEL, OBJECT, SCAN
+from lidarpool.export.cloud_file import CloudFile
+from lidarpool.export.ply_format import header, row_type
+from lidarpool.export.sweeps import SWEEPS_FILE, Sweeps
+from lidarpool.live.result_page import open_result, result_page, result_view, view_result
+from lidarpool.live.surface import Surface, colours_for
+from lidarpool.live.view import range_image
+from lidarpool.plan import Plan
+from lidarpool.render.hits import hit_colours
+from lidarpool.run.picture_file import PICTURE_FILE, Pictured, SensorWay
+from lidarpool.scene.actors import Actor, box
+from lidarpool.scene.mesh import Mesh
+
+POSES = 25
+NOWHERE = np.zeros((0, 3), np.float32)
+ORIGIN = np.array([500_000.0, 100.0, 0.0])
+ALL = 1_000_000
+
+
+def write(path, positions, scans=100):
+    """Write a cloud as a run does."""
+    count = len(positions)
+    row = row_type(np.dtype(np.float64), (SCAN, CHANNEL, OBJECT))
+    rows = np.zeros(count, row)
+    for axis, name in enumerate("xyz"):
+        rows[name] = positions[:, axis]
+    rows["scan"] = np.arange(count) * scans // max(1, count)
+    rows["ring"] = np.arange(count) % 40
+    path.write_bytes(header(row, count) + rows.tobytes())
+    return path
+
+
+def test_scans_are_chosen_and_thinned(tmp_path):
+    x = np.arange(50_000) // 500
+    file = CloudFile(write(tmp_path / "a.ply", np.column_stack([x, 0 * x, 0 * x])))
+    assert (len(file), file.scans) == (50_000, (0, 99))
+    cloud, count = file.choose(10_000, (20, 29))
+    assert count == len(cloud) == 5_000
+    assert np.unique(cloud["scan"]).tolist() == list(range(20, 30))
+    cloud, count = file.choose(4_000, (0, 99))
+    assert (count, len(cloud)) == (50_000, 4_000)
+    assert np.bincount(cloud["scan"]).min() >= 35
+    assert np.bincount(cloud["channel"]).min() > 50
+    assert np.array_equal(cloud.positions[:, 0], cloud["scan"])
+
+
+def test_no_points_and_points_that_are_nowhere_are_no_reason_to_fail(tmp_path):
+    nothing = CloudFile(write(tmp_path / "a.ply", np.zeros((0, 3))))
+    assert (len(nothing), nothing.scans, nothing.choose(10, (0, 0))[1]) == (0, (0, 0), 0)
+    nowhere = CloudFile(write(tmp_path / "b.ply", np.full((1000, 3), np.nan)))
+    assert len(nowhere.choose(1000, (0, 99))[0]) == 0
+
+
+def test_what_is_no_result_is_refused(tmp_path):
+    for name, words in (("", "no cloud.ply"), ("none.ply", "none.ply"), ("cut.ply", "cut.ply")):
+        (tmp_path / "cut.ply").write_bytes(b"ply\n")
+        with pytest.raises(LidarpoolError, match=words):
+            view_result(tmp_path / name, port=0, browser=False)
+
+
+@pytest.fixture(scope="module")
+def pictured():
+    """Return a room with a roof, 6 by 8 by 3 metres, far from zero, scanned from 25 poses."""
+    room = trimesh.creation.box(bounds=[(0, 0, 0), (6, 8, 3)])
+    faces = np.int32(room.faces)
+    scene = Scene(np.array(room.vertices), faces, np.zeros(12, np.int32), ("room",), ORIGIN)
+    poses = np.column_stack([np.full(POSES, 3.0), np.linspace(1, 7, POSES), np.ones(POSES)])
+    rays = np.stack([np.repeat(poses[:2], 9, axis=0), np.full((18, 3), 2.9)], axis=1)
+    rays[:9, 1, 2] = 0.5
+    return Pictured(
+        scene,
+        (SensorWay(np.arange(POSES), poses),),
+        np.arange(12),
+        rays.astype(np.float32),
+        Planning((1, 1), (5, 7), [(1, 6)], 0.5),
+        Plan(np.array([[1.0, 1.0], [5.0, 7.0]]), 7.2, 7.2, 1.0, 0, 1),
+        (),
+    )
+
+
+@pytest.fixture
+def cloud(tmp_path):
+    """Return a file of 10,000 points on the room's walls and ceiling."""
+    local = np.random.default_rng(0).uniform((0, 0, 0), (6, 8, 3), (10_000, 3))
+    local[::2, 0], local[1::2, 2] = 0.0, 3.0
+    return write(tmp_path / "cloud.ply", local + ORIGIN)
+
+
+def told(view, what, **asked):
+    """Return what the page is told: (JSON, arrays)."""
+    return view.answer(what, {name: str(value) for name, value in asked.items()}, lambda: False)
+
+
+def places(view, **asked):
+    """Positions (n, 3) of the points that the page is given, local."""
+    return told(view, "points", **{"colour": "z", "most": ALL, **asked})[1]["positions"]
+
+
+def test_the_page_is_told_of_scene_sensors_rays_and_planning(cloud, pictured):
+    view = result_view(CloudFile(cloud), pictured, title="a room")
+    state, arrays = told(view, "state")
+    assert (state["title"], state["points"]) == ("a room", 10_000)
+    assert state["origin"] == ORIGIN.tolist()
+    assert state["scene"] == ["grey", "hits", "object"]
+    assert arrays["sensor0_places"].shape == (POSES, 3)
+    assert arrays["rays"].shape == (18, 2, 3)
+    assert state["path"] == {"corners": [[1, 1], [5, 7]], "discs": [[1, 6, 0.5]]}
+    points, arrays = told(view, "points", colour="object", most=ALL, filter="scan,10,19")
+    assert (points["count"], len(arrays["rows"])) == (1000, 1000)
+    assert [name for name, *_ in points["legend"]["labels"]] == ["room"]
+    world = [view.points.values(axis, arrays["rows"]) for axis in "xyz"]
+    assert np.allclose(arrays["positions"] + ORIGIN, np.stack(world, axis=1))
+
+
+def test_colours_are_those_of_the_legend_whatever_is_shown(cloud, pictured):
+    view = result_view(CloudFile(cloud), pictured)
+    whole, arrays = told(view, "points", colour="z", most=ALL)
+    some, part = told(view, "points", colour="z", most=ALL, scans="50-59")
+    assert some["legend"] == whole["legend"]
+    assert part["rows"].tolist() == list(range(5000, 6000))
+    assert np.array_equal(part["colours"], arrays["colours"][5000:6000])
+    low, *_, high = whole["legend"]["marks"]
+    assert (low, high) == ("0.0", "3.0")
+
+
+def test_surfaces_have_the_colours_that_are_asked_for(cloud, pictured):
+    view = result_view(CloudFile(cloud), pictured)
+    grey, arrays = told(view, "surface", colour="grey")
+    assert arrays["corners"].shape == (12, 3, 3)
+    assert "colours" not in arrays  # the page has its own, light or dark
+    assert grey["legend"] is None
+    assert grey["roof_cut"] == pytest.approx(2)  # halfway up from the sensors
+    hits, arrays = told(view, "surface", colour="hits")
+    assert "hits per square metre" in hits["legend"]["title"]
+    assert arrays["colours"].shape == arrays["corners"].shape
+    objects, arrays = told(view, "surface", colour="object")
+    assert objects["legend"]["labels"][0][0] == "room"
+    assert set(arrays["objects"].tolist()) == {0}
+
+
+def test_a_drive_through_a_large_scene_is_looked_at_from_near(cloud):
+    """The camera is near the way, and towers are cut above it."""
+    scene = Scene.from_meshes([box("Ground", (800, 800, 0.1)), box("Tower", (9, 9, 90))])
+    way = SensorWay(np.array([0, 2e9]), np.array([[0, 5, 2.0], [20, 5, 2]]), True, "", "VLP-16")
+    hits, rays = np.full(scene.triangles, 9, np.int64), np.zeros((0, 2, 3), np.float32)
+    seen = Pictured(scene, [way], hits, rays, None, None, (), 2e9)
+    state, _ = told(result_view(CloudFile(cloud), seen), "state")
+    assert 20 < state["cut"] < 40
+    assert np.ptp(state["box"], axis=0).max() < 200 < np.ptp(state["bounds"], axis=0).max()
+
+
+def test_under_a_wide_roof_a_drive_is_cut_below_the_roof(cloud):
+    roof = box("Roof", (800, 800, 1))
+    roof = replace(roof, vertices=roof.vertices + np.array([0, 0, 10]))
+    scene = Scene.from_meshes([box("Ground", (800, 800, 0.1)), roof, box("Mast", (1, 1, 90))])
+    way = SensorWay(np.array([0, 2e9]), np.array([[3, 5, 2.0], [20, 5, 2]]), True, "", "VLP-16")
+    hits, rays = np.zeros(scene.triangles, np.int64), np.zeros((0, 2, 3), np.float32)
+    view = result_view(CloudFile(cloud), Pictured(scene, [way], hits, rays, None, None, (), 2e9))
+    assert told(view, "surface", colour="grey")[0]["roof_cut"] == pytest.approx(6, abs=0.5)
+
+
+def test_actors_are_told_with_their_poses_and_numbers(cloud):
+    scene = Scene.from_meshes([box("Hall", (8, 8, 8)), box("Table", (2, 2, 2))])
+    half = np.sqrt(0.5)
+    track = Track([0, 2], [[1, 1, 0], [5, 1, 0]], [[0, 0, 0, 1], [0, 0, half, half]])
+    scene = replace(scene, actors=(Actor(box("Cart", (1, 1, 1)), track),))
+    hits, rays = np.zeros(scene.triangles, np.int64), np.zeros((0, 2, 3), np.float32)
+    way = SensorWay(np.zeros(1), np.array([[20.0, 0, 1]]))
+    view = result_view(CloudFile(cloud), Pictured(scene, [way], hits, rays, None, None, (), 2e9))
+    state, arrays = told(view, "state")
+    assert (state["actors"], state["statics"], len(state["actor_colours"])) == (
+        [{"name": "Cart"}],
+        2,
+        1,
+    )
+    assert (arrays["actor0_times"][0], arrays["actor0_times"][-1]) == (0, 2)
+    assert arrays["actor0_places"][[0, -1]] == pytest.approx(np.array([[1, 1, 0], [5, 1, 0]]))
+    assert np.abs(arrays["actor0_turns"][-1]) == pytest.approx([0, 0, half, half])
+
+
+@pytest.fixture(scope="module")
+def spun():
+    """Return the sweeps of a survey of a turn at each of two poses."""
+    scene = Scene.from_meshes([box("Room", (6, 8, 3))])
+    survey = Survey(
+        Sensor.grid(rays_per_revolution=360, layers=8), [Pose((0, 0, 1)), Pose((1, 0, 1))]
+    )
+    return Sweeps.of(survey, scene)
+
+
+def sweeping(path, sweeps):
+    """Write a cloud of each sweep's number as its points' x, ten points a sweep."""
+    scans = np.repeat(sweeps.scans[:-1], 10)
+    rows = np.zeros(len(scans), row_type(np.dtype(np.float32), (SCAN, CHANNEL, OBJECT)))
+    rows["scan"], rows["ring"] = scans, np.tile(np.arange(10) % 8, len(sweeps))
+    rows["x"] = np.repeat(np.arange(len(sweeps)), 10) + 2
+    path.write_bytes(header(rows.dtype, len(rows)) + rows.tobytes())
+
+
+def test_without_pictures_sensors_and_sweeps_are_still_shown(tmp_path, spun):
+    sweeping(tmp_path / "cloud.ply", spun)
+    spun.save(tmp_path / SWEEPS_FILE)
+    view = open_result(tmp_path)
+    state, arrays = told(view, "state")
+    assert state["title"].startswith(tmp_path.name)
+    assert (len(state["sensors"]), state["scene"]) == (1, None)
+    assert arrays["sensor0_places"] == pytest.approx(spun.pose.positions)
+    assert arrays["sweep_begins"] == pytest.approx(spun.begins_ns / 1e9)
+    first, last = arrays["sweep_scans"][1:3]
+    of_second = places(view, scans=f"{first:.0f}-{last - 1:.0f}")
+    assert set(of_second[:, 0].tolist()) == {3}
+    image = told(view, "range", sweep=1)[1]["image"]
+    assert image.shape[0] == 8  # channels
+    with pytest.raises(KeyError):
+        told(view, "range", sweep=len(spun))
+
+
+def test_a_range_image_has_channels_from_above_and_azimuth_from_left_to_right():
+    turn = np.radians(np.arange(180, -180, -1.0))
+    ring = np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
+    spots = np.concatenate([5 * ring, 9 * ring + [0, 0, 1]])
+    away, channels = np.linalg.norm(spots, axis=1), np.repeat([0, 7], 360)
+    image = range_image(spots, away, channels, (5.0, 9.0))
+    assert image.shape[0] == 8 and 300 < image.shape[1] <= 432
+    assert (image[[0, 7], :, 3] > 0).mean() > 0.8
+    assert not image[1:7].any()
+    assert not np.array_equal(image[0, 100], image[7, 100])  # the upper is farther
+    left = spots[:, 1] > 1  # y is to the left
+    half = range_image(spots[left], away[left], channels[left], (5.0, 9.0))
+    assert half[[0, 7]].any(axis=2).any(axis=0).mean() > 0.8  # it fills its picture
+    whole = range_image(
+        spots[left | (spots[:, 0] > 0)],
+        away[left | (spots[:, 0] > 0)],
+        channels[left | (spots[:, 0] > 0)],
+        (5.0, 9.0),
+    )
+    assert whole.shape == half.shape[:1] + whole.shape[1:]
+    few = range_image(spots, away, np.repeat([0, 1], 360), (5.0, 9.0))
+    assert few.shape[0] == 128  # by elevation
+
+
+def test_columns_of_other_programs_can_be_coloured_and_filtered_by(tmp_path):
+    """A cloud without scans, far from zero, with columns of one value or none."""
+    rows = np.zeros(20, [*((a, "<f8") for a in "xyz"), ("nx", "<f4"), ("2-a", "|u1"),
+                         ("nothing", "<f4"), ("big", "<f8")])  # fmt: skip
+    rows["x"], rows["nothing"], rows["big"], rows["nx"] = 5e6, np.nan, 1e18, np.arange(20)
+    lines = [*(f"property double {a}" for a in "xyz"), "property float nx", "property uchar 2-a",
+             "property float nothing", "property double big"]  # fmt: skip
+    head = ["ply", "format binary_little_endian 1.0", "element vertex 20", *lines, "end_header", ""]
+    (tmp_path / "theirs.ply").write_bytes("\n".join(head).encode() + rows.tobytes())
+    view = open_result(tmp_path / "theirs.ply")
+    state, arrays = told(view, "state")
+    names = [column["name"] for column in state["columns"]]
+    assert names == ["z", "x", "y", "nx", "nothing", "big"]
+    assert "sweep_scans" not in arrays
+    for name in names:
+        limits, _ = told(view, "column", name=name)
+        assert limits["low"] <= limits["high"]
+        points, arrays = told(view, "points", colour=name, most=ALL)
+        assert (points["count"], len(arrays["positions"])) == (20, 20)
+        assert np.abs(arrays["positions"]).max() < 1
+    assert len(places(view, filter="nx,3,5")) == 3
+
+
+def test_what_a_column_is_filtered_by_is_told(cloud, pictured):
+    view = result_view(CloudFile(cloud), pictured)
+    assert told(view, "column", name="object")[0] == {"labels": [["room", 0]]}
+    scans = told(view, "column", name="scan")[0]
+    assert (scans["low"], scans["high"], scans["whole"]) == (0, 99, True)
+    heights = told(view, "column", name="z")[0]
+    assert heights["low"] >= 0 and heights["high"] == 3
+    with pytest.raises(KeyError):
+        told(view, "column", name="nothing")
+
+
+def test_a_point_is_told_in_words_and_world_coordinates(cloud, pictured):
+    view = result_view(CloudFile(cloud), pictured)
+    point, _ = told(view, "point", row=2)
+    assert point["place"] == [view.points.values(axis, np.array([2]))[0] for axis in "xyz"]
+    assert point["columns"] == [["scan", "0"], ["channel", "2"], ["object", "room"]]
+    with pytest.raises(KeyError):
+        told(view, "point", row=10_000)
+
+
+def test_damaged_pictures_are_noted_and_the_cloud_is_shown(cloud, capsys, monkeypatch):
+    asked = []
+
+    def interrupt(_):
+        asked.append(capsys.readouterr().err)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("lidarpool.live.result_page.time.sleep", interrupt)
+    (cloud.parent / PICTURE_FILE).write_bytes(b"PK\x03\x04junk")
+    view_result(cloud.parent, port=0, browser=False)
+    (said,) = asked
+    assert PICTURE_FILE in said.splitlines()[0]
+    assert "shows 10,000 points" in said
+
+
+def test_questions_come_by_http(cloud, pictured):
+    with result_page(result_view(CloudFile(cloud), pictured), port=0, browser=False) as page:
+        told = ask(page.url, "points", colour="z", most=100)
+        assert told["count"] == 10_000
+        assert told["arrays"]["positions"].shape == (100, 3)
+
+
+def test_many_triangles_become_few_that_keep_shape_and_hits():
+    scene = Scene.seed()
+    surface = Surface(scene, most=5000)
+    corners = surface.corners.reshape(-1, 3)
+    assert 500 < len(surface.corners) <= 5000
+    assert np.allclose(corners.min(axis=0), scene.vertices.min(axis=0), atol=0.5)
+    assert np.allclose(corners.max(axis=0), scene.vertices.max(axis=0), atol=0.5)
+    first = scene.face_object == 0  # of six objects, far from each other
+    arrays, legend = surface.coloured("hits", np.where(first, 3, 0), NOWHERE)
+    corners, colours = arrays["corners"], arrays["colours"]
+    middles = corners.mean(axis=1)
+    low, high = scene.object_bounds[0]
+    there = ((middles > low - 1) & (middles < high + 1)).all(axis=1)
+    vivid = (np.ptp(colours.astype(int), axis=2) > 40).any(axis=1)
+    assert vivid[there].mean() > 0.9
+    assert not vivid[~there].any()
+    assert "hits per square metre" in legend["title"]
+    assert len(Surface(scene).corners) == len(scene.faces)  # few enough
+
+
+def test_hits_of_a_wall_of_two_triangles_are_told_apart_on_a_grid():
+    """A wall of 8 by 4 metres: 100 hits per square metre on its left half, none on the other."""
+    wall = trimesh.Trimesh([[0, 0, 0], [8, 0, 0], [8, 0, 4], [0, 0, 4]], [[0, 1, 2], [0, 2, 3]])
+    scene = Scene.from_meshes([Mesh("wall", wall.vertices, wall.faces)])
+    random = np.random.default_rng(0)
+    points = random.uniform((0, 0, 0), (4, 0, 4), (800, 3)).astype(np.float32)  # every other hit
+    corners = scene.vertices[scene.faces].astype(np.float32)
+    hits = np.array([800.0, 800.0])
+    pieces, _, colours, limits = hit_colours(scene, corners, hits, points, 5000)
+    sides = pieces[:, 1:] - pieces[:, :1]
+    areas = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) / 2
+    assert areas.sum() == pytest.approx(32, rel=1e-4)
+    assert limits[0] < 100 < limits[1] < 300
+    vivid = np.ptp(colours, axis=2) > 0.2
+    assert vivid[pieces[..., 0] < 3.5].all()
+    assert not vivid[pieces[..., 0] > 5.5].any()
+    assert len(hit_colours(scene, corners, np.array([800.0, 0.0]), points, 3)[0]) <= 3
+    untouched, _, colours, _ = hit_colours(scene, corners, np.zeros(2), points, 5000)
+    assert len(untouched) == 2 and (np.ptp(colours, axis=2) < 0.1).all()
+
+
+def test_what_touches_does_not_show_through():
+    """Each side of a box is moved inwards, so that those of two that touch are apart."""
+    scene = Scene.from_meshes([box("Wall", (8, 1, 3)), box("Ceiling", (8, 8, 1))])
+    surface = Surface(scene)
+    moved = surface.corners - scene.vertices[scene.faces]
+    sides = surface.corners[:, 1:] - surface.corners[:, :1]
+    normals = np.cross(sides[:, 0], sides[:, 1])
+    assert ((moved.mean(axis=1) * normals).sum(axis=1) < 0).all()
+    assert np.abs(moved).max() < 0.01
+
+
+def test_a_scene_is_coloured_by_the_reflectance_of_its_objects():
+    scene = Scene.from_meshes([box("White", (1, 1, 1)), box("Black", (2, 2, 2))])
+    share = np.array([1.0, 0.0])
+    assert colours_for(scene, share) == ("grey", "hits", "object", "reflectance")
+    assert colours_for(scene, np.array([0.5, 0.5])) == ("grey", "hits", "object")
+    arrays, legend = Surface(scene, share).coloured("reflectance", share, NOWHERE)
+    colours = arrays["colours"]
+    assert np.unique(colours[scene.face_object == 0]).tolist() == [255]
+    assert colours[scene.face_object == 1].max() < 40
+    assert legend["title"] == "reflectance"

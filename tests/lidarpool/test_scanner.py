@@ -1,0 +1,305 @@
+"""A scanner gives what a survey gives, sweep by sweep, and images of ranges."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lidarpool import (
+    Actor,
+    Beams,
+    Cloud,
+    Column,
+    LidarpoolError,
+    Material,
+    Mesh,
+    Mounted,
+    Noise,
+    Pose,
+    Returns,
+    Scanner,
+    Scene,
+    Sensor,
+    Spin,
+    Survey,
+    Track,
+    load_sensor,
+)
+from lidarpool.columns.table import OPTIONAL, SCAN
+from lidarpool.export.sweeps import Sweeps
+from lidarpool.scene.actors import box
+from lidarpool.scene.shapes import seed_objects
+from lidarpool.simulator import rig as rig_module
+from lidarpool.simulator.returns import columns_of
+from lidarpool.simulator.rig import Rig
+
+COLUMNS = [column.name for column in OPTIONAL]
+VLP16 = load_sensor("velodyne/vlp16")
+GRID = Sensor.grid(rays_per_revolution=120, layers=8, step_deg=30, max_range_m=40)
+DRIVE = Track([0, 0.5], [[-3, 0.1, 1.2], [3, 0.4, 1.2]])
+BEND = Track([0, 1], [[0, 0, 1], [5, 0, 1]], [[0, 0, 0, 1], [0, 0, np.sin(0.5), np.cos(0.5)]])
+CAR = Actor(box("Car", (4.5, 1.8, 1.5)), Track([0, 1], [[6, -3, 0], [6, 7, 0]]))
+HERE = Pose((0.5, -0.3, 1.1), 20, 3, -2)
+MOUNT = Pose((0.4, -0.2, 0.3), 30, -8, 3)
+PHYSICS = {
+    "materials": [Material("*", 0.5), Material("Bowl", transparent="mirror")],
+    "returns": Returns("dual", 7, 3.0),
+    "noise": Noise(0.02, angle_deg=0.05, dropout=0.1, seed=5),
+    "visibility_km": 1.0,
+}
+LATE = Sensor(
+    Beams(
+        np.radians([-20, 0, 12]),
+        time_ns=[0, 5e4, 1e5],
+        origin=[[0.1, 0, 0], [0, 0, 0.1], [0.1, 0.02, 0]],
+    ),
+    Spin(90.449, step_deg=50),
+    max_range_m=40,
+    start_ns=2e7,
+)
+SENSORS = {
+    "turns of no whole number": VLP16,
+    "one pattern for all turns": GRID,
+    "frames": load_sensor("livox/mid40", step_deg=90),
+    "scans across turns, beams apart": LATE,
+    "mounted": Mounted(GRID, MOUNT),
+}
+
+
+@pytest.fixture(scope="module")
+def scene():
+    corners = np.array([[-30, -30, 0], [30, -30, 0], [30, 30, 0], [-30, 30, 0.0]])
+    ground = Mesh("Ground", corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    meshes = [*seed_objects(rings=8, segments=12), ground]
+    return Scene.from_meshes(meshes).with_actors([CAR])
+
+
+def surveyed(scene, survey):
+    """Cloud of a survey as its workers make it."""
+    part = columns_of(list(Rig(scene, survey, "numpy").cast(0, survey.scan_count)))
+    table = (SCAN, *(c for c in survey.stored_columns if c.name not in "xyz"))
+    return part.cloud(table, survey.precision_m, scene.origin)
+
+
+def same(one: Cloud, other: Cloud):
+    assert one.columns.keys() == other.columns.keys()
+    assert one.positions.tobytes() == other.positions.tobytes()
+    for name, values in other.columns.items():
+        assert one[name].dtype == values.dtype and np.array_equal(one[name], values), name
+    return True
+
+
+def sweep_of(cloud, steps):
+    return cloud.part(np.flatnonzero((cloud.scan >= steps.start) & (cloud.scan < steps.stop)))
+
+
+@pytest.mark.parametrize("physics", [{}, PHYSICS], ids=["plain", "all effects"])
+@pytest.mark.parametrize("moves", [False, True], ids=["standing", "moving"])
+@pytest.mark.parametrize("name", SENSORS)
+def test_a_sweep_has_the_bytes_of_a_survey(scene, name, moves, physics):
+    given = SENSORS[name]
+    carried = given if isinstance(given, Mounted) else Mounted(given)
+    options = {"columns": COLUMNS, "precision_m": 1e-3, **physics}
+    where = {"trajectory": DRIVE} if moves else {"poses": [HERE]}
+    steps = carried.sensor.steps_of_turn(2).stop
+    whole = surveyed(scene, Survey(sensors=[carried], steps=steps, **where, **options))
+    scanner = Scanner(scene, given, backend="numpy", **options)
+    sweeps = [scanner.sweep(DRIVE if moves else HERE, number=number) for number in (2, 0, 1)]
+    same(Cloud.joined([sweeps[1], sweeps[2], sweeps[0]]), whole)
+    assert all(len(sweep) > 20 for sweep in sweeps)
+    assert (whole["object"] == len(scene.names)).any(), "the actor is seen"
+
+
+def test_sweeps_are_those_that_exporters_find():
+    for sensor in (VLP16, GRID, LATE, replace(GRID, head=Spin(120, step_deg=77))):
+        survey = Survey(sensor, [(0, 0, 1)], steps=sensor.steps_of_turn(40).stop)
+        firsts = [sensor.steps_of_turn(number).start for number in range(42)]
+        assert Sweeps.of(survey, Scene.seed()).scans.tolist() == firsts
+
+
+def test_another_start_is_another_time_on_the_same_trajectory(scene):
+    scanner = Scanner(scene.with_actors([]), VLP16, columns=["time"], backend="numpy")
+    later = replace(BEND, start_s=0.25, duration_s=None)
+    one, other = scanner.sweep(later, start_s=0.5, number=3), scanner.sweep(BEND, start_s=0.75)
+    assert len(one) > 1000 and not np.array_equal(one.scan, other.scan)
+    other = scanner.sweep(BEND, start_s=0.75, number=3)
+    assert np.array_equal(one.positions, other.positions)
+    assert np.array_equal(other.time - one.time, np.full(len(one), 250_000_000))
+    default = scanner.sweep(BEND, number=3)
+    assert same(scanner.sweep(BEND, number=3, start_s=0.3), default)
+    assert not np.array_equal(default.positions[:100], other.positions[:100])
+
+
+IMAGES = {
+    "plain": {},
+    "noise of ranges": {"noise": Noise(0.02, 0.001, seed=3)},
+    "all effects": PHYSICS,
+    "lost returns": {"noise": Noise(dropout=0.3)},
+}
+
+
+@pytest.mark.parametrize("name", IMAGES)
+@pytest.mark.parametrize("given", [GRID, Mounted(GRID, MOUNT)], ids=["sensor", "mounted"])
+def test_an_image_has_the_ranges_of_sweeps(scene, name, given, monkeypatch):
+    columns = ["ray", "range", "return_number"]
+    scanner = Scanner(scene, given, columns=columns, backend="numpy", **IMAGES[name])
+    poses = [HERE, Pose((1, 0, 1)), Pose((0, 1, 2), 100)]
+    images = scanner.ranges(poses, number=4, start_s=0.2)
+    assert images.shape == (3, 120, 8) and images.dtype == np.float32
+    for number, (image, pose) in enumerate(zip(images, poses, strict=True), 4):
+        sweep = scanner.sweep(pose, number=number, start_s=0.2)
+        sweep = sweep.part(np.flatnonzero(sweep.return_number == 1))
+        rays = (sweep.scan - 12 * number) * 80 + sweep.ray
+        expected = np.full(960, np.inf, np.float32)
+        expected[rays] = sweep.range
+        assert np.isfinite(expected).sum() > 100
+        np.testing.assert_allclose(image.reshape(-1), expected, rtol=1e-6)
+    monkeypatch.setattr(rig_module, "IMAGE_RAYS", 1000)
+    assert np.array_equal(scanner.ranges(poses, number=4, start_s=0.2), images)
+
+
+@pytest.mark.parametrize("sensor", [VLP16, LATE, replace(GRID, head=Spin(120, step_deg=77))])
+def test_an_image_has_the_firings_of_its_turn(scene, sensor):
+    scanner = Scanner(scene, sensor, columns=["ray", "range"], backend="numpy")
+    for number in range(4):
+        [image], sweep = scanner.ranges(HERE, number=number), scanner.sweep(HERE, number=number)
+        steps = sensor.steps_of_turn(number)
+        begins = np.array([sensor.firings(step)[0] for step in steps]) * sensor.channels
+        expected = np.full(image.size, np.inf, np.float32)
+        expected[(begins - begins[0])[sweep.scan - steps.start] + sweep.ray] = sweep.range
+        np.testing.assert_allclose(image.reshape(-1), expected, rtol=1e-6)
+
+
+def test_poses_can_be_given_in_several_forms(scene):
+    scanner = Scanner(scene, GRID, backend="numpy")
+    places = np.array([[0, 0, 1], [1, -1, 2.0]])
+    images = scanner.ranges(places)
+    assert np.array_equal(scanner.ranges(places.tolist()), images)
+    assert np.array_equal(scanner.ranges([Pose((0, 0, 1)), (1, -1, 2)]), images)
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = HERE.rotation, HERE.position
+    assert np.array_equal(scanner.ranges(matrix[None]), scanner.ranges(HERE))
+    assert same(scanner.sweep((0, 0, 1)), scanner.sweep(Pose((0, 0, 1))))
+    assert scanner.ranges(np.empty((0, 3))).shape == (0, 120, 8)
+
+
+def test_an_actor_stands_where_it_was_put(scene):
+    scanner = Scanner(scene.with_actors([Actor(CAR.mesh)]), GRID, backend="numpy")
+    car = len(scene.names)
+    for x in (-6, 6):
+        scanner.move("Car", (x, 0, 0))
+        for points in (scanner.sweep((0, 0, 1), number=3), scanner.sweep((0, 0, 1), start_s=9)):
+            on = points.positions[points.object == car]
+            assert len(on) > 10 and (np.abs(on[:, 0] - x) < 2.3).all()
+    scanner.move("Car", DRIVE)
+    with pytest.raises(LidarpoolError, match=r"Actor 'Car': The trajectory goes from 0 to 0\.5 s"):
+        scanner.sweep((0, 0, 1), start_s=9)
+
+
+@pytest.mark.parametrize("physics", [{}, PHYSICS], ids=["plain", "all effects"])
+def test_a_moved_actor_is_like_one_that_was_there_before(scene, physics):
+    """In cast, normals, and energies."""
+    clouds, images, way = [], [], Track([0, 1], [[4, -3, 0], [5, 3, 0]])
+    for first in (CAR.trajectory, way):
+        car = Actor(CAR.mesh, first)
+        scanner = Scanner(
+            scene.with_actors([Actor(box("Van", (5, 2, 2))), car]), GRID, columns=COLUMNS,
+            backend="numpy", **physics,
+        )  # fmt: skip
+        scanner.sweep((0, 0, 1))  # fills what is kept
+        scanner.move("Van", (-6, 1, 0))
+        scanner.move("Car", way)
+        clouds.append(scanner.sweep((0, 0, 1), number=2))
+        images.append(scanner.ranges((0, 0, 1), number=2))
+    assert {6, 7, 8} <= {*clouds[0].object.tolist()} and same(*clouds)
+    assert np.array_equal(*images)
+
+
+def test_a_sweep_sees_actors_where_they_were_when_it_began(scene):
+    """Moved while its columns are made, by one of them."""
+    later = []
+
+    def moves(returns):
+        for step in later:
+            scanner.move("Car", step)
+        return returns.cosine
+
+    own = Column("moves", "float32", "", "moves the actor", moves)
+    columns = [own, "intensity", "class"]
+    scanner = Scanner(scene, GRID, columns=columns, backend="numpy")
+    scanner.move("Car", Pose((4, 1, 0), 30))
+    before = scanner.sweep((0, 0, 1))
+    later.append(Pose((4, 1, 0), 75))
+    assert same(scanner.sweep((0, 0, 1)), before)
+    assert not np.array_equal(scanner.sweep((0, 0, 1)).moves, before.moves)
+
+
+@pytest.mark.parametrize(("backend", "sensor"), [("numpy", LATE), ("embree", VLP16)])
+def test_threads_share_a_scanner(scene, backend, sensor):
+    def scan(number):
+        cloud = scanner.sweep(BEND, number=number)
+        image = scanner.ranges([HERE, (0, 0, 1 + number / 10)], number=number)
+        return cloud.positions.tobytes(), cloud["time"].tobytes(), image.tobytes()
+
+    scanner = Scanner(scene, sensor, columns=["time"], backend=backend, **PHYSICS)
+    alone = [scan(number) for number in range(4)]
+    scanner = Scanner(scene, sensor, columns=["time"], backend=backend, **PHYSICS)
+    with ThreadPoolExecutor(4) as pool:
+        assert list(pool.map(scan, [*range(4)] * 2)) == alone * 2
+
+
+def test_positions_are_those_of_the_world_or_of_the_sensor(scene):
+    far = replace(scene.with_actors([]), origin=np.array([5e5, 4e6, 100]))
+    world = Scanner(far, GRID, backend="numpy").sweep(HERE).positions
+    local = Scanner(scene.with_actors([]), GRID, backend="numpy").sweep(HERE).positions
+    assert np.allclose(world - far.origin, local, atol=1e-6)
+    own = Scanner(far, GRID, backend="numpy", coordinates="sensor").sweep(HERE).positions
+    assert np.allclose(own @ HERE.rotation.T + HERE.position, local, atol=0.02)
+
+
+WRONG = {
+    "number": (lambda s: s.sweep((0, 0, 1), number=-1), "number is -1"),
+    "large": (lambda s: s.sweep((0, 0, 1), number=10**9), "counted up to"),
+    "start": (lambda s: s.ranges((0, 0, 1), start_s=float("nan")), "start_s is nan"),
+    "late": (lambda s: s.sweep(DRIVE, start_s=0.45), "from 0.45 to 0.549167 s"),
+    "actor": (lambda s: s.move("Cart", (0, 0, 1)), "no actor 'Cart'. Did you mean"),
+    "object": (lambda s: s.move("Bowl", (0, 0, 1)), "'Bowl'. It is part of the scene"),
+    "pose": (lambda s: s.sweep("here"), "pose is 'here'"),
+    "infinite": (lambda s: s.sweep((0, 0, np.inf)), "finite"),
+    "poses": (lambda s: s.ranges([[0, 0]]), "of the shape (1, 2)"),
+    "text": (lambda s: s.ranges("here"), "poses is 'here'"),
+    "mixed": (lambda s: s.ranges([HERE, "here"]), "a pose is 'here'"),
+    "turned": (lambda s: s.ranges(np.full((2, 4, 4), [0, 0, 0, 1])), "orthonormal rows"),
+    "row": (lambda s: s.ranges(np.ones((1, 4, 4))), "last row"),
+    "nan": (lambda s: s.ranges([[0, 0, np.nan]]), "finite"),
+    "backend": (lambda s: Scanner(Scene.seed(), GRID, backend="embre"), "'embre'. Did you mean"),
+    "threads": (lambda s: Scanner(Scene.seed(), GRID, threads=0), "threads is 0"),
+    "material": (
+        lambda s: Scanner(Scene.seed(), GRID, materials=[Material("Bow", 0.5)]),
+        "Did you mean",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_wrong_arguments(scene, name):
+    call, says = WRONG[name]
+    with pytest.raises(LidarpoolError) as raised:
+        call(Scanner(scene, GRID, backend="numpy"))
+    assert says in str(raised.value) and len(str(raised.value).splitlines()) <= 2
+
+
+def test_a_scan_needs_no_cluster_and_imports_none():
+    code = (
+        "import sys; from lidarpool import Scanner, Scene, Sensor\n"
+        "scanner = Scanner(Scene.seed(), Sensor.grid(100, 4))\n"
+        "assert len(scanner.sweep((0, 0, 1))) and scanner.ranges((0, 0, 1)).size == 400\n"
+        "print({'dask', 'distributed', 'poolpart'} & sys.modules.keys())"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"

@@ -1,0 +1,52 @@
+"""A scanner and a run over a cluster: the same survey, the same bytes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lidarpool import (
+    Actor,
+    Material,
+    Noise,
+    Pose,
+    Returns,
+    Scanner,
+    Scene,
+    Sensor,
+    Survey,
+    Track,
+    load_sensor,
+    simulate,
+)
+from lidarpool.columns.table import OPTIONAL
+from lidarpool.scene.actors import box
+
+OPTIONS = {
+    "columns": [column.name for column in OPTIONAL],
+    "materials": [Material("*", 0.4, semantic_class=3), Material("Bowl", transparent="mirror")],
+    "returns": Returns("dual", subrays=7, divergence_mrad=10),
+    "noise": Noise(0.02, angle_deg=0.05, dropout=0.1, seed=5),
+    "visibility_km": 2.0,
+}
+CAR = Actor(box("Car", (4.5, 1.8, 1.5)), Track([0, 1], [[-5, 3, 0], [5, 3, 0]]))
+
+
+def test_sweeps_of_a_moving_sensor_are_those_of_a_run(cluster_client, same_cloud):
+    scene = Scene.seed().with_actors([CAR])
+    sensor, track = load_sensor("velodyne/vlp16"), Track([0, 0.5], [[-4, -1, 1], [4, -1, 1]])
+    survey = Survey(sensor, trajectory=track, steps=72, **OPTIONS)
+    cloud = simulate(scene, survey, client=cluster_client).cloud
+    assert (cloud["object"] == 6).any() and (cloud["returns"] == 2).any()
+    scanner = Scanner(scene, sensor, **OPTIONS)
+    for number in range(2):
+        rows = np.flatnonzero(cloud["scan"] // 36 == number)
+        assert len(rows) > 500 and same_cloud(scanner.sweep(track, number=number), cloud.part(rows))
+
+
+def test_stations_are_sweeps_of_as_many_numbers(cluster_client, same_cloud):
+    sensor, poses = Sensor.grid(360, 16), [Pose((0, 0, 1), 20, 5, -3), Pose((2, 1, 1.5))]
+    cloud = simulate(Scene.seed(), Survey(sensor, poses, **OPTIONS), client=cluster_client).cloud
+    scanner = Scanner(Scene.seed(), sensor, **OPTIONS)
+    for number, pose in enumerate(poses):
+        rows = np.flatnonzero(cloud["scan"] // 36 == number)
+        assert len(rows) > 50 and same_cloud(scanner.sweep(pose, number=number), cloud.part(rows))

@@ -1,0 +1,854 @@
+// The page: what is asked of the server, the controls, and the time that is played.
+import { button, dual, element, iconButton, legend, menu, number, row, section, setIcon, slider, stepFor, tick } from "./controls.js";
+import { Picture, lastNotAbove } from "./picture.js";
+
+const FIRST_LOOK = 200_000; // points that are asked for first
+const REST_MS = 250; // for which the camera stands still before points are asked for
+const NEWS_MS = 500;
+const CACHED = 300e6; // bytes of points of single sweeps
+const AHEAD = 3; // sweeps that are asked for before they are played
+const GROWING = 300_000; // points of all sweeps up to now, while they are played
+const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 5, 10];
+const BUDGETS = [0.2, 0.5, 1, 2, 5, 10, 20].map((millions) => millions * 1e6);
+const HIDDEN = "not shown";
+const TYPES = {
+  float32: Float32Array, float64: Float64Array, uint8: Uint8Array, uint16: Uint16Array, uint32: Uint32Array, int32: Int32Array,
+};
+
+const $ = (id) => document.getElementById(id);
+const picture = new Picture($("canvas"), $("labels"), $("axes"), $("scale"), () => moved());
+
+// What users have chosen; a link holds it.
+const chosen = {
+  colour: "z", scene: "grey", filter: [], off: new Set(), show: "all", time: 0, speed: 1, loop: true, images: true,
+  budget: 2e6, size: 1, shading: true, clip: [[null, null], [null, null], [null, null]], rays: true, follow: false,
+};
+let state = null; // of the server: {…, arrays}
+let sweeps = []; // [{first, last, begin, sensor, index}] in order of their beginnings
+let playing = false;
+let picked = []; // points: {place, local, columns}
+
+// -- the server --------------------------------------------------------------------------
+
+async function ask(what, asked = {}, signal = undefined) {
+  const query = new URLSearchParams(Object.entries(asked).filter(([, value]) => value !== undefined));
+  const answer = await fetch(`${what}?${query}`, { signal });
+  if (!answer.ok) throw new Error(`${what}: ${answer.status}`);
+  const bytes = await answer.arrayBuffer();
+  const length = new DataView(bytes).getUint32(0, true);
+  const header = JSON.parse(new TextDecoder().decode(new Uint8Array(bytes, 4, length)));
+  const arrays = {};
+  for (const [name, type, shape, at] of header.arrays) {
+    arrays[name] = new TYPES[type](bytes, 4 + length + at, shape.reduce((a, b) => a * b, 1));
+    arrays[name].shape = shape;
+  }
+  return { ...header, arrays };
+}
+
+let lost = false;
+function failed(error) {
+  if (error.name === "AbortError") return;
+  console.warn(error);
+  if (error instanceof TypeError) {
+    lost = true;
+    setPlaying(false);
+    say("The server of this page has ended.", true);
+  }
+}
+
+function say(words, bad = false) {
+  $("hint").textContent = words;
+  $("hint").className = bad ? "bad" : "";
+}
+
+// -- points ------------------------------------------------------------------------------
+
+const requests = { base: null, detail: null }; // what is under way
+const cache = new Map(); // {key: points of sweeps}, the last used at the end
+let shownKey = null, restTimer = 0, complete = false;
+
+function rangesAt(time) {
+  const words = [];
+  for (const [number, sensor] of picture.sensors.entries()) {
+    if (!sensor.shown) continue;
+    const own = sensor.sweeps;
+    if (!own.length) continue;
+    if (chosen.show === "all") {
+      words.push(`${own[0].first}-${own.at(-1).last}`);
+      continue;
+    }
+    const last = lastNotAbove(sensor.begins, time + 1e-9);
+    if (last < 0) continue;
+    let first = last;
+    if (chosen.show === "now") first = 0;
+    else if (chosen.show !== "sweep") first = Math.min(last, lastNotAbove(sensor.begins, time - +chosen.show) + 1);
+    words.push(`${own[first].first}-${own[last].last}`);
+  }
+  return words.join(",");
+}
+
+const filterText = () => chosen.filter.map(([name, low, high]) => `${name},${low},${high}`).join(";");
+
+function questionAt(time) {
+  const asked = { colour: chosen.colour === HIDDEN ? "z" : chosen.colour };
+  if (chosen.filter.length) asked.filter = filterText();
+  const every = picture.sensors.every((sensor) => sensor.shown);
+  if (sweeps.length && !(chosen.show === "all" && every)) asked.scans = rangesAt(time);
+  return asked;
+}
+
+const keyOf = (asked) => JSON.stringify([asked, state.version, chosen.budget]);
+
+// Shows the points that are chosen; returns whether they are there already.
+function refresh() {
+  if (!state) return true;
+  const asked = questionAt(chosen.time), key = keyOf(asked);
+  if (chosen.colour === HIDDEN) {
+    for (const layer of ["base", "detail"]) picture.setPoints(layer, null);
+    shownKey = null;
+    tellFacts();
+    return true;
+  }
+  if (key === shownKey) return true;
+  if (chosen.show !== "all") return showSweeps(asked, key);
+  shownKey = key;
+  abort("detail");
+  loadBase(asked).catch(failed);
+  return true;
+}
+
+function abort(layer) {
+  requests[layer]?.abort();
+  requests[layer] = null;
+}
+
+async function load(layer, asked) {
+  abort(layer);
+  const request = (requests[layer] = new AbortController());
+  try {
+    return await ask("points", asked, request.signal);
+  } finally {
+    if (requests[layer] === request) {
+      requests[layer] = null;
+      tellFacts();
+    }
+  }
+}
+
+async function loadBase(asked) {
+  tellFacts();
+  const told = await load("base", { ...asked, most: Math.min(FIRST_LOOK, chosen.budget) });
+  picture.setPoints("detail", null);
+  picture.setPoints("base", told);
+  complete = told.arrays.rows.length >= told.count;
+  showLegend(told.legend);
+  tellFacts();
+  if (!complete) await loadDetail();
+}
+
+// More points: all if they are few enough, else those of the picture.
+async function loadDetail() {
+  const base = picture.layers.base?.told;
+  if (!base || complete || chosen.show !== "all" || requests.base) return;
+  const asked = { ...questionAt(chosen.time), most: chosen.budget };
+  const all = base.count <= chosen.budget;
+  if (!all) asked.eye = picture.matrix.elements.map((value) => +value.toPrecision(9)).join(",");
+  const loading = load("detail", asked);
+  tellFacts();
+  const told = await loading;
+  picture.setPoints("detail", told);
+  if (all) {
+    picture.setPoints("base", null);
+    complete = true;
+  }
+  tellFacts();
+}
+
+function moved() {
+  clearTimeout(restTimer);
+  if (state && !complete && chosen.show === "all" && !playing)
+    restTimer = setTimeout(() => { if (!requests.base) loadDetail().catch(failed); }, REST_MS);
+}
+
+function remember(key, told) {
+  cache.delete(key);
+  cache.set(key, told);
+  const size = (one) => one.arrays.rows.length * 20;
+  let sum = [...cache.values()].reduce((bytes, one) => bytes + size(one), 0);
+  for (const [old, one] of cache) {
+    if (sum <= CACHED || cache.size <= AHEAD + 1) break;
+    cache.delete(old);
+    sum -= size(one);
+  }
+}
+
+const underWay = new Map(); // {key: promise}
+function fetchSweeps(asked, key) {
+  if (cache.has(key) || underWay.has(key)) return;
+  const most = chosen.show === "now" && playing ? Math.min(GROWING, chosen.budget) : chosen.budget;
+  const loading = ask("points", { ...asked, most })
+    .then((told) => { remember(key, told); if (key === keyOf(questionAt(chosen.time))) refresh(); })
+    .catch(failed)
+    .finally(() => { underWay.delete(key); tellFacts(); });
+  underWay.set(key, loading);
+}
+
+function showSweeps(asked, key) {
+  abort("base");
+  abort("detail");
+  if (!cache.has(key)) {
+    fetchSweeps(asked, key);
+    return false;
+  }
+  const told = cache.get(key);
+  remember(key, told);
+  shownKey = key;
+  complete = true;
+  picture.setPoints("base", null);
+  picture.setPoints("detail", told);
+  showLegend(told.legend);
+  tellFacts();
+  return true;
+}
+
+// -- the panel ---------------------------------------------------------------------------
+
+const panel = {};
+
+const onlyObject = (name) => {
+  const limits = chosen.filter.find(([column]) => column === name);
+  return limits && limits[1] === limits[2] ? limits[1] : null;
+};
+
+let legendText = "";
+function showLegend(told) {
+  const text = JSON.stringify([told, chosen.filter]);
+  if (text === legendText) return;
+  legendText = text;
+  const column = told?.column;
+  panel.legend.replaceChildren(legend(chosen.colour === HIDDEN ? null : told, onlyObject(column), (value) => {
+    setLimits(column, onlyObject(column) === value ? null : [value, value]);
+  }));
+}
+
+function tellFacts() {
+  if (!state || !panel.facts) return;
+  const layers = Object.values(picture.layers).map((points) => points.told);
+  const some = layers[0]?.count ?? (chosen.colour === HIDDEN ? state.points : 0);
+  const count = state.sampled ? state.points : some; // of a run, some parts are read
+  const drawn = Math.min(picture.drawn, count), n = (value) => value.toLocaleString("en");
+  const parts = [`<b>${n(count)} points</b>`];
+  if (count < state.points) parts.push(`of ${n(state.points)}`);
+  if (drawn < count && chosen.colour !== HIDDEN) parts.push(`· ${n(drawn)} drawn`);
+  panel.facts.innerHTML = parts.join(" ");
+  if (requests.detail || requests.base || (underWay.size && !playing)) panel.facts.append(" …");
+}
+
+function setLimits(name, limits) {
+  chosen.filter = chosen.filter.filter(([column]) => column !== name);
+  if (limits) chosen.filter.push([name, ...limits]);
+  if (name === "object") picture.showObjects(limits);
+  legendText = "";
+  tellFilter();
+  refresh();
+}
+
+function tellFilter() {
+  panel.limits.replaceChildren(
+    ...chosen.filter.map(([name, low, high]) => element("div", { className: "note", textContent: limitWords(name, low, high) })),
+    ...(chosen.filter.length ? [button("Show all", () => {
+      chosen.filter = [];
+      picture.showObjects(null);
+      legendText = "";
+      tellFilter();
+      showFilterInput(panel.filterBy.menu.value).catch(failed);
+      refresh();
+    })] : []),
+  );
+}
+
+const filterNames = {}; // {column: {value: name}}
+function limitWords(name, low, high) {
+  const names = filterNames[name] ?? {};
+  if (low === high) return `${name}: only ${names[low] ?? number(low)}`;
+  const column = state.columns.find((one) => one.name === name), size = column?.unit === "s" ? 1e9 : 1;
+  const [a, b] = [low, high].map((value) => (Math.abs(value) > 1e300 ? null : number(value / size)));
+  return `${name}: ${a === null ? `up to ${b}` : b === null ? `from ${a}` : `${a} to ${b}`} ${column?.unit ?? ""}`;
+}
+
+async function showFilterInput(name) {
+  const told = await ask("column", { name });
+  const limits = chosen.filter.find(([column]) => column === name);
+  if (told.labels) {
+    filterNames[name] = Object.fromEntries(told.labels.map(([text, value]) => [value, text]));
+    const options = [["", "all"], ...told.labels.map(([text, value]) => [value, text])];
+    const only = limits && limits[1] === limits[2] ? limits[1] : "";
+    panel.filterInput.replaceChildren(menu("only", options, only, (value) => setLimits(name, value === "" ? null : [+value, +value])));
+    return;
+  }
+  const span = told.high - told.low, step = told.whole ? Math.max(1, Math.round(stepFor(span))) : stepFor(span);
+  const low = Math.floor(told.low / step) * step, high = Math.max(Math.ceil(told.high / step) * step, low + step);
+  const ends = limits ? [limits[1] / told.unit, limits[2] / told.unit] : [null, null];
+  const apply = later((some) => setLimits(name, some.every((one) => one === null) ? null :
+    [some[0] === null ? -1.7e308 : some[0] * told.unit, some[1] === null ? 1.7e308 : some[1] * told.unit]));
+  panel.filterInput.replaceChildren(dual("range", low, high, step, ends, (value) => number(value, step), apply));
+}
+
+function later(act, ms = 120) {
+  let timer = 0;
+  return (...values) => {
+    clearTimeout(timer);
+    timer = setTimeout(() => act(...values), ms);
+  };
+}
+
+const savedTheme = () => { try { return localStorage.getItem("lidarpool-theme"); } catch { return null; } };
+const systemDark = matchMedia("(prefers-color-scheme: dark)");
+function setTheme(theme) {
+  document.documentElement.dataset.theme = theme;
+  picture.setTheme(theme);
+}
+
+function buildPanel() {
+  const columns = state.columns.map((column) => column.name);
+  panel.facts = element("div", { id: "facts" });
+  panel.progress = element("div", { id: "progress" });
+  const head = element(
+    "header", {}, element("h1", { textContent: document.title, title: document.title }),
+    iconButton("link", "Copy the link to this view", copyLink),
+    iconButton("picture", "Save the picture", () => picture.save(`${document.title}.png`)),
+    iconButton("theme", "Light or dark", () => {
+      const theme = document.documentElement.dataset.theme === "dark" ? "light" : "dark";
+      try { localStorage.setItem("lidarpool-theme", theme); } catch { /* a page in a frame may not */ }
+      setTheme(theme);
+    }),
+  );
+  panel.legend = element("div");
+  const points = section("Points", true,
+    (panel.colour = menu("colour", [...columns, HIDDEN], chosen.colour, (value) => { chosen.colour = value; legendText = ""; refresh(); if (value === HIDDEN) showLegend(null); })),
+    panel.legend,
+    slider("size", -1, 1, 0.05, Math.log10(chosen.size), (value) => `${(10 ** value).toFixed(1)}×`, (value) => {
+      chosen.size = picture.pointScale = 10 ** value;
+      picture.sizePoints();
+    }),
+    menu("at most", BUDGETS.map((count) => [count, `${(count / 1e6).toLocaleString("en")} million`]), chosen.budget, (value) => { chosen.budget = +value; shownKey = null; refresh(); }),
+    tick("shade by depth", chosen.shading, (on) => { chosen.shading = on; picture.strength = on ? 1 : 0; picture.dirty = true; }),
+  );
+  const parts = [head, panel.progress, panel.facts, points];
+  if (state.scene) {
+    panel.sceneLegend = element("div");
+    parts.push(section("Scene", true,
+      menu("colour", [...state.scene, HIDDEN], chosen.scene, (value) => { chosen.scene = value; loadSurface().catch(failed); }),
+      panel.sceneLegend,
+      tick("sample rays", chosen.rays, (on) => { chosen.rays = on; showRays(); }),
+    ));
+  }
+  if (picture.sensors.length) {
+    panel.sensors = picture.sensors.map((sensor, k) => tick([sensor.name, sensor.model].filter(Boolean).join(": ") || `sensor ${k + 1}`, sensor.shown, (on) => {
+      sensor.shown = on;
+      if (on) chosen.off.delete(k); else chosen.off.add(k);
+      picture.setTime(chosen.time);
+      buildSteps();
+      refresh();
+      showImages();
+    }));
+    parts.push(section("Sensors", picture.sensors.length < 9, ...panel.sensors));
+  }
+  const sides = [["all", "All"], ["top", "Top"], ["side", "Side"], ["front", "Front"]].map(([side, text]) => button(text, () => look(side)));
+  if (picture.sensors.length) sides.push(button("Sensor", () => look("sensor")));
+  panel.parallel = tick("parallel projection", false, (on) => picture.useParallel(on));
+  parts.push(section("View", true, element("div", { className: "buttons" }, ...sides), panel.parallel));
+  panel.point = element("div", { className: "note", textContent: "Click a point; Shift and click another to measure." });
+  parts.push(section("Point", true, panel.point));
+  panel.limits = element("div");
+  panel.filterInput = element("div");
+  panel.filterBy = menu("column", columns, columns.includes("object") ? "object" : columns[0], (name) => showFilterInput(name).catch(failed));
+  const filter = section("Filter", chosen.filter.length > 0, panel.filterBy, panel.filterInput, panel.limits);
+  filter.addEventListener("toggle", () => { if (filter.open) showFilterInput(panel.filterBy.menu.value).catch(failed); });
+  panel.clip = element("div");
+  parts.push(filter, section("Clip box", false, panel.clip, button("Show all", () => setClip([[null, null], [null, null], [null, null]]))));
+  parts.push(section("Keys", false, element("dl", { className: "keys", innerHTML: [
+    ["space", "play or pause"], ["← →", "one sweep back or on; ten with Shift"], ["Home End", "first or last sweep"],
+    ["A T S F", "all, from the top, side, front"], ["P", "parallel or perspective"], ["C", "copy the link"],
+  ].map(([keys, words]) => `<dt>${keys.split(" ").map((key) => `<kbd>${key}</kbd>`).join(" ")}</dt><dd>${words}</dd>`).join("") })));
+  $("panel").replaceChildren(...parts.flatMap((part) => (part === panel.facts && state.note ? [part, element("div", { className: "note", style: { padding: "0 12px 8px" }, textContent: state.note })] : [part])));
+  buildClip();
+  tellFilter();
+}
+
+function look(side) {
+  if (side === "sensor") picture.lookFromSensor();
+  else picture.look(side);
+  panel.parallel.box.checked = picture.isParallel;
+}
+
+function buildClip() {
+  const names = ["x", "y", "z"];
+  panel.clip.replaceChildren(...names.map((name, axis) => {
+    const [low, high] = state.bounds.map((corner) => corner[axis] + state.origin[axis]);
+    const step = stepFor(high - low), first = Math.floor(low / step) * step, last = Math.ceil(high / step + 1e-9) * step;
+    const ends = chosen.clip[axis].map((value) => (value === null ? null : value + state.origin[axis]));
+    return dual(`${name}, m`, first, last, step, ends, (value) => number(value, step), (some) => {
+      chosen.clip[axis] = some.map((value) => (value === null ? null : value - state.origin[axis]));
+      picture.setClip(chosen.clip);
+    });
+  }));
+}
+
+function setClip(limits) {
+  chosen.clip = limits;
+  picture.setClip(limits);
+  buildClip();
+}
+
+async function loadSurface() {
+  if (!state.scene) return;
+  const hidden = chosen.scene === HIDDEN;
+  picture.actorsHidden = hidden;
+  picture.colourActors(chosen.scene === "object");
+  const told = hidden ? null : await ask("surface", { colour: chosen.scene });
+  if (hidden !== (chosen.scene === HIDDEN)) return;
+  picture.setSurface(told);
+  picture.showObjects(picture.onlyObjects);
+  panel.sceneLegend.replaceChildren(legend(told?.legend, onlyObject("object"), (value) => setLimits("object", onlyObject("object") === value ? null : [value, value])));
+  if (told && !loadSurface.looked) {
+    loadSurface.looked = true;
+    loadSurface.floor = told.floor;
+    const cut = Math.min(told.roof_cut ?? Infinity, state.cut ?? Infinity);
+    if (Number.isFinite(cut) && !loadSurface.linked) setClip([[null, null], [null, null], [null, cut]]);
+    showPath();
+  }
+}
+
+// Rays are of all sweeps.
+function showRays() {
+  picture.raysShown = chosen.rays && (chosen.show === "all");
+  picture.showObjects(picture.onlyObjects);
+}
+
+const showPath = () => picture.setPath(state.path, loadSurface.floor ?? state.box[0][2]);
+
+// -- picked points -----------------------------------------------------------------------
+
+async function pick(x, y, measure) {
+  const found = picture.pick(x, y);
+  if (!found) {
+    picked = [];
+    return showPicked();
+  }
+  const told = await ask("point", { row: found.row });
+  const one = { local: found.place, place: told.place, columns: told.columns };
+  picked = measure && picked.length ? [picked[0], one] : [one];
+  return showPicked();
+}
+
+function showPicked() {
+  const rows = [], metres = (value) => `${value.toLocaleString("en", { minimumFractionDigits: 3, maximumFractionDigits: 3 })} m`;
+  let text = "";
+  if (picked.length === 2) {
+    const way = picked[1].place.map((value, axis) => value - picked[0].place[axis]);
+    text = metres(Math.hypot(...way));
+    rows.push(["distance", text], ["horizontal", metres(Math.hypot(way[0], way[1]))]);
+    ["x", "y", "z"].forEach((axis, k) => rows.push([`Δ${axis}`, metres(way[k])]));
+  }
+  const point = picked.at(-1);
+  if (point) ["x", "y", "z"].forEach((axis, k) => rows.push([axis, metres(point.place[k])]));
+  if (point) rows.push(...point.columns);
+  picture.mark(picked.map((one) => one.local), text);
+  if (!rows.length) panel.point.replaceChildren("Click a point; Shift and click another to measure.");
+  else panel.point.replaceChildren(element("table", { className: "point" }, ...rows.map(([name, value]) =>
+    element("tr", {}, element("td", { textContent: name }), element("td", { textContent: value })))));
+}
+
+// -- time --------------------------------------------------------------------------------
+
+let steps = []; // beginnings of the sweeps of the sensors that are shown, ascending
+const clock = {};
+
+function buildSteps() {
+  const begins = sweeps.filter((sweep) => picture.sensors[sweep.sensor]?.shown).map((sweep) => sweep.begin);
+  steps = [...new Set(begins)].sort((a, b) => a - b);
+  if (clock.ticks) drawTicks();
+}
+
+const duration = () => Math.max(state.duration, 1e-9);
+
+function buildTime() {
+  const timed = sweeps.length > 0 && picture.sensors.length > 0;
+  $("time").hidden = !timed;
+  if (!timed) return;
+  clock.play = iconButton("play", "Play (space)", () => setPlaying(!playing));
+  const shows = [["all", "all points"], ["sweep", "one sweep"], [0.5, "last 0.5 s"], [2, "last 2 s"], [10, "last 10 s"], ["now", "all until now"]];
+  clock.show = menu("", shows.filter(([value]) => !(+value >= state.duration)), chosen.show, (value) => { clock.own = true; setShow(value); });
+  clock.show.title = "Points that are shown";
+  clock.slider = element("input", { type: "range", min: 0, max: duration(), step: "any", value: chosen.time, title: "Time" });
+  clock.slider.setAttribute("aria-label", "time, seconds");
+  clock.slider.oninput = () => { leaveAll(); setTime(+clock.slider.value); };
+  clock.ticks = element("canvas");
+  clock.now = element("span", { className: "now" });
+  clock.speed = menu("", SPEEDS.map((speed) => [speed, `${speed}×`]), chosen.speed, (value) => { chosen.speed = +value; });
+  clock.speed.title = "Speed; 1× is as fast as the survey";
+  clock.loop = iconButton("loop", "Play again from the start", () => { chosen.loop = !chosen.loop; showToggles(); });
+  clock.follow = button("Follow", () => { chosen.follow = picture.follow = !chosen.follow; showToggles(); });
+  clock.follow.title = "Move the camera with the carrier";
+  clock.follow.hidden = !picture.sensors.some((sensor) => sensor.moves);
+  clock.images = button("Range image", () => { chosen.images = !chosen.images; showToggles(); showImages(); });
+  $("time").replaceChildren(
+    element("div", { className: "line" }, clock.slider, clock.ticks),
+    element("div", { className: "transport" },
+      iconButton("back", "Sweep back (←)", () => stepBy(-1)), clock.play, iconButton("next", "Sweep on (→)", () => stepBy(1)), clock.speed, clock.loop),
+    clock.now,
+    element("div", { className: "options" }, clock.show, clock.follow, clock.images),
+  );
+  new ResizeObserver(drawTicks).observe(clock.ticks);
+  showToggles();
+}
+
+function showToggles() {
+  for (const [control, on] of [[clock.loop, chosen.loop], [clock.follow, chosen.follow], [clock.images, chosen.images]])
+    control.setAttribute("aria-pressed", on);
+}
+
+function drawTicks() {
+  const { clientWidth: width, clientHeight: height } = clock.ticks, ratio = devicePixelRatio;
+  if (!width) return;
+  Object.assign(clock.ticks, { width: width * ratio, height: height * ratio });
+  const pen = clock.ticks.getContext("2d"), style = getComputedStyle(document.body);
+  pen.scale(ratio, ratio);
+  const room = 8, at = (time) => room + (width - 2 * room) * (time / duration()); // a thumb is 16 pixels wide
+  pen.fillStyle = style.getPropertyValue("--line");
+  if (steps.length < width / 3) for (const time of steps) pen.fillRect(at(time), 0, 1, 4);
+  const most = width / 70, step = [1, 2, 5, 10].map((n) => n * 10 ** Math.floor(Math.log10(duration() / most))).find((n) => duration() / n <= most);
+  pen.fillStyle = style.getPropertyValue("--muted");
+  pen.font = "11px system-ui, sans-serif";
+  for (let time = 0; time <= duration() * 1.0001; time += step) {
+    pen.textAlign = time === 0 ? "left" : at(time) > width - 20 ? "right" : "center";
+    pen.fillText(`${number(time, step)} s`, Math.min(Math.max(at(time), 0), width), 14);
+    pen.fillRect(at(time), 0, 1, 4);
+  }
+}
+
+function setShow(value) {
+  chosen.show = value;
+  showRays();
+  clock.show.value = value;
+  shownKey = null;
+  refresh();
+  showImages();
+  tellTime();
+}
+
+// Playing and stepping shows single sweeps, unless a user has chosen what is shown.
+function leaveAll() {
+  if (chosen.show === "all" && !clock.own) setShow("sweep");
+}
+
+function setTime(time) {
+  chosen.time = Math.min(Math.max(time, 0), duration());
+  clock.slider.value = chosen.time;
+  picture.setTime(chosen.time);
+  tellTime();
+  const ready = refresh();
+  showImages();
+  return ready;
+}
+
+function tellTime() {
+  const digits = duration() < 100 ? 3 : 1;
+  const index = lastNotAbove(steps, chosen.time + 1e-9);
+  clock.now.textContent = `${chosen.time.toFixed(digits)} s · sweep ${index + 1} of ${steps.length}`;
+}
+
+function stepBy(count) {
+  if (!steps.length) return;
+  setPlaying(false);
+  leaveAll();
+  const index = lastNotAbove(steps, chosen.time + 1e-9);
+  const back = count < 0 && chosen.time - steps[Math.max(index, 0)] > 1e-6 ? 1 : 0;
+  setTime(steps[Math.min(Math.max(index + count + back, 0), steps.length - 1)]);
+}
+
+function setPlaying(on) {
+  if (on === playing || (on && (lost || !steps.length))) return;
+  playing = on;
+  setIcon(clock.play, on ? "pause" : "play");
+  clock.play.title = on ? "Pause (space)" : "Play (space)";
+  if (!on) return moved();
+  leaveAll();
+  if (chosen.time >= duration() - 1e-6) setTime(0);
+}
+
+// The time of a sweep does not pass before its points are there.
+function play(seconds) {
+  let time = chosen.time + seconds * chosen.speed;
+  if (time >= duration()) {
+    if (!chosen.loop) {
+      setTime(duration());
+      setPlaying(false);
+      return;
+    }
+    time = 0;
+  }
+  if (chosen.show !== "all" && chosen.colour !== HIDDEN) {
+    const next = lastNotAbove(steps, time + 1e-9);
+    for (let k = 0; k <= AHEAD; k++) {
+      const asked = questionAt(k ? steps[(next + k) % steps.length] : time);
+      fetchSweeps(asked, keyOf(asked));
+    }
+    if (!cache.has(keyOf(questionAt(time)))) return;
+  }
+  setTime(time);
+}
+
+// -- range images ------------------------------------------------------------------------
+
+const images = new Map(); // {sensor: {sweep, canvas, caption}}
+const MOST_IMAGES = 3;
+
+function showImages() {
+  const box = $("images");
+  const on = chosen.images && chosen.show !== "all" && sweeps.length > 0 && picture.sensors.some((sensor) => sensor.shown);
+  box.hidden = !on;
+  if (!on) return;
+  const shown = [...picture.sensors.entries()].filter(([, sensor]) => sensor.shown && sensor.sweeps.length).slice(0, MOST_IMAGES);
+  for (const [number, { figure }] of images) figure.hidden = !shown.some(([other]) => other === number);
+  for (const [number, sensor] of shown) {
+    const index = lastNotAbove(sensor.begins, chosen.time + 1e-9);
+    if (index < 0) continue;
+    if (!images.has(number)) {
+      const canvas = element("canvas", { width: 1, height: 1 }), bar = element("i"), words = element("span");
+      const figure = element("figure", {}, element("figcaption", {}, element("b", { textContent: sensor.name || sensor.model || "sensor" }), words, bar), canvas);
+      box.append(figure);
+      images.set(number, { canvas, words, bar, figure, sweep: -1, wanted: -1, busy: false });
+    }
+    const image = images.get(number);
+    image.wanted = sensor.sweeps[index].index;
+    loadImage(image).catch(failed);
+  }
+}
+
+async function loadImage(image) {
+  if (image.busy || image.wanted === image.sweep) return;
+  image.busy = true;
+  try {
+    while (image.wanted !== image.sweep) {
+      const sweep = image.wanted, told = await ask("range", { sweep });
+      const [height, width] = told.arrays.image.shape;
+      Object.assign(image.canvas, { width, height });
+      image.canvas.getContext("2d").putImageData(new ImageData(new Uint8ClampedArray(told.arrays.image), width, height), 0, 0);
+      image.words.textContent = `range, ${number(told.low, 0.1)} to ${number(told.high, 0.1)} m`;
+      image.bar.style.background = "linear-gradient(to right,#fde725,#5ec962,#21918c,#3b528b,#440154)";
+      image.sweep = sweep;
+    }
+  } finally {
+    image.busy = false;
+  }
+}
+
+// -- links -------------------------------------------------------------------------------
+
+function linkText() {
+  const { position } = picture.camera, { target } = picture.controls;
+  const three = (place) => place.toArray().map((value) => +value.toPrecision(7)).join(",");
+  const words = {
+    camera: `${three(position)};${three(target)}`, colour: chosen.colour, scene: chosen.scene, show: chosen.show, time: chosen.time.toFixed(6),
+    clip: chosen.clip.map((pair) => pair.map((value) => value ?? "").join(",")).join(";"), size: chosen.size.toFixed(3),
+  };
+  if (picture.isParallel) words.parallel = picture.viewHeight.toPrecision(7);
+  if (chosen.filter.length) words.filter = filterText();
+  if (chosen.off.size) words.off = [...chosen.off].join(",");
+  return new URLSearchParams(words).toString();
+}
+
+async function copyLink() {
+  history.replaceState(null, "", `#${linkText()}`);
+  try {
+    await navigator.clipboard.writeText(location.href);
+    say("The link to this view was copied.");
+  } catch {
+    say("The link is in the address bar.");
+  }
+  setTimeout(() => say(""), 2500);
+}
+
+function readLink() {
+  const words = new URLSearchParams(location.hash.slice(1));
+  const columns = state.columns.map((column) => column.name), get = (name) => words.get(name) ?? "";
+  if ([...columns, HIDDEN].includes(get("colour"))) chosen.colour = get("colour");
+  if ([...(state.scene ?? []), HIDDEN].includes(get("scene"))) chosen.scene = get("scene");
+  if (get("show")) { chosen.show = get("show"); clock.own = true; }
+  if (get("size")) chosen.size = picture.pointScale = Math.min(10, Math.max(0.1, +get("size") || 1));
+  chosen.time = Math.min(Math.max(+get("time") || 0, 0), state.duration);
+  for (const entry of get("filter").split(";").filter(Boolean)) {
+    const [name, low, high] = entry.split(",");
+    if (columns.includes(name) && Number.isFinite(+low) && Number.isFinite(+high)) chosen.filter.push([name, +low, +high]);
+  }
+  for (const k of get("off").split(",").filter(Boolean)) if (picture.sensors[k]) { chosen.off.add(+k); picture.sensors[k].shown = false; }
+  if (words.has("clip")) {
+    loadSurface.linked = true;
+    const pairs = get("clip").split(";").map((pair) => pair.split(",").map((value) => (value === "" || !Number.isFinite(+value) ? null : +value)));
+    if (pairs.length === 3 && pairs.every((pair) => pair.length === 2)) chosen.clip = pairs;
+  }
+  return words;
+}
+
+function readCamera(words) {
+  const places = (words.get("camera") ?? "").split(";").map((place) => place.split(",").map(Number));
+  if (places.length !== 2 || places.flat().length !== 6 || !places.flat().every(Number.isFinite)) return;
+  const { position, controls } = { position: picture.camera.position.clone(), controls: picture.controls };
+  picture.place(position.fromArray(places[0]), controls.target.clone().fromArray(places[1]));
+  const height = +words.get("parallel");
+  if (height > 0) {
+    picture.useParallel(true);
+    Object.assign(picture.parallel, { top: height / 2, bottom: -height / 2, zoom: 1 });
+    picture.resize();
+    panel.parallel.box.checked = true;
+  }
+}
+
+// -- the beginning, news of a run, and the frames ----------------------------------------
+
+function takeState(told) {
+  state = told;
+  const { arrays } = told;
+  const own = state.sensors.map((sensor, k) => ({
+    ...sensor, shown: !chosen.off.has(k), times: arrays[`sensor${k}_times`], places: arrays[`sensor${k}_places`], sweeps: [], begins: [],
+  }));
+  sweeps = [];
+  if (arrays.sweep_scans) {
+    arrays.sweep_begins.forEach((begin, index) => {
+      const sweep = { first: arrays.sweep_scans[index], last: arrays.sweep_scans[index + 1] - 1, begin, sensor: arrays.sweep_sensor[index], index };
+      sweeps.push(sweep);
+      own[sweep.sensor]?.sweeps.push(sweep);
+    });
+    for (const sensor of own) sensor.begins = Float64Array.from(sensor.sweeps, (sweep) => sweep.begin);
+  }
+  picture.setSensors(own);
+  picture.setActors(state.actors.map((actor, k) => ({
+    ...actor, object: state.statics + k, colour: state.actor_colours[k], corners: arrays[`actor${k}_corners`],
+    times: arrays[`actor${k}_times`], places: arrays[`actor${k}_places`], turns: arrays[`actor${k}_turns`],
+  })));
+  picture.setRays(arrays.rays);
+  document.title = state.title;
+}
+
+// What is new of a run.
+async function news() {
+  for (;;) {
+    await new Promise((done) => setTimeout(done, document.hidden ? 4 * NEWS_MS : NEWS_MS));
+    const told = await ask("news");
+    if (told.rays_version !== news.rays) {
+      news.rays = told.rays_version;
+      picture.setRays(told.arrays.rays);
+    }
+    if (panel.progress.innerHTML !== told.panel) panel.progress.innerHTML = told.panel;
+    panel.stop.textContent = told.over ? "Close" : told.stopping ? "Stopping" : "Stop";
+    if (told.time !== null && !told.over) picture.setTime(told.time);
+    state.points = told.points;
+    if (told.version !== state.version && told.ends === (news.ends ?? 0)) {
+      state.version = told.version;
+      if (chosen.show === "all") await loadBase(questionAt(0));
+    }
+    if (chosen.scene === "hits" && told.hits_version !== news.hits) {
+      news.hits = told.hits_version;
+      await loadSurface();
+    }
+    if (told.path && !state.path) {
+      state.path = told.path;
+      showPath();
+    }
+    if (told.ends !== (news.ends ?? 0)) {
+      Object.assign(news, { ends: told.ends, over: true });
+      cache.clear();
+      takeState(await ask("state"));
+      picture.setTime(chosen.time);
+      buildSteps();
+      buildTime();
+      shownKey = null;
+      refresh();
+      await loadSurface();
+    }
+  }
+}
+
+function follow() {
+  panel.stop = element("button", { type: "button", className: "stop", textContent: "Stop", style: { margin: "0 12px 8px" } });
+  panel.stop.onclick = () => fetch("stop", { method: "POST", headers: { "X-Lidarpool": "1" } }).catch(failed);
+  panel.progress.after(panel.stop);
+  news().catch((error) => {
+    failed(error);
+    panel.stop.hidden = true;
+  });
+}
+
+function keys(event) {
+  if (event.ctrlKey || event.metaKey || event.altKey) return;
+  if (["INPUT", "SELECT"].includes(event.target.tagName) && event.target !== clock.slider) return;
+  const acts = {
+    " ": () => setPlaying(!playing), ArrowLeft: () => stepBy(event.shiftKey ? -10 : -1), ArrowRight: () => stepBy(event.shiftKey ? 10 : 1),
+    Home: () => stepBy(-1e9), End: () => stepBy(1e9), a: () => look("all"), t: () => look("top"), s: () => look("side"), f: () => look("front"),
+    p: () => { picture.useParallel(!picture.isParallel); panel.parallel.box.checked = picture.isParallel; }, c: copyLink,
+  };
+  const timed = [" ", "ArrowLeft", "ArrowRight", "Home", "End"];
+  const act = acts[event.key.length === 1 ? event.key.toLowerCase() : event.key];
+  if (!act || (timed.includes(event.key) && $("time").hidden)) return;
+  if (event.target.tagName === "BUTTON" && event.key === " ") event.target.blur();
+  event.preventDefault();
+  act();
+}
+
+let pressed = null;
+function mouse() {
+  const canvas = $("canvas");
+  canvas.addEventListener("pointerdown", (event) => { pressed = event.button === 0 ? [event.offsetX, event.offsetY] : null; canvas.focus(); });
+  canvas.addEventListener("pointerup", (event) => {
+    if (pressed && Math.hypot(event.offsetX - pressed[0], event.offsetY - pressed[1]) < 4) pick(event.offsetX, event.offsetY, event.shiftKey).catch(failed);
+    pressed = null;
+  });
+}
+
+async function begin() {
+  setTheme(savedTheme() ?? (systemDark.matches ? "dark" : "light"));
+  systemDark.addEventListener("change", () => { if (!savedTheme()) setTheme(systemDark.matches ? "dark" : "light"); });
+  say("Reading …");
+  takeState(await ask("state"));
+  const words = readLink();
+  picture.resize();
+  picture.frame(state.box, state.bounds);
+  buildPanel();
+  setTheme(document.documentElement.dataset.theme);
+  buildSteps();
+  buildTime();
+  picture.setTime(chosen.time);
+  if (!$("time").hidden) tellTime();
+  setClip(chosen.clip);
+  showRays();
+  picture.showObjects(chosen.filter.find(([name]) => name === "object")?.slice(1) ?? null);
+  readCamera(words);
+  showPath();
+  say("");
+  mouse();
+  addEventListener("keydown", keys);
+  addEventListener("hashchange", () => location.reload()); // another link was entered
+  document.addEventListener("visibilitychange", () => { if (document.hidden) setPlaying(false); });
+  let before = performance.now();
+  const frame = (now) => {
+    if (playing) play(Math.min((now - before) / 1000, 0.25));
+    before = now;
+    picture.draw();
+    requestAnimationFrame(frame);
+  };
+  requestAnimationFrame(frame);
+  if (state.live) follow();
+  refresh();
+  showImages();
+  await loadSurface();
+}
+
+begin().catch((error) => {
+  console.error(error);
+  say("The page could not be read: is its server still there?", true);
+});
+
+// For tests and for the console of curious users.
+Object.assign(window, { lidarpool: { picture, chosen, get state() { return state; }, get playing() { return playing; }, get steps() { return steps; } } });

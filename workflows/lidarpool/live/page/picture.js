@@ -1,0 +1,661 @@
+// The 3D picture: points with eye-dome lighting, surfaces, sensors, actors, path, camera.
+import * as THREE from "./three.min.js";
+import { element } from "./controls.js";
+
+THREE.ColorManagement.enabled = false; // colours are those of the legends
+
+const THEMES = {
+  light: { back: 0xffffff, grid: 0xdfe3e8, surface: 0xd3d7dc, rays: 0xe88c96 },
+  dark: { back: 0x14171c, grid: 0x2a3038, surface: 0x3c434d, rays: 0x8f3c48 },
+};
+const RED = 0xe0182d, GREEN = 0x149650, DISC = 0x78828f, MARK = 0xff00a0;
+const FOV = 45; // degrees, from the upper to the lower edge
+const SIDES = { all: [0.55, -1, 0.62], top: [0, 0, 1], side: [1, 0, 0], front: [0, -1, 0] };
+const PICKED_WITHIN = 6; // pixels
+const SAME_SURFACE = 1.03; // times the distance of the nearest
+const AS_POINTS = 0.25; // alpha of pixels that are points: only these get eye-dome lighting
+
+const POINT_VERTEX = `
+  uniform float size, pixels, least, most;
+  uniform vec3 low, high;
+  uniform bool flat_;
+  attribute vec4 colour;
+  varying vec3 shade;
+  void main() {
+    shade = colour.rgb;
+    vec4 at = modelViewMatrix * vec4(position, 1.0);
+    gl_Position = projectionMatrix * at;
+    gl_PointSize = clamp(size * pixels / (flat_ ? 1.0 : max(-at.z, 1e-6)), least, most);
+    if (any(lessThan(position, low)) || any(greaterThan(position, high)))
+      gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
+  }`;
+const POINT_FRAGMENT = `
+  varying vec3 shade;
+  void main() {
+    vec2 away = gl_PointCoord - 0.5;
+    if (dot(away, away) > 0.25) discard;
+    gl_FragColor = vec4(shade, ${AS_POINTS});
+  }`;
+
+// Eye-dome lighting: Boucheny, "Visualisation scientifique de grands volumes de données" (2009).
+// A pixel is darker the more its neighbours lie before it.
+const SHADE_VERTEX = `
+  varying vec2 at;
+  void main() { at = uv; gl_Position = vec4(position.xy, 0.0, 1.0); }`;
+const SHADE_FRAGMENT = `
+  uniform sampler2D picture, depths;
+  uniform vec2 pixel;
+  uniform float near, far, strength;
+  uniform bool flat_;
+  varying vec2 at;
+  const float NOTHING = -1e9;
+  float depth(vec2 where_) {
+    float d = texture2D(depths, where_).x;
+    if (d >= 1.0) return NOTHING;
+    return flat_ ? d * (far - near) : log2(near * far / (far - d * (far - near)));
+  }
+  void main() {
+    vec4 found = texture2D(picture, at);
+    float own = depth(at), sum = 0.0;
+    if (strength > 0.0 && found.a > 0.1 && found.a < 0.6 && own > NOTHING) {
+      for (int k = 0; k < 8; k++) {
+        float angle = float(k) * 0.7853982;
+        float other = depth(at + 1.4 * pixel * vec2(cos(angle), sin(angle)));
+        if (other > NOTHING) sum += min(strength * max(0.0, own - other), 1.2);
+      }
+    }
+    gl_FragColor = vec4(found.rgb * exp(-sum / 8.0), 1.0);
+  }`;
+
+const lerp = (a, b, share) => a + (b - a) * share;
+
+// Index of the last of ascending numbers that is not above one; -1 if all are.
+export function lastNotAbove(numbers, value) {
+  let low = 0, high = numbers.length;
+  while (low < high) {
+    const middle = (low + high) >> 1;
+    if (numbers[middle] <= value) low = middle + 1;
+    else high = middle;
+  }
+  return low - 1;
+}
+
+// Position at a time of something that was at places (k, 3) at ascending times.
+function placeAt(times, places, time, moves) {
+  const before = Math.max(0, lastNotAbove(times, time));
+  const after = Math.min(before + 1, times.length - 1);
+  const span = times[after] - times[before];
+  const share = moves && span > 0 ? Math.min(1, Math.max(0, (time - times[before]) / span)) : 0;
+  return [0, 1, 2].map((axis) => lerp(places[3 * before + axis], places[3 * after + axis], share));
+}
+
+export class Picture {
+  constructor(canvas, labels, axes, scale, changed) {
+    Object.assign(this, { canvas, labels, axes, scale, changed });
+    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: false, powerPreference: "high-performance" });
+    this.renderer.outputColorSpace = THREE.LinearSRGBColorSpace;
+    this.renderer.localClippingEnabled = true;
+    this.scene = new THREE.Scene();
+    this.scene.add(new THREE.HemisphereLight(0xffffff, 0xb9bdc4, 2.1));
+    const sun = new THREE.DirectionalLight(0xffffff, 1.4);
+    sun.position.set(0.15, -0.75, 1.2);
+    this.scene.add(sun);
+    this.perspective = new THREE.PerspectiveCamera(FOV, 1, 0.1, 1000);
+    this.parallel = new THREE.OrthographicCamera(-1, 1, 1, -1, 0, 1000);
+    for (const camera of [this.perspective, this.parallel]) camera.up.set(0, 0, 1);
+    this.camera = this.perspective;
+    this.controls = new THREE.OrbitControls(this.camera, canvas);
+    Object.assign(this.controls, { enableDamping: true, dampingFactor: 0.18, zoomToCursor: true, screenSpacePanning: true });
+    this.controls.addEventListener("change", () => { this.dirty = true; changed(); });
+    this.pointMaterial = new THREE.ShaderMaterial({
+      vertexShader: POINT_VERTEX, fragmentShader: POINT_FRAGMENT,
+      uniforms: {
+        size: { value: 0.1 }, pixels: { value: 1 }, least: { value: 1 }, most: { value: 8 }, flat_: { value: false },
+        low: { value: new THREE.Vector3() }, high: { value: new THREE.Vector3() },
+      },
+    });
+    this.planes = [0, 1, 2].flatMap((axis) => [1, -1].map((sign) =>
+      new THREE.Plane(new THREE.Vector3().setComponent(axis, sign), 1e9)));
+    this.surfaceMaterial = new THREE.MeshLambertMaterial({ flatShading: true, side: THREE.DoubleSide, clippingPlanes: this.planes });
+    this.makePasses();
+    this.layers = {}; // {name: Points}
+    this.names = []; // [text, place, element]
+    this.sensors = [];
+    this.actors = [];
+    this.marks = [];
+    this.extent = 1;
+    this.pointScale = 1;
+    this.strength = 1;
+    this.dirty = true;
+    this.theme = "light";
+    new ResizeObserver(() => this.resize()).observe(canvas);
+    canvas.addEventListener("webglcontextrestored", () => { this.dirty = true; });
+  }
+
+  makePasses() {
+    this.target = new THREE.WebGLRenderTarget(4, 4, { samples: 4, depthTexture: new THREE.DepthTexture(4, 4, THREE.FloatType) });
+    this.shading = new THREE.ShaderMaterial({
+      vertexShader: SHADE_VERTEX, fragmentShader: SHADE_FRAGMENT, depthTest: false, depthWrite: false,
+      uniforms: {
+        picture: { value: this.target.texture }, depths: { value: this.target.depthTexture }, pixel: { value: new THREE.Vector2() },
+        near: { value: 1 }, far: { value: 2 }, strength: { value: 0 }, flat_: { value: false },
+      },
+    });
+    this.screen = new THREE.Scene();
+    this.screen.add(new THREE.Mesh(new THREE.PlaneGeometry(2, 2), this.shading));
+    this.screenCamera = new THREE.OrthographicCamera(-1, 1, 1, -1, 0, 1);
+  }
+
+  resize() {
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    if (!width || !height) return;
+    const ratio = Math.min(window.devicePixelRatio, 2);
+    this.renderer.setPixelRatio(ratio);
+    this.renderer.setSize(width, height, false);
+    this.target.setSize(Math.round(width * ratio), Math.round(height * ratio));
+    this.perspective.aspect = width / height;
+    this.perspective.updateProjectionMatrix();
+    const half = this.parallel.top;
+    this.parallel.left = (-half * width) / height;
+    this.parallel.right = (half * width) / height;
+    this.parallel.updateProjectionMatrix();
+    this.dirty = true;
+    this.changed();
+  }
+
+  // -- what is shown ---------------------------------------------------------------------
+
+  // box: [low, high] that is looked at; bounds: of all
+  frame(box, bounds) {
+    this.box = box.map((corner) => new THREE.Vector3(...corner));
+    this.bounds = bounds.map((corner) => new THREE.Vector3(...corner));
+    this.extent = this.box[0].distanceTo(this.box[1]) || 1;
+    this.reach = this.bounds[0].distanceTo(this.bounds[1]) || 1;
+    this.setClip([[null, null], [null, null], [null, null]]);
+    this.addGrid();
+    this.look("all");
+  }
+
+  addGrid() {
+    if (this.grid) this.scene.remove(this.grid);
+    const [low, high] = this.box;
+    const step = 10 ** Math.floor(Math.log10(this.extent / 4));
+    const lines = [];
+    const ends = ["x", "y"].map((axis) => {
+      const room = 0.2 * (high[axis] - low[axis]) + 2 * step;
+      return [Math.floor((low[axis] - room) / step), Math.ceil((high[axis] + room) / step)];
+    });
+    const z = low.z - 0.002 * this.extent;
+    const [[x0, x1], [y0, y1]] = ends.map((pair) => pair.map((n) => n * step));
+    for (let x = ends[0][0]; x <= ends[0][1]; x++) lines.push(x * step, y0, z, x * step, y1, z);
+    for (let y = ends[1][0]; y <= ends[1][1]; y++) lines.push(x0, y * step, z, x1, y * step, z);
+    this.gridStep = step;
+    this.grid = this.thinLines(lines, THEMES[this.theme].grid);
+    this.scene.add(this.grid);
+  }
+
+  thinLines(numbers, color) {
+    const geometry = new THREE.BufferGeometry();
+    geometry.setAttribute("position", new THREE.Float32BufferAttribute(numbers, 3));
+    const made = new THREE.LineSegments(geometry, new THREE.LineBasicMaterial({ color, clippingPlanes: [] }));
+    made.frustumCulled = false;
+    return made;
+  }
+
+  thickLines(numbers, color, linewidth) {
+    const geometry = new THREE.LineSegmentsGeometry().setPositions(numbers);
+    const made = new THREE.LineSegments2(geometry, new THREE.LineMaterial({ color, linewidth }));
+    made.frustumCulled = false;
+    return made;
+  }
+
+  setTheme(theme) {
+    this.theme = theme;
+    const { back, grid, surface, rays } = THEMES[theme];
+    this.scene.background = new THREE.Color(back);
+    if (this.grid) this.grid.material.color.set(grid);
+    if (this.rays) this.rays.material.color.set(rays);
+    if (!this.surfaceMaterial.vertexColors) this.surfaceMaterial.color.set(surface);
+    for (const actor of this.actors) if (!actor.coloured) actor.mesh.material.color.set(surface);
+    this.dirty = true;
+  }
+
+  setPoints(layer, told) {
+    const old = this.layers[layer];
+    if (old) {
+      this.scene.remove(old);
+      old.geometry.dispose();
+      delete this.layers[layer];
+    }
+    this.dirty = true;
+    if (!told || !told.arrays.rows.length) return;
+    const geometry = new THREE.BufferGeometry();
+    geometry.setAttribute("position", new THREE.BufferAttribute(told.arrays.positions, 3));
+    geometry.setAttribute("colour", new THREE.BufferAttribute(told.arrays.colours, 4, true));
+    const points = new THREE.Points(geometry, this.pointMaterial);
+    points.frustumCulled = false;
+    points.told = told;
+    this.scene.add(points);
+    this.layers[layer] = points;
+    this.sizePoints();
+  }
+
+  get drawn() {
+    return Object.values(this.layers).reduce((sum, points) => sum + points.told.arrays.rows.length, 0);
+  }
+
+  // Points can be seen where there are few, and told apart where there are many.
+  sizePoints() {
+    const count = Math.max(1, this.drawn);
+    const { size, least, most } = this.pointMaterial.uniforms;
+    const ratio = this.renderer.getPixelRatio();
+    size.value = this.pointScale * this.extent * Math.min(0.0035, 0.9 / Math.sqrt(count));
+    least.value = ratio * (count < 20_000 ? 3.5 : count < 200_000 ? 2.2 : 1.5) * Math.sqrt(this.pointScale);
+    most.value = ratio * Math.max(2, 7 * this.pointScale);
+    this.dirty = true;
+  }
+
+  setSurface(told) {
+    if (this.surface) {
+      this.scene.remove(this.surface);
+      this.surface.geometry.dispose();
+      this.surface = null;
+    }
+    this.dirty = true;
+    if (!told || !told.arrays.corners.length) return;
+    const geometry = new THREE.BufferGeometry();
+    geometry.setAttribute("position", new THREE.BufferAttribute(told.arrays.corners, 3));
+    const coloured = "colours" in told.arrays;
+    if (coloured) geometry.setAttribute("color", new THREE.BufferAttribute(told.arrays.colours, 3, true));
+    this.surfaceMaterial.vertexColors = coloured;
+    this.surfaceMaterial.color.set(coloured ? 0xffffff : THEMES[this.theme].surface);
+    this.surfaceMaterial.needsUpdate = true;
+    this.surface = new THREE.Mesh(geometry, this.surfaceMaterial);
+    this.surface.frustumCulled = false;
+    this.surface.objects = told.arrays.objects;
+    this.scene.add(this.surface);
+    this.showObjects(this.onlyObjects);
+  }
+
+  // limits: [lowest, highest] object that is shown, or null
+  showObjects(limits) {
+    this.onlyObjects = limits;
+    const shown = (object) => !limits || (object >= limits[0] && object <= limits[1]);
+    if (this.surface) {
+      const { objects, geometry } = this.surface;
+      if (!limits) geometry.setIndex(null);
+      else {
+        const index = [];
+        objects.forEach((object, k) => { if (shown(object)) index.push(3 * k, 3 * k + 1, 3 * k + 2); });
+        geometry.setIndex(index);
+      }
+    }
+    for (const actor of this.actors) actor.mesh.visible = shown(actor.object) && !this.actorsHidden;
+    if (this.rays) this.rays.visible = !limits && this.raysShown !== false;
+    this.dirty = true;
+  }
+
+  setActors(actors) {
+    for (const actor of this.actors) this.scene.remove(actor.mesh);
+    this.actors = actors;
+    for (const actor of actors) {
+      const geometry = new THREE.BufferGeometry();
+      geometry.setAttribute("position", new THREE.BufferAttribute(actor.corners, 3));
+      const material = new THREE.MeshLambertMaterial({ flatShading: true, side: THREE.DoubleSide, clippingPlanes: this.planes });
+      actor.mesh = new THREE.Mesh(geometry, material);
+      actor.mesh.frustumCulled = false;
+      geometry.computeBoundingBox();
+      actor.top = geometry.boundingBox.max.z;
+      this.scene.add(actor.mesh);
+    }
+  }
+
+  colourActors(coloured) {
+    for (const actor of this.actors) {
+      actor.coloured = coloured;
+      if (coloured) actor.mesh.material.color.setRGB(...actor.colour.map((byte) => byte / 255));
+      else actor.mesh.material.color.set(THEMES[this.theme].surface);
+    }
+    this.dirty = true;
+  }
+
+  setSensors(sensors) {
+    for (const made of this.sensorParts ?? []) this.scene.remove(made);
+    this.sensorParts = [];
+    this.sensors = sensors;
+    const ball = new THREE.SphereGeometry(1, 20, 12), red = new THREE.MeshBasicMaterial({ color: RED });
+    for (const sensor of sensors) {
+      sensor.marker = new THREE.Mesh(ball, red);
+      sensor.marker.scale.setScalar((sensor.moves ? 0.0036 : 0.009) * this.extent);
+      this.sensorParts.push(sensor.marker);
+      const { places } = sensor, count = places.length / 3;
+      sensor.way = new THREE.Group();
+      if (sensor.moves && count > 1) {
+        const lines = [];
+        for (let k = 0; k + 1 < count; k++) lines.push(...places.subarray(3 * k, 3 * k + 6));
+        sensor.way.add(this.thickLines(lines, RED, 3));
+      } else {
+        for (let k = 0; k < count && k < 1000; k++) {
+          const mark = new THREE.Mesh(ball, red);
+          mark.position.set(...places.subarray(3 * k, 3 * k + 3));
+          mark.scale.setScalar(0.0054 * this.extent);
+          sensor.way.add(mark);
+        }
+      }
+      this.sensorParts.push(sensor.way);
+    }
+    for (const made of this.sensorParts) this.scene.add(made);
+  }
+
+  setRays(ends) {
+    if (this.rays) this.scene.remove(this.rays);
+    this.rays = null;
+    this.dirty = true;
+    if (!ends || !ends.length) return;
+    this.rays = this.thinLines(ends, THEMES[this.theme].rays);
+    this.rays.material.clippingPlanes = this.planes;
+    this.scene.add(this.rays);
+    this.showObjects(this.onlyObjects);
+  }
+
+  setPath(path, ground) {
+    if (this.path) this.scene.remove(this.path);
+    this.path = null;
+    this.dirty = true;
+    if (!path) return;
+    const z = ground + 0.004 * this.extent, lines = [];
+    this.path = new THREE.Group();
+    path.corners.slice(1).forEach(([x, y], k) => lines.push(...path.corners[k], z, x, y, z));
+    this.path.add(this.thickLines(lines, GREEN, 4));
+    for (const [x, y, radius] of path.discs) {
+      const disc = new THREE.Mesh(
+        new THREE.CircleGeometry(radius, 48), new THREE.MeshBasicMaterial({ color: DISC, transparent: true, opacity: 0.35, depthWrite: false }));
+      disc.position.set(x, y, ground + 0.002 * this.extent);
+      this.path.add(disc);
+    }
+    this.path.ends = [["start", path.corners[0]], ["target", path.corners.at(-1)]].map(([text, [x, y]]) => [text, [x, y, z]]);
+    this.scene.add(this.path);
+  }
+
+  // Places sensors and actors as they are at a time, seconds.
+  setTime(time) {
+    const before = this.carrier;
+    this.time = time;
+    for (const sensor of this.sensors) {
+      sensor.at = placeAt(sensor.times, sensor.places, time, sensor.moves);
+      sensor.marker.position.set(...sensor.at);
+      sensor.marker.visible = sensor.way.visible = sensor.shown;
+    }
+    for (const actor of this.actors) {
+      actor.at = placeAt(actor.times, actor.places, time, true);
+      actor.mesh.position.set(...actor.at);
+      const k = Math.max(0, lastNotAbove(actor.times, time));
+      actor.mesh.quaternion.set(...actor.turns.subarray(4 * k, 4 * k + 4)).normalize();
+    }
+    const moving = this.sensors.find((sensor) => sensor.moves) ?? this.sensors[0];
+    this.carrier = moving ? new THREE.Vector3(...moving.at) : null;
+    if (this.follow && before && this.carrier) {
+      const way = this.carrier.clone().sub(before);
+      this.camera.position.add(way);
+      this.controls.target.add(way);
+    }
+    this.dirty = true;
+  }
+
+  get labelled() {
+    const names = this.marks.filter((mark) => mark.text).map((mark) => [mark.text, mark.place]);
+    const moving = this.sensors.filter((sensor) => sensor.moves && sensor.shown && sensor.at);
+    if (moving.length) names.push([moving.map((sensor) => sensor.name).filter(Boolean).join(", ") || "sensor", moving[0].at]);
+    for (const sensor of this.sensors)
+      if (!sensor.moves && sensor.shown && sensor.at) names.push([sensor.name || "sensor", sensor.at]);
+    for (const actor of this.actors)
+      if (actor.mesh.visible && actor.at) names.push([actor.name, [actor.at[0], actor.at[1], actor.at[2] + actor.top]]);
+    return [...names, ...(this.path?.ends ?? [])].slice(0, 100);
+  }
+
+  // limits: [lowest, highest] of each axis, null for none
+  setClip(limits) {
+    this.clip = limits;
+    const { low, high } = this.pointMaterial.uniforms;
+    limits.forEach(([least, most], axis) => {
+      low.value.setComponent(axis, least ?? -1e12);
+      high.value.setComponent(axis, most ?? 1e12);
+      this.planes[2 * axis].constant = -(least ?? -1e12);
+      this.planes[2 * axis + 1].constant = most ?? 1e12;
+    });
+    this.dirty = true;
+  }
+
+  // -- camera ----------------------------------------------------------------------------
+
+  look(side) {
+    const away = new THREE.Vector3(...SIDES[side]).normalize();
+    const [low, high] = this.box;
+    const middle = low.clone().add(high).multiplyScalar(0.5);
+    const up = new THREE.Vector3(0, side === "top" ? 1 : 0, side === "top" ? 0 : 1);
+    const right = up.clone().cross(away).normalize(), tall = away.clone().cross(right);
+    const aspect = this.perspective.aspect, slope = Math.tan((FOV * Math.PI) / 360);
+    let distance = 0;
+    for (let k = 0; k < 8; k++) {
+      const corner = new THREE.Vector3(...[0, 1, 2].map((axis) => (k & (1 << axis) ? high : low).getComponent(axis))).sub(middle);
+      const reach = Math.max(Math.abs(corner.dot(right)) / aspect, Math.abs(corner.dot(tall))) / 0.9 / slope;
+      distance = Math.max(distance, (side === "all" ? corner.dot(away) : 0) + reach);
+    }
+    this.place(middle.clone().addScaledVector(away, distance || 1), middle);
+    if (side === "all") this.useParallel(false);
+    else this.useParallel(true);
+  }
+
+  // Behind and above the carrier, looking ahead.
+  lookFromSensor() {
+    if (!this.carrier) return;
+    const moving = this.sensors.find((sensor) => sensor.moves);
+    const ahead = new THREE.Vector3(1, 0, 0);
+    if (moving) {
+      const step = 0.02 * (moving.times.at(-1) - moving.times[0]);
+      const [a, b] = [-step, step].map((part) => new THREE.Vector3(...placeAt(moving.times, moving.places, this.time + part, true)));
+      const way = b.sub(a).setZ(0);
+      if (way.length() > 1e-6) ahead.copy(way.normalize());
+    }
+    const back = 0.045 * this.extent;
+    const eye = this.carrier.clone().addScaledVector(ahead, -back).add(new THREE.Vector3(0, 0, back / 2));
+    this.useParallel(false);
+    this.place(eye, this.carrier.clone().addScaledVector(ahead, 0.1 * this.extent));
+  }
+
+  place(position, target) {
+    // Exactly from above, the controls would not know what is up.
+    const eye = position.clone();
+    if (Math.hypot(eye.x - target.x, eye.y - target.y) < 1e-4 * eye.distanceTo(target)) eye.y -= 1e-4 * eye.distanceTo(target);
+    for (const camera of [this.perspective, this.parallel]) camera.position.copy(eye);
+    this.controls.target.copy(target);
+    this.controls.update();
+    this.dirty = true;
+  }
+
+  get isParallel() { return this.camera === this.parallel; }
+
+  useParallel(parallel) {
+    const half = this.viewHeight / 2;
+    const from = this.camera, to = parallel ? this.parallel : this.perspective;
+    if (from !== to) {
+      to.position.copy(from.position);
+      this.camera = this.controls.object = to;
+    }
+    const target = this.controls.target;
+    if (parallel) {
+      const height = from === to ? Math.tan((FOV * Math.PI) / 360) * to.position.distanceTo(target) : half;
+      Object.assign(this.parallel, { top: height, bottom: -height, zoom: 1 });
+      this.resize();
+    } else if (from !== to) {
+      const distance = half / Math.tan((FOV * Math.PI) / 360);
+      to.position.sub(target).setLength(distance).add(target);
+    }
+    this.controls.update();
+    this.dirty = true;
+    this.changed();
+  }
+
+  // Metres from the upper to the lower edge, where the camera looks.
+  get viewHeight() {
+    if (this.isParallel) return (this.parallel.top - this.parallel.bottom) / this.parallel.zoom;
+    return 2 * Math.tan((FOV * Math.PI) / 360) * this.perspective.position.distanceTo(this.controls.target);
+  }
+
+  get matrix() {
+    this.updateCamera();
+    return new THREE.Matrix4().multiplyMatrices(this.camera.projectionMatrix, this.camera.matrixWorldInverse);
+  }
+
+  updateCamera() {
+    const distance = this.camera.position.distanceTo(this.controls.target), reach = 3 * this.reach + distance;
+    if (this.isParallel) Object.assign(this.camera, { near: -reach, far: reach });
+    else Object.assign(this.camera, { near: Math.min(Math.max(0.01 * distance, 0.02), this.reach / 50), far: reach });
+    this.camera.updateProjectionMatrix();
+    this.camera.updateMatrixWorld();
+  }
+
+  // -- drawing ---------------------------------------------------------------------------
+
+  // Called for each frame; draws if anything has changed.
+  draw() {
+    this.controls.update();
+    if (!this.dirty) return;
+    this.dirty = false;
+    this.updateCamera();
+    const { uniforms } = this.pointMaterial;
+    const height = this.target.height;
+    uniforms.flat_.value = this.isParallel;
+    uniforms.pixels.value = height / (this.isParallel ? this.viewHeight : 2 * Math.tan((FOV * Math.PI) / 360));
+    for (const mark of this.marks) if (mark.ball) mark.ball.scale.setScalar(0.006 * this.distanceTo(mark.place));
+    const shade = this.shading.uniforms;
+    shade.pixel.value.set(1 / this.target.width, 1 / height);
+    shade.near.value = this.camera.near;
+    shade.far.value = this.camera.far;
+    shade.flat_.value = this.isParallel;
+    shade.strength.value = this.strength * (this.isParallel ? 144 / this.viewHeight : 120);
+    this.renderer.setRenderTarget(this.target);
+    this.renderer.clear();
+    this.renderer.render(this.scene, this.camera);
+    this.renderer.setRenderTarget(null);
+    this.renderer.render(this.screen, this.screenCamera);
+    this.drawLabels();
+    this.drawAxes();
+    this.drawScale();
+  }
+
+  distanceTo(place) {
+    if (this.isParallel) return this.viewHeight;
+    return this.camera.position.distanceTo(new THREE.Vector3(...place));
+  }
+
+  drawLabels() {
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    const taken = [], shown = [];
+    for (const [text, place] of this.labelled) {
+      const at = new THREE.Vector3(...place).project(this.camera);
+      if (Math.abs(at.x) > 1 || Math.abs(at.y) > 1 || Math.abs(at.z) > 1) continue;
+      const x = ((at.x + 1) / 2) * width + 8, y = ((1 - at.y) / 2) * height - 24, wide = 7 * text.length + 14;
+      if (taken.some(([a, b, c]) => x < a + c && a < x + wide && Math.abs(y - b) < 22)) continue;
+      taken.push([x, y, wide]);
+      shown.push([text, x, y]);
+    }
+    while (this.labels.children.length < shown.length) this.labels.append(element("span"));
+    [...this.labels.children].forEach((label, k) => {
+      label.hidden = k >= shown.length;
+      if (label.hidden) return;
+      const [text, x, y] = shown[k];
+      if (label.textContent !== text) label.textContent = text;
+      label.style.transform = `translate(${Math.round(x)}px, ${Math.round(y)}px)`;
+    });
+  }
+
+  drawAxes() {
+    const pen = this.axes.getContext("2d"), middle = 64, turn = this.camera.quaternion.clone().invert();
+    pen.clearRect(0, 0, 128, 128);
+    pen.lineWidth = 4;
+    pen.font = "bold 22px system-ui, sans-serif";
+    pen.textAlign = "center";
+    pen.textBaseline = "middle";
+    const axes = ["x", "y", "z"].map((name, axis) => [name, new THREE.Vector3().setComponent(axis, 1).applyQuaternion(turn), ["#d2404a", "#3f9a4d", "#3f74d0"][axis]]);
+    for (const [name, way, colour] of axes.sort((a, b) => a[1].z - b[1].z)) {
+      pen.strokeStyle = pen.fillStyle = colour;
+      pen.beginPath();
+      pen.moveTo(middle, middle);
+      pen.lineTo(middle + 38 * way.x, middle - 38 * way.y);
+      pen.stroke();
+      pen.fillText(name, middle + 52 * way.x, middle - 52 * way.y);
+    }
+  }
+
+  drawScale() {
+    const metres = this.viewHeight / this.canvas.clientHeight;
+    const most = 150 * metres, power = 10 ** Math.floor(Math.log10(most));
+    const length = [5, 2, 1].map((n) => n * power).find((n) => n <= most);
+    const [unit, size] = length >= 1000 ? ["km", 1000] : length >= 1 ? ["m", 1] : length >= 0.01 ? ["cm", 0.01] : ["mm", 0.001];
+    this.scale.firstChild.textContent = `${+(length / size).toPrecision(2)} ${unit}`;
+    this.scale.lastChild.style.width = `${Math.round(length / metres)}px`;
+    this.scale.title = this.isParallel ? "scale" : "scale where the camera looks";
+  }
+
+  // -- the mouse -------------------------------------------------------------------------
+
+  // The point under the mouse: {row, layer, place} or null. It is the nearest to the mouse of those
+  // on the first surface.
+  pick(x, y) {
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    const m = this.matrix.elements, found = [];
+    const { low, high } = this.pointMaterial.uniforms;
+    for (const points of Object.values(this.layers)) {
+      const p = points.told.arrays.positions;
+      for (let k = 0; k < p.length; k += 3) {
+        const w = m[3] * p[k] + m[7] * p[k + 1] + m[11] * p[k + 2] + m[15];
+        if (w <= 0) continue;
+        const across = (((m[0] * p[k] + m[4] * p[k + 1] + m[8] * p[k + 2] + m[12]) / w + 1) / 2) * width - x;
+        if (Math.abs(across) > PICKED_WITHIN) continue;
+        const down = ((1 - (m[1] * p[k] + m[5] * p[k + 1] + m[9] * p[k + 2] + m[13]) / w) / 2) * height - y;
+        const away = Math.hypot(across, down);
+        if (away > PICKED_WITHIN) continue;
+        if ([0, 1, 2].some((axis) => p[k + axis] < low.value.getComponent(axis) || p[k + axis] > high.value.getComponent(axis))) continue;
+        const depth = (m[2] * p[k] + m[6] * p[k + 1] + m[10] * p[k + 2] + m[14]) / w;
+        found.push({ away, depth: this.isParallel ? depth : w, row: points.told.arrays.rows[k / 3], place: [p[k], p[k + 1], p[k + 2]] });
+      }
+    }
+    if (!found.length) return null;
+    const nearest = found.reduce((a, b) => (b.depth < a.depth ? b : a)).depth;
+    const first = this.isParallel ? found.filter((one) => one.depth <= nearest + 0.01) : found.filter((one) => one.depth <= SAME_SURFACE * nearest);
+    return first.reduce((a, b) => (b.away < a.away ? b : a));
+  }
+
+  // places: of one or two points that are marked; text: of the line between them
+  mark(places, text = "") {
+    for (const mark of this.marks) if (mark.made) this.scene.remove(mark.made);
+    const material = new THREE.MeshBasicMaterial({ color: MARK, depthTest: false });
+    this.marks = places.map((place) => {
+      const ball = new THREE.Mesh(new THREE.SphereGeometry(1, 16, 10), material);
+      ball.position.set(...place);
+      ball.renderOrder = 2;
+      return { ball, made: ball, place };
+    });
+    if (places.length === 2) {
+      const line = this.thickLines(places.flat(), MARK, 3);
+      line.material.depthTest = false;
+      line.renderOrder = 1;
+      const place = places[0].map((value, axis) => (value + places[1][axis]) / 2);
+      this.marks.unshift({ made: line, place, text });
+    }
+    for (const mark of this.marks) this.scene.add(mark.made);
+    this.dirty = true;
+  }
+
+  // The picture as a PNG file.
+  save(name) {
+    this.dirty = true;
+    this.draw();
+    this.canvas.toBlob((file) => {
+      const link = element("a", { href: URL.createObjectURL(file), download: name });
+      link.click();
+      URL.revokeObjectURL(link.href);
+    });
+  }
+}

@@ -1,0 +1,281 @@
+"""Selects points of a cloud for a page: by scans, by columns, and for a camera."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.choice import one_of_each_part
+from ..columns.cloud import Cloud
+from ..columns.table import Column
+from ..export.ply_format import AXES
+
+Floats = NDArray[np.floating]
+Rows = NDArray[np.int64]
+Limits = tuple[float, float] | None  # lowest and highest, both included; None for all
+Scans = tuple[tuple[int, int], ...]  # first and last scan of each range
+
+BLOCK = 1 << 15  # rows that are read at a time
+_FIRST_LOOK = 200_000  # points that tell how many are where in the picture
+_ACROSS, _DOWN = 48, 27
+TILES = _ACROSS * _DOWN  # parts of a picture
+_KEPT = 0.8  # of the points, as often as they are too many
+
+
+class Points(Protocol):
+    """Points in rows, in a file or in memory."""
+
+    @property
+    def table(self) -> Sequence[Column]:
+        """Columns beside the positions."""
+
+    def __len__(self) -> int: ...
+
+    def values(self, name: str, rows: Rows | slice) -> NDArray[Any]:
+        """Values of a column, or of x, y or z in world coordinates, in some rows."""
+
+    def rows_of(self, scans: tuple[float, float]) -> tuple[int, int]:
+        """First row of these scans and the first after them."""
+
+
+class HeldPoints:
+    """Points in memory, in any order of their scans."""
+
+    def __init__(self, cloud: Cloud) -> None:
+        self._cloud, self.table = cloud, cloud.table
+
+    def __len__(self) -> int:
+        return len(self._cloud)
+
+    def values(self, name: str, rows: Rows | slice) -> NDArray[Any]:
+        """Values of a column, or of x, y or z in world coordinates, in some rows."""
+        if name in AXES:
+            return np.asarray(self._cloud.positions[rows, AXES.index(name)])
+        return self._cloud[name][rows]
+
+    def rows_of(self, scans: tuple[float, float]) -> tuple[int, int]:
+        """Return all rows."""
+        return 0, len(self)
+
+
+def within(values: Any, limits: Limits) -> Any:
+    """Whether values (n,) are within limits; NaN is not."""
+    if limits is None:
+        return np.ones(np.shape(values), np.bool_)
+    return (values >= limits[0]) & (values <= limits[1])
+
+
+@dataclass(frozen=True)
+class Filter:
+    """Filter: points whose columns are within limits, (column, lowest, highest) each."""
+
+    limits: tuple[tuple[str, float, float], ...] = ()
+
+    @classmethod
+    def read(cls, text: str, names: Sequence[str]) -> Filter:
+        """Read limits from an address, ``column,lowest,highest;…``; others are left out.
+
+        Examples
+        --------
+        >>> Filter.read("z,0,1.5;what,1,2", ["z"])
+        Filter(limits=(('z', 0.0, 1.5),))
+        """
+        found = []
+        for entry in filter(None, text.split(";")):
+            name, low, high = entry.rsplit(",", 2)
+            if name in names:
+                found.append((name, float(low), float(high)))
+        return cls(tuple(found))
+
+    def keeps(self, points: Points, rows: Rows | slice) -> NDArray[np.bool_]:
+        """Whether some points, (n,), are within all limits."""
+        x, y, z = (points.values(axis, rows) for axis in AXES)
+        kept = np.asarray(np.isfinite(x + y + z))
+        for name, low, high in self.limits:
+            kept &= within(points.values(name, rows), (low, high))
+        return kept
+
+
+@dataclass(frozen=True)
+class Eye:
+    """Camera of a browser: the matrix (4, 4) from local coordinates to clip coordinates."""
+
+    matrix: tuple[tuple[float, ...], ...]
+
+    @classmethod
+    def read(cls, text: str) -> Eye:
+        """Read 16 numbers, column by column, as WebGL has them; ValueError if they are not."""
+        numbers = np.array([float(number) for number in text.split(",")]).reshape(4, 4).T
+        return cls(tuple(map(tuple, numbers.tolist())))
+
+    def seen(self, places: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+        """Project points (n, 3) to the picture, (n, 2) in -1 to 1, and whether they are in it."""
+        x, y, z, w = self._clip(places)
+        inside = (np.abs(x) < w) & (np.abs(y) < w) & (z > -w)
+        return np.stack([x, y], axis=1) / np.where(inside, w, 1.0)[:, None], inside
+
+    def _clip(self, places: Floats) -> Floats:
+        """Points (n, 3) in clip coordinates, (4, n)."""
+        matrix = np.array(self.matrix)
+        return np.asarray(matrix[:, :3] @ places.T + matrix[:, 3:])
+
+    def tiles(self, places: Floats) -> Rows:
+        """Part of the picture of each point (n, 3): (n,); -1 outside."""
+        at, inside = self.seen(places)
+        across, down = (np.clip(at, -1, 0.9999).T + 1) / 2
+        column, row = (across * _ACROSS).astype(np.int64), (down * _DOWN).astype(np.int64)
+        return np.where(inside, row * _ACROSS + column, -1)
+
+    def may_see(self, box: Floats) -> bool:
+        """Whether a box (2, 3) may be partly in the picture."""
+        x, y, z, w = self._clip(np.array(list(itertools.product(*box.T))))
+        outside = (x > w, x < -w, y > w, y < -w, z < -w)
+        return not any(bool(beyond.all()) for beyond in outside)
+
+
+def even_shares(counts: NDArray[Any], most: int) -> NDArray[np.float64]:
+    """Shares (t,) of the points (t,) of each part of a picture, so that each part shows as many.
+
+    A part with fewer points shows all of them; they are `most` in all.
+    """
+    each, few = np.inf, np.zeros(len(counts), np.bool_)
+    for _ in range(len(counts)):
+        rest = int((~few & (counts > 0)).sum())
+        each = max(most - float(counts[few].sum()), 0.0) / rest if rest else np.inf
+        fewer = counts <= each
+        if (fewer == few).all():
+            break
+        few = fewer
+    return np.minimum(each / np.maximum(counts, 1e-9), 1.0)
+
+
+def positions(points: Points, rows: Rows | slice) -> NDArray[np.float64]:
+    """Positions of some rows, float64 (n, 3), world coordinates, metres."""
+    # Columns one after the other are what the matrix product of a camera reads fastest.
+    return np.stack([points.values(axis, rows) for axis in AXES], dtype=np.float64).T
+
+
+class Abandoned(Exception):  # noqa: N818 - no error: nobody waits for the answer any more
+    """Nobody waits for the points any more."""
+
+
+class PointFinder:
+    """Selects points of a cloud.
+
+    It remembers the bounding boxes of the blocks that it has read, 48 bytes each: 150 kB for a
+    hundred million points. `origin` is the world position of the local origin, (3,).
+    """
+
+    def __init__(self, points: Points, origin: NDArray[np.float64]) -> None:
+        self.points, self._origin = points, origin
+        self._boxes = np.full((-(-len(points) // BLOCK), 2, 3), np.nan)  # NaN for unread blocks
+
+    def find(
+        self,
+        most: int,
+        wanted: Filter = Filter(),
+        scans: Scans | None = None,
+        eye: Eye | None = None,
+        abandoned: Callable[[], bool] = lambda: False,
+    ) -> tuple[Rows, int]:
+        """Find at most `most` points that pass a filter, in order.
+
+        Parameters
+        ----------
+        most
+            Points at most. They are evenly spaced in the file, or with an eye over its picture.
+        wanted, scans
+            The filter, and the ranges of scans; None for all.
+        eye
+            Camera: only points in its picture.
+        abandoned
+            Asked now and then; once it returns True, nobody waits for the answer.
+
+        Returns
+        -------
+        rows
+            int64 (k,), ascending.
+        count
+            Number of points that pass the filter, also outside the picture.
+
+        Raises
+        ------
+        Abandoned
+            If nobody waits for the answer.
+        """
+        ranges = self._ranges(scans)
+        whole = sum(high - low for low, high in ranges)
+        if not wanted.limits and (eye is None or whole <= most):
+            rows = _spread(ranges, one_of_each_part(whole, most))
+            return rows[wanted.keeps(self.points, rows)], whole
+        if eye is None:
+            return self._search(ranges, most, wanted, None, None, abandoned)
+        some, count = self.find(_FIRST_LOOK, wanted, scans, None, abandoned)
+        tiles = eye.tiles(self._local(some))
+        counts = np.bincount(tiles[tiles >= 0], minlength=TILES) * (count / max(len(some), 1))
+        if counts.sum() == 0:  # the sample may have missed a few
+            counts += 1
+        rows, _ = self._search(ranges, most, wanted, eye, even_shares(counts, most), abandoned)
+        return rows, count
+
+    def _ranges(self, scans: Scans | None) -> list[tuple[int, int]]:
+        """Rows, first and after the last, of ranges of scans."""
+        if scans is None:
+            return [(0, len(self.points))]
+        return sorted(self.points.rows_of(some) for some in scans)
+
+    def _local(self, rows: Rows | slice) -> NDArray[np.float64]:
+        return positions(self.points, rows) - self._origin
+
+    def _search(
+        self,
+        ranges: Sequence[tuple[int, int]],
+        most: int,
+        wanted: Filter,
+        eye: Eye | None,
+        shares: NDArray[np.float64] | None,
+        abandoned: Callable[[], bool],
+    ) -> tuple[Rows, int]:
+        """Read blocks one after the other; the points that are kept become fewer on the way."""
+        random, thin, found, kept = np.random.default_rng(0), 1.0, 0, [np.empty(0, np.int64)]
+        for low, high in ranges:
+            for number in range(low // BLOCK, -(-high // BLOCK)):
+                if abandoned():
+                    raise Abandoned
+                first, last = max(low, number * BLOCK), min(high, (number + 1) * BLOCK)
+                if not self._may_be_seen(number, eye):
+                    continue
+                rows = first + np.flatnonzero(wanted.keeps(self.points, slice(first, last)))
+                found += len(rows)
+                share = np.full(len(rows), thin)
+                if eye is not None and shares is not None and len(rows):
+                    places = self._local(rows)
+                    whole = len(rows) == min(BLOCK, len(self.points) - number * BLOCK)
+                    if whole and np.isnan(self._boxes[number, 0, 0]):
+                        ends = [(axis.min(), axis.max()) for axis in places.T]
+                        self._boxes[number] = np.array(ends).T
+                    tiles = eye.tiles(places)
+                    share *= np.where(tiles >= 0, shares[tiles], 0.0)
+                kept.append(rows[random.random(len(rows)) < share])
+                while sum(map(len, kept)) > most:
+                    thin *= _KEPT
+                    joined = np.concatenate(kept)
+                    kept = [joined[random.random(len(joined)) < _KEPT]]
+        return np.concatenate(kept), found
+
+    def _may_be_seen(self, number: int, eye: Eye | None) -> bool:
+        box = self._boxes[number]
+        return eye is None or bool(np.isnan(box[0, 0])) or eye.may_see(box)
+
+
+def _spread(ranges: Sequence[tuple[int, int]], numbers: Rows) -> Rows:
+    """Rows of the n-th points of ranges of rows."""
+    firsts = np.array([low for low, _ in ranges], np.int64)
+    before = np.cumsum([0, *(high - low for low, high in ranges)])[:-1]
+    part = np.searchsorted(before, numbers, "right") - 1
+    return numbers + (firsts - before)[part]

@@ -1,0 +1,320 @@
+"""The simulator as a function: one sensor in a scene, sweep by sweep."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from raybeam.poses import check_poses
+
+from ..base.arguments import checked, shown
+from ..base.errors import LidarpoolError
+from ..base.words import did_you_mean
+from ..columns.cloud import Cloud
+from ..columns.table import AXES, SCAN, Column
+from ..scene.scene import Scene
+from ..sensor import (
+    Material,
+    Mounted,
+    Noise,
+    Pose,
+    Returns,
+    ScanSpec,
+    Sensor,
+    Stations,
+    Survey,
+    Trajectory,
+)
+from ..sensor.trajectory import CENTRE
+from .motion import check_trajectory
+from .returns import columns_of
+from .rig import Rig
+from .world import check_backend_here
+
+SCANS_MOST = 1 << 31  # the type of the column `scan`
+_ONE_POSE = "a Pose, or x, y and z in metres, such as (0, 0, 1)"
+
+
+class Scanner:
+    """A sensor in a scene, which scans when it is called: no cluster, no files.
+
+    It gives the bytes that a survey gives for the same scans: sweep `number` is the turn (or frame)
+    of that number of a survey along the same trajectory, with the same random numbers. Threads may
+    share it.
+
+    Parameters
+    ----------
+    scene
+        What is scanned.
+    sensor
+        The lidar, or the lidar `Mounted` on a carrier: then poses are the carrier's.
+    columns, precision_m, coordinates, materials, returns, noise, visibility_km
+        As of `Survey`.
+    backend
+        "cuda", "embree", "numpy", or "auto" for the first of these that can be used.
+    threads
+        CPU threads to cast with; None for all cores.
+    device
+        Number of the CUDA device; None for the current one.
+
+    Raises
+    ------
+    LidarpoolError
+        If an argument does not fit, or the backend cannot be used here.
+
+    Examples
+    --------
+    >>> from lidarpool import Pose, Scanner, Scene, load_sensor
+    >>> scanner = Scanner(Scene.seed(), load_sensor("velodyne/vlp16"), columns=["range"])
+    >>> scanner.sweep(Pose((0, 0, 1)))
+    <Cloud of 2,270 points: x, y, z, scan, channel, object, range>
+    >>> scanner.ranges([(0, 0, 1), (1, 0, 1)]).shape
+    (2, 1809, 16)
+    """
+
+    @checked
+    def __init__(
+        self,
+        scene: Scene,
+        sensor: Sensor | Mounted,
+        *,
+        columns: Sequence[str | Column] = (),
+        precision_m: float | None = None,
+        coordinates: str = "world",
+        materials: Sequence[Material] = (),
+        returns: Returns | None = None,
+        noise: Noise | None = None,
+        visibility_km: float | None = None,
+        backend: str = "auto",
+        threads: int | None = None,
+        device: int | None = None,
+    ) -> None:
+        survey = Survey(
+            sensors=[sensor if isinstance(sensor, Mounted) else Mounted(sensor)],
+            poses=[CENTRE],
+            steps=1,
+            precision_m=precision_m,  # type: ignore[arg-type]  # None for the sensor's
+            columns=columns,
+            coordinates=coordinates,
+            materials=materials,
+            returns=returns or Returns(),
+            noise=noise or Noise(),
+            visibility_km=visibility_km,
+        )
+        check_backend_here(backend)
+        try:
+            self._rig = Rig(scene, survey, backend, threads, device)
+        except ValueError as error:  # of threads or device
+            raise LidarpoolError(str(error)) from error
+        self._actors = list(scene.actors)
+        self._lock = threading.Lock()
+
+    def __repr__(self) -> str:
+        rig = self._rig
+        return f"<Scanner: {rig.survey.sensor.model} in {rig.scene!r}, by {rig.backend}>"
+
+    @property
+    def backend(self) -> str:
+        """Name of the ray-casting backend in use."""
+        return self._rig.backend
+
+    @checked
+    def sweep(
+        self,
+        pose: Pose | Trajectory | Sequence[float],
+        *,
+        number: int = 0,
+        start_s: float | None = None,
+    ) -> Cloud:
+        """Scan once around.
+
+        Parameters
+        ----------
+        pose
+            Pose of a sensor that stands, or the trajectory of one that moves: each beam is fired
+            from where it is at its own time. In the scene's local coordinates.
+        number
+            Number of the turn, or frame, from 0. It chooses the firings, since a head turns on
+            where its last turn has ended, and the random numbers.
+        start_s
+            When the turn begins, seconds since the start of the trajectory, and of those of
+            actors. By default when it does in a survey: `number` times the duration of a turn.
+
+        Returns
+        -------
+        Cloud
+            The returns in the order of their rays, with all columns.
+
+        Raises
+        ------
+        LidarpoolError
+            If the trajectory, or that of an actor, does not last as long as the sweep.
+        """
+        path = _path(pose)
+        rig, specs, late_ns = self._specs(number, start_s)
+        if path.moves:
+            _check_lasts(path, *_span_ns(rig, specs))
+        check_trajectory(path)
+        returns = rig.returns(specs, path, late_ns)
+        survey = rig.survey
+        origin = rig.scene.origin if survey.coordinates == "world" else np.zeros(3)
+        table = (SCAN, *(column for column in survey.stored_columns if column not in AXES))
+        return columns_of([returns]).cloud(table, survey.precision_m, origin)
+
+    @checked
+    def ranges(
+        self,
+        poses: Pose | ArrayLike,
+        *,
+        number: int = 0,
+        start_s: float | None = None,
+    ) -> NDArray[np.float32]:
+        """Ranges that the sensor measures from many poses at one time, as images.
+
+        This is the fastest way to scan: no points are made.
+
+        Parameters
+        ----------
+        poses
+            One pose, or a list; positions (k, 3), metres; or matrices (k, 4, 4) from the axes of
+            the sensor, or of its carrier, to the scene's. The sensor stands at each.
+        number
+            Number of the turn. The image of pose i has the random numbers of turn ``number + i``.
+        start_s
+            When the turn begins, for actors; as of `sweep`.
+
+        Returns
+        -------
+        float32 (k, firings, channels)
+            Range of the nearest reported return of each ray, metres; inf where nothing returns.
+
+        Raises
+        ------
+        LidarpoolError
+            If the poses are no such list or array, a number is not finite, or a matrix does not
+            rotate.
+        """
+        positions, rotations = _placed(poses)
+        rig, specs, _ = self._specs(number, start_s)
+        if not len(positions):
+            firings = specs[-1].firings[1] - specs[0].firings[0]
+            return np.empty((0, firings, specs[0].channels), np.float32)
+        rays = sum(spec.ray_count for spec in specs)
+        try:
+            made = check_poses(positions, rotations, rays, rays * len(positions), None)
+        except ValueError as error:
+            raise LidarpoolError(str(error)) from error
+        return rig.ranges(specs, made.positions, made.rotations)
+
+    @checked
+    def move(self, name: str, pose: Pose | Trajectory | Sequence[float]) -> None:
+        """Place an actor; sweeps that have begun see it where it was.
+
+        Parameters
+        ----------
+        name
+            Of the actor.
+        pose
+            Where it stands from now on, or a trajectory that it follows from time 0 on. In the
+            scene's local coordinates.
+
+        Raises
+        ------
+        LidarpoolError
+            If there is no such actor.
+        """
+        path = _path(pose)
+        scene = self._rig.scene
+        actors = scene.all_names[len(scene.names) :]
+        if name not in actors:
+            hint = did_you_mean(name, actors) or f" There are {', '.join(actors[:5]) or 'none'}."
+            if name in scene.names:
+                hint = " It is part of the scene, which stands still: make it an Actor."
+            raise LidarpoolError(f"There is no actor {name!r}.{hint}")
+        number = actors.index(name)
+        with self._lock:
+            self._actors[number] = replace(self._actors[number], trajectory=path)
+            self._rig = self._rig.with_actors(tuple(self._actors))
+
+    def _specs(self, number: int, start_s: float | None) -> tuple[Rig, list[ScanSpec], float]:
+        """Rig as it is now, scans of a turn, and how late it is, nanoseconds."""
+        rig = self._rig
+        sensor = rig.survey.sensor
+        if number < 0:
+            raise LidarpoolError(f"number is {number}; it must be at least 0.")
+        if start_s is not None and not 0 <= start_s < float("inf"):
+            raise LidarpoolError(f"start_s is {start_s}; it must be at least 0.")
+        steps = sensor.steps_of_turn(number)
+        if steps.stop > SCANS_MOST:
+            raise LidarpoolError(f"number is {number}; scans are counted up to {SCANS_MOST:,}.")
+        late_ns = 0
+        if start_s is not None:
+            late_ns = round(start_s * 1e9 - sensor.turn_ns(number))
+        specs = [
+            ScanSpec(step, 0, sensor.firings(step), late_ns, 0, sensor.channels) for step in steps
+        ]
+        begin_ns, end_ns = _span_ns(rig, specs)
+        for actor in rig.scene.actors:
+            if actor.trajectory.moves:
+                actor.check(begin_ns, end_ns)
+        return rig, specs, late_ns
+
+
+def _span_ns(rig: Rig, specs: list[ScanSpec]) -> tuple[float, float]:
+    """When the first and the last firing of scans begin, nanoseconds."""
+    sensor = rig.survey.sensor
+    ends = np.array([specs[0].firings[0], specs[-1].firings[1] - 1], np.int64)
+    begin, end = (sensor.begins_ns(ends) + (sensor.lead_ns + specs[0].start_ns)).tolist()
+    return begin, end
+
+
+def _check_lasts(path: Trajectory, begin_ns: float, end_ns: float) -> None:
+    if end_ns > path.duration_ns:
+        raise LidarpoolError(
+            f"The sweep would last from {begin_ns / 1e9:.6g} to {end_ns / 1e9:.6g} s, and the "
+            f"trajectory lasts {path.duration_ns / 1e9:.6g} s: begin earlier (start_s), or take a "
+            "longer one."
+        )
+
+
+def _path(given: Any) -> Trajectory:
+    path: Trajectory = given if hasattr(given, "poses") else Stations((_pose("pose", given),))
+    return path
+
+
+def _pose(name: str, given: Any) -> Pose:
+    if isinstance(given, Pose):
+        return given
+    try:
+        return Pose(tuple(map(float, given)))  # type: ignore[arg-type]  # it counts them
+    except (TypeError, ValueError) as error:
+        raise LidarpoolError(f"{name} is {shown(given)}; it must be {_ONE_POSE}.") from error
+
+
+def _placed(poses: Any) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+    """Positions (k, 3) and rotations (k, 3, 3), or None."""
+    if isinstance(poses, Pose):
+        poses = [poses]
+    if isinstance(poses, Sequence) and any(isinstance(pose, Pose) for pose in poses):
+        made = [_pose("a pose", pose) for pose in poses]
+        turns = [np.eye(3) if pose.rotation is None else pose.rotation for pose in made]
+        return np.array([pose.position for pose in made]), np.array(turns)
+    try:
+        table = np.asarray(poses, np.float64)
+    except (TypeError, ValueError):
+        table = np.zeros(0)
+    if table.shape == (3,) or (table.ndim == 2 and table.shape[1] == 3):
+        return table.reshape(-1, 3), None
+    if table.ndim == 3 and table.shape[1:] == (4, 4):
+        if not np.allclose(table[:, 3], [0, 0, 0, 1]):
+            raise LidarpoolError("The last row of each matrix of poses must be 0, 0, 0, 1.")
+        return table[:, :3, 3], table[:, :3, :3]
+    raise LidarpoolError(
+        f"poses is {shown(poses)} of the shape {table.shape}; it must be a list of Pose, positions "
+        "(k, 3), or matrices (k, 4, 4)."
+    )
