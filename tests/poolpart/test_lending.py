@@ -8,7 +8,7 @@ import time
 import dask
 import pytest
 from distributed import Client, Event, as_completed, get_client, wait, worker_client
-from tests.poolpart.helpers import LONG_S, declared, here, join, kill, wait_for
+from tests.poolpart.helpers import LONG_S, addresses, declared, here, join, kill, wait_for
 
 from poolpart import Partition, Pool, PoolError, rest
 from poolpart.lending import lending_plugin
@@ -272,7 +272,9 @@ def test_whoever_dies_while_the_parent_waits(nannies, wait_until, who):
     wait_until(lambda: any(t.key.startswith("wait_and_say") for t in scheduler.tasks.values()))
     wait_until(lambda: scheduler.tasks[parent.key].processing_on is not None)
     lender = str(scheduler.tasks[parent.key].processing_on.name)
-    kill(nannies, lender if who == "parent" else str(1 - int(lender)))
+    name = lender if who == "parent" else str(1 - int(lender))
+    killed = kill(nannies, name)
+    wait_until(lambda: addresses(nannies).get(name, killed) != killed)
     nannies.wait_for_workers(2, timeout=LONG_S)
     Event(gate, nannies).set()
     assert parent.result(LONG_S) == 1

@@ -1,64 +1,215 @@
-"""raybeam and poolpart can be had without the rest."""
+"""lidarpool, raybeam and poolpart as distributions: what they hold, alone and together."""
 
 from __future__ import annotations
 
-import json
+import importlib.metadata
+import os
+import re
 import subprocess
 import sys
+import tarfile
 import tomllib
+import zipfile
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+
+from lidarpool import __version__
 
 ROOT = Path(__file__).parents[2]
-CASTS = """
-import numpy as np
-from raybeam import RayCaster
-caster = RayCaster(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], float), [[0, 1, 2]])
-print(caster.backend, caster.cast([0.2, 0.2, 5.0], [[0, 0, -1], [0, 0, 1]]).distance)
-"""
-DIVIDES = """
-from distributed import Client
-from poolpart import Pool, local_cluster
-if __name__ == "__main__":
-    with local_cluster({"A": (1, 1), "B": (1, 2)}) as cluster, Client(cluster) as client:
-        pool = Pool.from_client(client)
-        print(*pool.partitions(), sum(pool.partitions()["B"].map(abs, range(-9, 0))))
-"""
+FOLDERS = {"lidarpool": ".", "raybeam": "kernels", "poolpart": "scheduler"}
+PACKAGES = {
+    "lidarpool": ["kernels/raybeam", "scheduler/poolpart", "workflows/lidarpool"],
+    "raybeam": ["raybeam"],
+    "poolpart": ["poolpart"],
+}
 
 
-def declared(folder: str) -> dict:
-    project = tomllib.loads((ROOT / folder / "pyproject.toml").read_text(encoding="utf-8"))
-    return project["project"]
+def declared(name: str) -> dict:
+    project = (ROOT / FOLDERS[name] / "pyproject.toml").read_text(encoding="utf-8")
+    return tomllib.loads(project)
 
 
-@pytest.mark.parametrize("folder", ["kernels", "scheduler"])
-def test_a_part_wants_what_the_whole_wants(folder):
-    whole, part = declared("."), declared(folder)
+@pytest.mark.parametrize("name", ["raybeam", "poolpart"])
+def test_a_part_wants_what_the_whole_wants(name):
+    whole, part = declared("lidarpool")["project"], declared(name)["project"]
     extras = whole["optional-dependencies"]
     assert set(part["dependencies"]) < set(whole["dependencies"])
-    for name, wanted in part.get("optional-dependencies", {}).items():
-        assert set(wanted) <= set(extras.get(name, whole["dependencies"]))
+    for extra, wanted in part.get("optional-dependencies", {}).items():
+        assert set(wanted) <= set(extras.get(extra, whole["dependencies"]))
     assert part["requires-python"] == whole["requires-python"]
+    licence = (ROOT / FOLDERS[name] / "LICENSE").read_bytes()
+    assert licence == (ROOT / "LICENSE").read_bytes()
+
+
+def python(*arguments: object, **options) -> str:
+    done = subprocess.run(
+        [sys.executable, *map(str, arguments)], stdout=subprocess.PIPE, text=True, **options
+    )
+    assert not done.returncode, done.stdout
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory) -> Path:
+    """Source distributions of this checkout, and the wheels built from them."""
+    for tool in ("pip", "hatchling", "twine"):
+        pytest.importorskip(tool, reason=f"needs {tool}: pip install '.[dev]'")
+    place = tmp_path_factory.mktemp("built")
+    for folder in FOLDERS.values():
+        python("-m", "hatchling", "build", "-t", "sdist", "-d", place, cwd=ROOT / folder)
+    python(
+        *("-m", "pip", "wheel", "--quiet", "--no-build-isolation", "--no-deps", "--no-index"),
+        *("-w", place, *place.glob("*.tar.gz")),
+    )
+    return place
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("what", "code", "says", "most"),
-    [
-        ("kernels", CASTS, "numpy [ 5. inf]\n", 2),
-        ("kernels[embree]", CASTS, "embree [ 5. inf]\n", 3),
-        ("scheduler", DIVIDES, "A B 45\n", 25),
-    ],
-)
-def test_a_part_by_itself_in_an_empty_environment(tmp_path, what, code, says, most):
-    """It is had from where packages come from, hence slow."""
-    subprocess.run([sys.executable, "-m", "venv", tmp_path / "venv"], check=True)
-    pip = [tmp_path / "venv" / "bin" / "python", "-m", "pip", "--disable-pip-version-check"]
-    subprocess.run([*pip, "install", "--quiet", ROOT / what], check=True)
-    listed = subprocess.run([*pip, "list", "--format=json"], check=True, stdout=subprocess.PIPE)
-    names = {entry["name"] for entry in json.loads(listed.stdout)} - {"pip", "setuptools"}
-    assert len(names) <= most and not {"lidarpool", "open3d-cpu"} & names
-    (tmp_path / "it.py").write_text(code, encoding="utf-8")
-    done = subprocess.run([pip[0], "-I", "it.py"], cwd=tmp_path, stdout=subprocess.PIPE, text=True)
-    assert done.stdout == says
+@pytest.mark.sample
+@pytest.mark.parametrize("name", FOLDERS)
+def test_they_hold_the_files_that_git_has_and_no_others(built, name):
+    tracked = subprocess.run(
+        ["git", "ls-files", *PACKAGES[name]],
+        cwd=ROOT / FOLDERS[name],
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+    ).stdout.split()
+    assert len(tracked) > 20
+    stem = f"{name}-{__version__}"
+    with tarfile.open(built / f"{stem}.tar.gz") as archive:
+        found = {member.removeprefix(f"{stem}/") for member in archive.getnames()}
+    about = {"PKG-INFO", "pyproject.toml", "README.md", "LICENSE", ".gitignore"}
+    assert found == about.union(tracked)
+    with zipfile.ZipFile(built / f"{stem}-py3-none-any.whl") as archive:
+        found = set(archive.namelist())
+    about = {file for file in found if file.startswith(f"{stem}.dist-info/")}
+    outer = {f"{Path(package).parent}/" for package in PACKAGES[name]} - {"./"}
+    wanted = {re.sub(f"^({'|'.join(outer)})", "", file) for file in tracked}
+    assert found - about == wanted
+    assert f"{stem}.dist-info/licenses/LICENSE" in about
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_a_package_index_would_take_them(built):
+    files = sorted(built.iterdir())
+    assert len(files) == 6
+    python("-m", "twine", "--no-color", "check", "--strict", *files)
+
+
+class Environment:
+    """A virtual environment of wheels, and of what they require, which links lead to."""
+
+    def __init__(self, folder: Path, built: Path, *wheels: str) -> None:
+        python("-m", "venv", "--without-pip", folder)
+        self.bin = folder / "bin"
+        self._built = built
+        self.pip("install", *wheels)
+        self._site = next(folder.glob("lib/python*/site-packages"))
+        self._link([Requirement(wheel) for wheel in wheels])
+
+    def pip(self, command: str, *options: str) -> None:
+        here = ["--no-index", "--no-deps", "--find-links", self._built]
+        more = here if command == "install" else []
+        python("-m", "pip", "--python", self.bin / "python", command, "--quiet", *more, *options)
+
+    def _link(self, wanted: list[Requirement]) -> None:
+        done: set[tuple[str, str]] = set()
+        while wanted:
+            requirement = wanted.pop()
+            [distribution, *_] = importlib.metadata.distributions(
+                name=requirement.name, path=[str(self._site), *sys.path]
+            )
+            entries = {file.parts[0] for file in distribution.files or ()} - {"..", "__pycache__"}
+            for entry in entries:
+                if not (self._site / entry).exists():
+                    (self._site / entry).symlink_to(distribution.locate_file(entry))
+            for extra in {"", *requirement.extras}:
+                if (requirement.name, extra) in done:
+                    continue
+                done.add((requirement.name, extra))
+                for text in distribution.requires or ():
+                    further = Requirement(text)
+                    if not further.marker or further.marker.evaluate({"extra": extra}):
+                        wanted.append(further)
+
+    def names(self) -> set[str]:
+        found = importlib.metadata.distributions(path=[str(self._site)])
+        return {one.metadata["Name"] for one in found}
+
+    def hashes(self, names: Iterable[str]) -> dict[str, list[str]]:
+        """Hashes of the packages' files, {file: one for each distribution that has it}."""
+        found: dict[str, list[str]] = {}
+        for name in names:
+            [one] = importlib.metadata.distributions(name=name, path=[str(self._site)])
+            for file in one.files or ():
+                if file.hash and not file.parts[0].endswith(".dist-info"):
+                    found.setdefault(str(file), []).append(file.hash.value)
+        return found
+
+    def run(self, *command: str, cwd: Path) -> str:
+        environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+        done = subprocess.run(
+            [self.bin / command[0], *command[1:]],
+            cwd=cwd, env=environment, stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        return done.stdout if done.returncode == 0 else f"exit {done.returncode}: {done.stdout}"
+
+    def run_readme(self, name: str, folder: Path, more: str = "") -> str:
+        """Run the example of a part's README."""
+        readme = (ROOT / FOLDERS[name] / "README.md").read_text(encoding="utf-8")
+        [code] = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
+        (folder / "example.py").write_text(code + more, encoding="utf-8")
+        return self.run("python", "-I", "example.py", cwd=folder)
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+@pytest.mark.parametrize(("extra", "backend"), [("", "numpy"), ("[embree]", "embree")])
+def test_raybeam_alone_needs_numpy_alone(built, tmp_path, extra, backend):
+    alone = Environment(tmp_path / "venv", built, f"raybeam{extra}")
+    assert alone.names() - {"embreex"} == {"raybeam", "numpy"}
+    said = alone.run_readme("raybeam", tmp_path, "print(caster.backend)\n")
+    assert said == f"[ 5. inf]\n{backend}\n"
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_poolpart_alone_needs_dask_alone(built, tmp_path):
+    alone = Environment(tmp_path / "venv", built, "poolpart")
+    assert not {"numpy", "lidarpool", "raybeam"} & alone.names()
+    assert alone.run_readme("poolpart", tmp_path) == "1 2 45\n"
+
+
+def surveys(environment: Environment, folder: Path, *options: str) -> str:
+    """Run a survey; say how it ended."""
+    car = str(ROOT / "examples" / "car.obj")
+    return environment.run("lidarpool", "run", car, "--out", "out", *options, cwd=folder)
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_lidarpool_alone_needs_no_more_than_it_declares(built, tmp_path):
+    alone = Environment(tmp_path / "venv", built, "lidarpool")
+    assert not {"raybeam", "poolpart", "pytest"} & alone.names()
+    assert "results in out: cloud.ply" in surveys(alone, tmp_path)
+    assert (tmp_path / "out" / "report.html").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_the_three_together_share_equal_files(built, tmp_path):
+    """Uninstalling a part takes its files from lidarpool, which is then to be installed again."""
+    together = Environment(tmp_path / "venv", built, *FOLDERS)
+    found = together.hashes(FOLDERS)
+    assert all(len(set(hashes)) == 1 for hashes in found.values())
+    twice = {file.split("/")[0] for file, hashes in found.items() if len(hashes) == 2}
+    assert twice == {"raybeam", "poolpart"}
+    together.pip("uninstall", "--yes", "raybeam", "poolpart")
+    assert surveys(together, tmp_path).startswith("exit 1")
+    together.pip("install", "--force-reinstall", "lidarpool")
+    assert "results in out: cloud.ply" in surveys(together, tmp_path, "--only", "cloud")

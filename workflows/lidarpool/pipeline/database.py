@@ -99,12 +99,14 @@ class RunDatabase:
             "CASE WHEN stop > ? THEN summaries ELSE x'' END FROM parts ORDER BY first",
             (self.frames,),
         )
-        for first, stop, name, count, size, hits, cells, summaries in rows:
-            if not is_part_of(mark, name):
-                raise ValueError(f"{name!r} is not a part of this run")
-            box = tuple(json.loads(cells))
-            self._enter(Receipt(-1, first, stop, name, count, size, hits, box, summaries))
-        trials = self._sql.execute("SELECT data FROM trials ORDER BY trial")
+        # From Python 3.12 on, an unfinished cursor in a traceback keeps a closed file locked.
+        with closing(rows):
+            for first, stop, name, count, size, hits, cells, summaries in rows:
+                if not is_part_of(mark, name):
+                    raise ValueError(f"{name!r} is not a part of this run")
+                box = tuple(json.loads(cells))
+                self._enter(Receipt(-1, first, stop, name, count, size, hits, box, summaries))
+        trials = self._sql.execute("SELECT data FROM trials ORDER BY trial").fetchall()
         self.trials = [_trial_of(json.loads(data)) for (data,) in trials]
 
     # -- reading -------------------------------------------------------------------------

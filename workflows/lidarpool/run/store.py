@@ -155,6 +155,7 @@ class RunStore:
         except LidarpoolError:
             if path.exists() and not path.stat().st_size:  # the disk is full
                 path.unlink()
+                path.with_name(f"{FILE}-journal").unlink(missing_ok=True)  # SQLite 3.37 leaves it
             raise
         return db
 

@@ -1,0 +1,57 @@
+"""Only the writing of PLY needs Open3D: all else works where it does not load."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+SCENARIO = "poses: [[0, 0, 1]]\nplanning: {enabled: false}\ncloud: {keep_every: 5}\n"
+EVERYTHING_ELSE = """
+from pathlib import Path
+from lidarpool import LidarpoolError, Scene, Survey, read_cloud, simulate
+from lidarpool.cli.commands import main
+from lidarpool.live.result_page import open_result, result_page
+
+def command(*arguments):
+    try:
+        main(arguments)
+    except SystemExit as ended:
+        assert not ended.code, arguments
+
+if __name__ == "__main__":
+    command("check", "s.yaml")
+    command("export", "out", "-f", "pcd", "-f", "laz")
+    command("plot", "out", "--colour", "object")
+    with result_page(open_result(Path("out")), port=0, browser=False):
+        print("shown")
+    points = simulate(Scene.seed(), Survey(poses=[(0, 0, 1)], keep_every=5)).points
+    assert len(points) == len(read_cloud("out/cloud.ply"))
+    points.save("again.laz")
+    try:
+        points.save("again.ply")
+    except LidarpoolError as error:
+        print(error)
+"""
+
+
+def test_what_writes_no_ply_does_without_it(cluster, lidarpool, no_pictures, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "s.yaml").write_text(SCENARIO)
+    made = lidarpool("run", "s.yaml", "--out", "out", "--scheduler", cluster)
+    assert made.code == 0, made.err
+    (tmp_path / "open3d").mkdir()
+    (tmp_path / "open3d" / "__init__.py").write_text("raise ImportError('there is no Open3D')")
+    (tmp_path / "script.py").write_text(EVERYTHING_ELSE)
+    done = subprocess.run(  # a script's folder is searched first, by its workers as well
+        [sys.executable, "script.py"],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    *_, shown, refused = done.stdout.splitlines()
+    assert shown == "shown"
+    assert refused.startswith("Clouds are written through Open3D, which does not load")
+    assert (tmp_path / "out" / "cloud.laz").exists() and (tmp_path / "again.laz").exists()
+    assert not (tmp_path / "again.ply").exists()
