@@ -158,17 +158,17 @@ class BatchReturns:
 
     @property
     def cell_x(self) -> NDArray[np.int32]:
-        """Of the positions."""
+        """Quantised x of each return, multiples of the precision from the local origin."""
         return self.cells[0]
 
     @property
     def cell_y(self) -> NDArray[np.int32]:
-        """Of the positions."""
+        """Quantised y of each return, multiples of the precision from the local origin."""
         return self.cells[1]
 
     @property
     def cell_z(self) -> NDArray[np.int32]:
-        """Of the positions."""
+        """Quantised z of each return, multiples of the precision from the local origin."""
         return self.cells[2]
 
     @cached_property
