@@ -81,7 +81,7 @@ class LongStages:
         self._looked_at = 0.0
         self._enough_at = time.monotonic()  # slots, free or not
         self._waited_from: float | None = None  # waited for slots that others held
-        self.waiting = False  # since when it waits for such slots; None if it does not
+        self.waiting = False  # whether it waits for such slots
         self.notes: list[str] = []  # what a user should know
 
     @property
