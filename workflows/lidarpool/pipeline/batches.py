@@ -37,7 +37,7 @@ class Batch:
     stop: int
     number: int
     place: Place = Place.WAITING
-    offer: int = -1  # number of the last offer; receipts of earlier ones count as well
+    tries: int = 0  # how often it was offered; receipts of all of them count
     worker: str = ""  # address of the GPU worker
     collector: str = ""  # name of the task of stage 4
     future: Future | None = None

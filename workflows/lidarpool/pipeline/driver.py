@@ -121,16 +121,12 @@ class SurveyDriver:
         self.generated = 0  # scans taken from stage 1, from the first on
         self.cast = 0  # scans that stage 2 has finished
         self.offered_again = 0
-        self.duplicates_dropped = 0
-        self._offers: dict[int, Batch] = {}  # {number of an offer: its batch}
-        self._offer_count = 0
         self._seconds: deque[float] = deque(maxlen=64)  # casting times of batches
         self._condemned: list[str] = []  # why scans cannot be done
         self._mark = db.meta["mark"]
         self._probe = (probe_name(self._mark, self.run_id), secrets.token_bytes(16))
         self._hidden: list[str] = []  # names of LIDAR workers that do not see the storage
         self._summary = summary_type(samples_of_scan(self.survey.scan_count))
-        self._sorter = -1  # number of the current attempt
         self._sorted_at = time.monotonic()  # when the last frames came
         self._scans = self._pipe("scans", queue_capacity)
         self._receipts = self._pipe("receipts", 64)
@@ -168,7 +164,6 @@ class SurveyDriver:
 
     def _sort(self, number: int) -> Work:
         """Start a sorter with its own pipe, which has all summaries not handed out yet."""
-        self._sorter = number
         self._sorted_at = time.monotonic()
         inlet = self._new_inlet(SORT, number)
         self._have_sorted(self._db.unframed())
@@ -338,10 +333,7 @@ class SurveyDriver:
     def _take_scans(self) -> bool:
         items = self._inbox.pop(self._scans.name, [])
         for first, stop in items:
-            # A restarted generator repeats scans that are here already.
-            new = max(first, self.generated)
-            if new > first:
-                self._drop_duplicates(GENERATE, range(first, min(new, stop)))
+            new = max(first, self.generated)  # a restarted generator repeats some
             if new >= stop:
                 continue
             self._trace("take", GENERATE, range(new, stop))
@@ -349,10 +341,6 @@ class SurveyDriver:
             for run in self._db.missing(new, stop):
                 self.batches.add(*run)
         return bool(items)
-
-    def _drop_duplicates(self, stage: str, scans: range) -> None:
-        self.duplicates_dropped += len(scans)
-        self._trace("duplicate", stage, scans)
 
     # -- stage 2: casting --------------------------------------------------------------------
 
@@ -392,16 +380,15 @@ class SurveyDriver:
         return moved
 
     def _cast(self, batch: Batch, address: str) -> None:
-        offer, self._offer_count = self._offer_count, self._offer_count + 1
-        self._offers[offer] = batch
-        batch.offer, batch.worker, batch.collector = offer, address, ""
+        batch.tries += 1
+        batch.worker, batch.collector = address, ""
         batch.future = self._gpu.submit(
             intersect,
             self.workers.handle,
             batch.first,
             batch.stop,
             self.run_id,
-            key=f"{INTERSECT}-{self.run_id}-{batch.first}.{offer}",
+            key=f"{INTERSECT}-{self.run_id}-{batch.first}-{batch.stop}.{batch.tries}",
             workers=address,
         )
         batch.to(Place.CASTING, time.monotonic())
@@ -543,18 +530,12 @@ class SurveyDriver:
         batch.to(Place.COLLECTING, time.monotonic())
         self._trace("handon", COLLECT, batch.scans)
         return {
-            "offer": batch.offer,
             "key": batch.future.key,
             "at": batch.worker,
             "first": batch.first,
             "stop": batch.stop,
             "name": part_name(self._mark, batch.first, batch.stop),
         }
-
-    def _under_way(self, offer: int) -> Batch | None:
-        """Batch of an offer; None if it is committed or was divided."""
-        batch = self._offers.get(offer)
-        return batch if batch is not None and batch in self.batches else None
 
     def _take_receipts(self) -> bool:
         answers = self._inbox.pop(self._receipts.name, [])
@@ -566,10 +547,10 @@ class SurveyDriver:
                 self._hidden.append(answer["hidden"])
                 continue
             if "lost" in answer:
-                # A replaced collector may report a batch that another has committed.
-                batch = self._under_way(answer["lost"])
-                if batch is not None and batch.place is Place.COLLECTING:
-                    self._again(batch, "its columns could not be fetched")
+                # A replaced collector may report a batch that was offered again.
+                for batch in self.batches.at(Place.COLLECTING):
+                    if batch.future is not None and batch.future.key == answer["lost"]:
+                        self._again(batch, "its columns could not be fetched")
                 continue
             receipt = Receipt.from_wire(answer["receipt"])
             if receipt.held_at and not self._fetch_held(receipt):
@@ -583,8 +564,9 @@ class SurveyDriver:
         """Write a part from a worker that does not see the storage."""
         data = take_held(self.client, receipt.held_at, receipt.name)
         if data is None:
-            if (batch := self._under_way(receipt.offer)) is not None:
-                self._again(batch, "its part was lost")
+            for batch in self.batches.within(receipt.first, receipt.stop):
+                if batch.place is Place.COLLECTING:
+                    self._again(batch, "its part was lost")
             return False
         try:
             self._storage.write(receipt.name, data)
@@ -600,19 +582,11 @@ class SurveyDriver:
 
     def _commit(self, receipts: list[Receipt]) -> None:
         new = self._db.commit(receipts)
-        for receipt in receipts:
-            scans = range(receipt.first, receipt.stop)
-            if any(receipt is one for one in new):
-                self._trace("points", COLLECT, scans)
-            else:
-                self._drop_duplicates(COLLECT, scans)
-                with suppress(OSError):  # leftovers there are removed at the end
-                    self._storage.remove([receipt.name])
         for receipt in new:
+            self._trace("points", COLLECT, range(receipt.first, receipt.stop))
             self._learn(receipt.records)
             for batch in self.batches.within(receipt.first, receipt.stop):
                 self.batches.remove(batch)
-            self._offers.pop(receipt.offer, None)
         if new:
             self._have_sorted(new)
             self._on_parts(new)
@@ -640,13 +614,7 @@ class SurveyDriver:
         for item in items:
             summaries = np.frombuffer(item["data"], self._summary)
             scans = range(item["first"], item["first"] + len(summaries))
-            if item["attempt"] != self._sorter:
-                self._trace("stale", SORT, scans)
-                continue
             self._sorted_at = time.monotonic()
-            if item["first"] < self._db.frames:
-                known = range(item["first"], min(scans.stop, self._db.frames))
-                self._drop_duplicates(SORT, known)
             for scan, summary in zip(scans, summaries, strict=True):
                 if scan == self._db.frames:
                     self._hand_out(scan, summary)

@@ -40,8 +40,6 @@ class Receipt:
 
     Parameters
     ----------
-    offer
-        Number of its offer; see `scan.batches`.
     first, stop
         Its scans.
     name
@@ -61,7 +59,6 @@ class Receipt:
         "" if the part is in storage.
     """
 
-    offer: int
     first: int
     stop: int
     name: str

@@ -104,9 +104,7 @@ def sort_frames(
             if ready:
                 whole = b"".join(ready)
                 trace("sort.put", **fields, scans=_scans(at, whole, size))
-                outlet.put(
-                    {"attempt": fields["attempt"], "first": at, "data": whole}, unbounded=True
-                )
+                outlet.put({"first": at, "data": whole}, unbounded=True)
                 trace("sort.sent", **fields, scans=_scans(at, whole, size))
     except (PipeClosed, PipeFailed):
         pass
@@ -131,9 +129,9 @@ def collect(
         Place of the parts, and a file there with its content. A worker that does not see that file
         holds its parts in memory, and the driver fetches them.
     inlet
-        From the driver: lists of {offer, key, at, first, stop, name}.
+        From the driver: lists of {key, at, first, stop, name}.
     outlet
-        To the driver: {receipt: …}, or {lost: offer} for a batch that could not be fetched,
+        To the driver: {receipt: …}, or {lost: key} for a batch that could not be fetched,
         {failed: reason} if the storage fails, {hidden: worker} if it is not seen.
     """
     secede()
@@ -160,12 +158,12 @@ def _collected(
     fields: dict[str, Any], storage: Storage | None, item: dict[str, Any]
 ) -> dict[str, Any]:
     """Make a part of one batch; returns the message to the driver."""
-    first, stop, offer = item["first"], item["stop"], item["offer"]
+    first, stop = item["first"], item["stop"]
     scans = list(range(first, stop))
     found = fetch_available(own_client(), [item["key"]], FETCH_PATIENCE_S, at=item["at"])
     batch: CastBatch | None = found.get(item["key"])
     if batch is None:
-        return {"lost": offer}
+        return {"lost": item["key"]}
     trace("collect.get", **fields, scans=scans)
     with naming_scans(first, stop - 1):
         data = pack(batch.part)
@@ -181,7 +179,6 @@ def _collected(
             return {"failed": f"{error.strerror or error}"}
         trace("collect.stored", **fields, scans=scans)
     receipt = Receipt(
-        offer=offer,
         first=first,
         stop=stop,
         name=item["name"],

@@ -180,7 +180,6 @@ class Run:
             survey_seconds=times[SurveyDriver],
             planning_seconds=times.get(TrialPump, 0.0),
             replayed=survey.offered_again,
-            duplicates_dropped=survey.duplicates_dropped,
         )
 
     def _survey_driver(self, on_frame: Callable[[Frame], None] | None) -> SurveyDriver:
