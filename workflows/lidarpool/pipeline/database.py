@@ -133,7 +133,7 @@ class RunDatabase:
 
     def forget_summaries(self, part: Receipt) -> None:
         """Drop the summaries of a part from memory, because all were handed out."""
-        self.parts[part.first] = replace(part, summaries=b"")
+        self.parts[part.first] = replace(part, summaries=b"", record=None)
 
     def summaries_of(self, scans: Sequence[int]) -> list[tuple[int, bytes]]:
         """Summaries of the parts that hold some scans: (first scan, summaries), in order."""
