@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import pytest
 
 from lidarpool import LidarpoolError
-from lidarpool.pipeline import watch
-from lidarpool.pipeline.watch import Watch
+from lidarpool.run import watch
+from lidarpool.run.watch import Watch
 
 
 @pytest.fixture

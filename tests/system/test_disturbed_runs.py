@@ -11,8 +11,8 @@ from tests.clusters import thread_cluster
 
 from lidarpool import Frame, LidarpoolError, Planning, Scene, Sensor, Survey, simulate
 from lidarpool.pipeline import SurveyDriver
-from lidarpool.pipeline.watch import WATCH_EVERY_S
 from lidarpool.run.trials import TrialPump
+from lidarpool.run.watch import WATCH_EVERY_S
 from poolpart import placement_violations, worker_identities
 
 # Enough batches that the run is still under way when something happens to it.

@@ -5,7 +5,6 @@ from .long_stages import LongStages
 from .messages import Frame, Receipt
 from .names import COLLECT, EXPORT, GENERATE, GPU, INTERSECT, LIDAR, OTHER, SORT
 from .rigs import RigPlan
-from .watch import Watch
 from .workers import CastingWorkers
 
 __all__ = [
@@ -23,5 +22,4 @@ __all__ = [
     "Receipt",
     "RigPlan",
     "SurveyDriver",
-    "Watch",
 ]

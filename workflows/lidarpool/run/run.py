@@ -32,7 +32,6 @@ from ..pipeline import (
     LongStages,
     RigPlan,
     SurveyDriver,
-    Watch,
 )
 from ..plan import best
 from .checks import find_workers, gpu_note
@@ -41,6 +40,7 @@ from .result import RunResult
 from .store import RunStore
 from .trials import TrialPump
 from .waiting import Waiting
+from .watch import Watch
 
 T = TypeVar("T")
 
