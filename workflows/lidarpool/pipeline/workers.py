@@ -97,6 +97,8 @@ class CastingWorkers:
 
     def cast(self, first: int, stop: int, offer: int, worker: str) -> str:
         """Offer the scans from `first` to `stop` to a worker for the n-th time; returns the key."""
+        # A key of its own for each offer: a task that is released and submitted again under its
+        # key stays with the worker that still runs it, whatever `workers` says (in 4 of 4 tries).
         key = f"{INTERSECT}-{self.handle}-{first}-{stop}.{offer}"
         self._casts[key] = self._partition.submit(
             intersect, self.handle, first, stop, self.handle, key=key, workers=worker
