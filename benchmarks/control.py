@@ -29,7 +29,8 @@ import numpy as np
 from distributed import Client, Scheduler, SpecCluster, Worker
 
 import lidarpool.pipeline.cast
-import lidarpool.pipeline.driver
+import lidarpool.pipeline.policies
+import lidarpool.pipeline.workers
 from lidarpool import Scene, Sensor, Survey, simulate
 from lidarpool.base.storage import Storage
 from lidarpool.columns.parts import PartColumns
@@ -150,7 +151,7 @@ def count_batches(batches: int) -> None:
     """Print bytes a batch: what more batches of one scan add at the scheduler and at the driver."""
     ends = {}
     for count in (batches, 3 * batches):
-        with counting() as counted, patch.object(lidarpool.pipeline.driver, "BATCH_RAYS", 1):
+        with counting() as counted, patch.object(lidarpool.pipeline.policies, "BATCH_RAYS", 1):
             simulate(Scene.seed(), small_survey(count, 5))
         ends[count] = counted.work(), counted.work(driver=True)
     scheduler, driver = (np.array(ends[3 * batches]) - ends[batches]) / (2 * batches)
@@ -191,8 +192,8 @@ def sustain(parts: int) -> None:
         tempfile.TemporaryDirectory() as folder,
         SpecCluster(workers=workers, scheduler=scheduler, silence_logs=50) as cluster,
         Client(cluster) as client,
-        patch.object(lidarpool.pipeline.driver, "intersect", cast_at_once),
-        patch.object(lidarpool.pipeline.driver, "BATCH_RAYS", 1),
+        patch.object(lidarpool.pipeline.workers, "intersect", cast_at_once),
+        patch.object(lidarpool.pipeline.policies, "BATCH_RAYS", 1),
         patch.object(Storage, "write", lambda self, name, data: None),
         patch.object(Storage, "sees", lambda self, name, data: True),
     ):

@@ -313,7 +313,7 @@ class Workspace:
 
 
 def _drift(vectors: Float, rates: Float, delays: Float, crosses: Float, product: Float) -> None:
-    """Rotate vectors of a block by their delays, in place, as `Poses.drifted` does."""
+    """Rotate vectors of a block by their delays, in place, as `RayPoses.turned` does."""
     x, y, z = vectors
     a, b, c = _factors(rates)
     pairs = ((b, z, c, y), (c, x, a, z), (a, y, b, x))

@@ -10,7 +10,6 @@ import pytest
 
 from lidarpool import Scene, Survey
 from lidarpool.live.run_page import live_run
-from lidarpool.pipeline import SurveyDriver
 from lidarpool.run.connection import local_client
 from lidarpool.run.job import Job
 from lidarpool.run.run import Run
@@ -32,7 +31,7 @@ def client():
 @pytest.fixture
 def live(monkeypatch):
     """Return a page, and the store that it follows, of a survey of many small batches."""
-    monkeypatch.setattr(SurveyDriver, "_wished_scans", lambda *_: 10)
+    monkeypatch.setattr("lidarpool.pipeline.policies.scans_per_batch", lambda *_: 10)
     survey = Survey(poses=[(0, 0, 1 + step / 20) for step in range(SCANS // 36)])
     job = Job(Scene.seed(), survey)
     store = RunStore(job)

@@ -29,8 +29,6 @@ driver.handon      a collector was told of a batch, or the sorter of summaries
 driver.points      the part of a batch was committed
 driver.frame       a frame was handed out
 driver.release     a scan was committed and handed out; nothing holds it any more
-driver.duplicate   something came that is here already, from `stage`, and was dropped
-driver.stale       something came from an attempt that was replaced, and was dropped
 driver.replay      a batch is about to be offered or handed on once more; `reason` says why
 ================== ======================================================================
 """
@@ -65,4 +63,4 @@ DRIVER_POINTS = (
 )
 
 # Points that many a run does not come to: what is to happen there waits for one that does.
-RARE_POINTS = ("driver.duplicate", "driver.stale", "driver.replay")
+RARE_POINTS = ("driver.replay",)

@@ -83,7 +83,6 @@ class Outcome:
     seconds: float
     silence: str  # the longest time in which nothing happened, and what ended it
     replayed: int
-    dropped: int
     misplaced: int
     error: str = ""
 
@@ -149,7 +148,6 @@ def disturbed(
         seconds=time.monotonic() - started,
         silence=_longest_silence(events),
         replayed=0 if result is None else result.replayed,
-        dropped=0 if result is None else result.duplicates_dropped,
         misplaced=0 if result is None else len(placement_violations(result.records)),
         error=error,
     )

@@ -19,7 +19,6 @@ from tests.chaos.survey import PLANNING, Reference, disturbed, room
 import poolpart.task_locations
 from lidarpool import simulate
 from lidarpool.base.tracing import trace_to
-from lidarpool.pipeline import SurveyDriver
 
 JOIN_S = 300.0
 STOP_S = 2.0  # for others to take over
@@ -80,7 +79,7 @@ def test_given_up_by_the_scheduler_what_it_does_counts_once(
 @pytest.mark.parametrize("stage", ["collect-0", "prepare"])  # a casting worker has prepared itself
 def test_given_up_by_the_driver_it_does_no_harm(arena, what, known, monkeypatch, stage):
     """The scheduler would take it for dead after five minutes, and wait that long."""
-    monkeypatch.setattr(SurveyDriver, "_wished_scans", lambda *_: 10)
+    monkeypatch.setattr("lidarpool.pipeline.policies.scans_per_batch", lambda *_: 10)
     seen, stopped, reasons, continued = [], [], set(), []
 
     def given_up() -> bool:

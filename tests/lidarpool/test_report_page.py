@@ -117,7 +117,6 @@ def write(tmp_path: Path) -> Callable[..., tuple[str, dict[str, Any]]]:
                 "survey_seconds": 6.2,
                 "planning_seconds": 10.0 if plan else 0.0,
                 "replayed": 3,
-                "duplicates_dropped": 17,
                 "resumed": 0,
                 "notes": (),
                 "identity": {},
@@ -171,7 +170,6 @@ def test_numbers_are_those_of_the_report(write):
     page = html.fromstring(text)
     pairs = {dt.text: dt.getnext().text for dt in page.xpath("//dl[@class='pairs']//dt")}
     assert pairs["batches offered again because a worker was lost"] == "3"
-    assert pairs["duplicate scans that were dropped"] == "17"
     assert pairs["tasks outside their partition"] == "0"
     assert pairs["shortest possible"] == f"{report['planning']['shortest_possible']:.2f} m"
     lead = page.xpath("//p[@class='lead']")[0].text_content()

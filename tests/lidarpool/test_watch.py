@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import pytest
 
 from lidarpool import LidarpoolError
-from lidarpool.pipeline import watch
-from lidarpool.pipeline.watch import Watch
+from lidarpool.run import watch
+from lidarpool.run.watch import Watch
 
 
 @pytest.fixture
@@ -39,8 +39,10 @@ ALL = [("GPU", "running"), ("OTHER", "running"), ("LIDAR", "running")]
 def test_a_partition_may_be_empty_for_a_while(look):
     look(2, *ALL)
     look(60, *ALL[:2])
+    assert look.told == ["waiting for workers of partition LIDAR, for another 2 s"]
     look(63, *ALL)
     look(120, *ALL[1:])
+    assert look.told[1:] == ["waiting for workers of partition GPU, for another 3 s"]
     with pytest.raises(LidarpoolError, match=r"'GPU' has had no workers for 60 s.*\"GPU=1\""):
         look(124, *ALL[1:])
 
@@ -70,8 +72,14 @@ def test_while_all_are_paused_it_says_what_to_do(look):
 
 def test_what_runs_already_goes_on_where_workers_are_paused(look):
     look(61, *ALL[:2], ("LIDAR", "paused"))
+    assert (look.told, look.watching.notes) == ([], [])
+    with pytest.raises(LidarpoolError, match="'LIDAR' has had no workers for 60 s"):
+        look(122, *ALL[:2])  # its workers count only as long as they are there
 
 
 def test_a_partition_with_nothing_left_to_do_may_leave(look):
     look.watching.forget(["OTHER"])
     look(61, ALL[0], ALL[2])
+    assert look.told == []
+    with pytest.raises(LidarpoolError, match="'GPU' has had no workers for 60 s"):
+        look(122, ALL[2])  # the others are watched as before

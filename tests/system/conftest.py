@@ -19,7 +19,7 @@ from distributed import Client, Worker, WorkerPlugin
 from tests.clusters import thread_cluster
 
 import lidarpool.base.fork_server
-import lidarpool.pipeline.driver
+import lidarpool.pipeline.long_stages
 import lidarpool.report.pictures
 from lidarpool import Cloud
 from lidarpool.base.tracing import trace_to
@@ -270,9 +270,9 @@ def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def all_records(monkeypatch: pytest.MonkeyPatch) -> None:
     """Wait for the records of the long stages: a run does without those that come too late."""
-    monkeypatch.setattr(lidarpool.pipeline.driver, "LAST_WORDS_S", 120.0)
+    monkeypatch.setattr(lidarpool.pipeline.long_stages, "LAST_WORDS_S", 120.0)
     patient = partial(fetch_available, patience_s=120.0)
-    monkeypatch.setattr(lidarpool.pipeline.driver, "fetch_available", patient)
+    monkeypatch.setattr(lidarpool.pipeline.long_stages, "fetch_available", patient)
 
 
 @pytest.fixture
@@ -282,4 +282,4 @@ def small_batches(monkeypatch: pytest.MonkeyPatch) -> None:
     By default the machine's speed decides, and a survey of small scans may be under way as a
     whole, or stage 1 have ended, when the driver sees the first frames.
     """
-    monkeypatch.setattr(lidarpool.pipeline.driver.SurveyDriver, "_wished_scans", lambda *_: 10)
+    monkeypatch.setattr("lidarpool.pipeline.policies.scans_per_batch", lambda *_: 10)

@@ -35,9 +35,9 @@ SHORT = "sensor: {layers: 8}\nplanning: {trials: 4, iterations: 20}\n"
 # A run does without the records of stages that end too late on a busy machine.
 PATIENT = """
 from functools import partial
-import lidarpool.pipeline.driver as driver
-driver.LAST_WORDS_S = 120
-driver.fetch_available = partial(driver.fetch_available, patience_s=120)
+import lidarpool.pipeline.long_stages as stages
+stages.LAST_WORDS_S = 120
+stages.fetch_available = partial(stages.fetch_available, patience_s=120)
 """
 
 

@@ -11,8 +11,8 @@ from tests.clusters import thread_cluster
 
 from lidarpool import Frame, LidarpoolError, Planning, Scene, Sensor, Survey, simulate
 from lidarpool.pipeline import SurveyDriver
-from lidarpool.pipeline.watch import WATCH_EVERY_S
 from lidarpool.run.trials import TrialPump
+from lidarpool.run.watch import WATCH_EVERY_S
 from poolpart import placement_violations, worker_identities
 
 # Enough batches that the run is still under way when something happens to it.
@@ -57,6 +57,20 @@ def test_points_of_a_frame_are_in_storage_when_it_comes(cluster_client, undistur
             assert np.array_equal(points.positions, cloud.positions[mine])
 
     simulate(Scene.seed(), SURVEY, client=cluster_client, on_frame=on_frame)
+
+
+def test_who_writes_a_part_of_the_same_scans_writes_the_same_bytes(
+    client, cluster_client, tmp_path
+):
+    """So a second writer of a batch does no harm: its file replaces one that is equal."""
+    written = []
+    for name, workers in (("processes", client), ("threads", cluster_client)):
+        simulate(Scene.seed(), SURVEY, client=workers, folder=tmp_path / name)
+        parts = (tmp_path / name / "parts").glob("*.npz")
+        written.append({path.name.partition("-")[2]: path.read_bytes() for path in parts})
+    both = written[0].keys() & written[1].keys()
+    assert both, "the first scan is a part by itself"
+    assert all(written[0][name] == written[1][name] for name in both)
 
 
 def test_a_partition_that_stays_empty_ends_the_run(tmp_path):

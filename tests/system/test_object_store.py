@@ -249,7 +249,7 @@ def test_damage_is_repaired_and_foreign_objects_stay(environment):
     store.save(now=True)
     again = RunStore(JOB, url, resume=True)
     assert again.notes == [f"cast again: scans 2 to 3; {names[1]} was damaged in {url}/parts"]
-    assert add(again, 2, 4, number=1)
+    assert add(again, 2, 4)
     again.tidy()
     assert len(again.points().load()) == 18
     assert f"{url}/parts holds what is not of this run and stays there" in again.remove()

@@ -39,10 +39,10 @@ KEPT = r"holds an unfinished run, [\d,]+ of \d+ scans: continue it with"
 # when it passes a point for the n-th time; a point in capitals stands for a call.
 DRIVERS = """
 import json, os, signal, sys, traceback
-import lidarpool.cli.run_command, lidarpool.report.output, lidarpool.report.pictures as pictures
+import lidarpool.cli.run_command, lidarpool.pipeline.policies, lidarpool.report.output
+import lidarpool.report.pictures as pictures
 from lidarpool.__main__ import main
 from lidarpool.pipeline.database import RunDatabase
-from lidarpool.pipeline.driver import SurveyDriver
 from lidarpool.base.tracing import trace_to
 
 pictures.take_shot = lambda *_, **__: None
@@ -52,7 +52,7 @@ class BlankPage:
     def svg(self): return "<svg></svg>"
 pictures.draw_scene = pictures.draw_intensity = BlankPage
 pictures.draw_cloud = pictures.draw_path = BlankPage
-SurveyDriver._wished_scans = lambda *_: 10
+lidarpool.pipeline.policies.scans_per_batch = lambda *_: 10
 
 def drive(point, times):
     left = [times]

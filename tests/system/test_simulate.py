@@ -142,8 +142,8 @@ def test_a_client_that_has_given_its_scheduler_up_is_told_of_in_one_sentence(cli
         simulate(room(), survey, client=lost, on_frame=lambda _: lost.close())
 
 
-def raise_at(scan: int | None, scan_of=None):
-    """A stand-in that fails, at one scan if it can tell which it is about."""
+def raise_at(scan: int | str | None, scan_of=None):
+    """A stand-in that fails, at one scan or stage if it can tell which it is about."""
 
     def fail(*arguments, **_):
         if scan is None or scan_of(arguments) == scan:
@@ -177,8 +177,8 @@ def raise_at(scan: int | None, scan_of=None):
             r"stage collect-\d failed: scan \d+: FloatingPointError",
         ),
         (
-            "lidarpool.pipeline.stages._scans",
-            raise_at(None),
+            "lidarpool.pipeline.messages.StageStart.trace",
+            raise_at("sort", lambda arguments: arguments[0].stage),
             "stage sort failed: the mirror is loose",
         ),
         ("lidarpool.run.trials.run_trial", raise_at(None), "Planning trial 0 failed: .*the mirror"),

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from poolpart import TaskRecord
 
 RECORDS_MOST = 4096  # of one stage; beyond that every second one is dropped, repeatedly
-RECENT = 1024  # recent records, to recognise duplicates
 MISPLACED_MOST = 20  # kept for each stage; all are counted
 SPANS_MOST = 2048
 
@@ -88,22 +87,13 @@ class TaskBook:
 
     def __init__(self) -> None:
         self.stages: dict[str, StageTotals] = {}
-        self._recent: deque[TaskRecord] = deque()
-        self._known: set[TaskRecord] = set()
 
-    def add(self, record: TaskRecord) -> bool:
-        """Add a task; False for a duplicate, from a result that is fetched twice."""
-        if record in self._known:
-            return False
-        self._known.add(record)
-        self._recent.append(record)
-        if len(self._recent) > RECENT:
-            self._known.discard(self._recent.popleft())
+    def add(self, record: TaskRecord) -> None:
+        """Add a task."""
         totals = self.stages.get(record.stage)
         if totals is None:
             totals = self.stages[record.stage] = StageTotals(record.stage, record.partition)
         totals.add(record)
-        return True
 
     @property
     def records(self) -> list[TaskRecord]:

@@ -27,7 +27,7 @@ from ..columns.cloud import CHUNK_POINTS
 from ..export.formats import Format
 from ..pipeline import GPU, LIDAR, OTHER
 from ..pipeline.database import FILE
-from ..pipeline.driver import BATCH_RAYS
+from ..pipeline.policies import BATCH_RAYS
 from ..report.output import ROOM_BYTES, refuse_to_replace
 from ..run.checks import find_workers, gpu_note, slots_needed
 from ..run.cluster_file import ClusterFile

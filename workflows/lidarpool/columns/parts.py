@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import io
 import re
-import secrets
 import zipfile
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -28,9 +27,7 @@ from .cloud import CHUNK_POINTS, Cloud, Savable, described, need_packages
 from .table import AXES, SCAN, Column
 
 # Files of a run in the folder of its parts: its mark, then what it is.
-_OWN = re.compile(
-    r"([0-9a-f]{16})-(?:mark|probe-[0-9a-f]{8}|\d{8,}-\d{8,}-[0-9a-f]{8}\.npz)", re.ASCII
-)
+_OWN = re.compile(r"([0-9a-f]{16})-(?:mark|probe-[0-9a-f]{8}|\d{8,}-\d{8,}\.npz)", re.ASCII)
 _AGAIN = "Resuming the run (--resume, in Python resume=True) casts its scans again."
 # Head of an array: format 1.0 of NumPy, and what it says of one row of numbers.
 _MAGIC = b"\x93NUMPY\x01\x00"
@@ -45,8 +42,8 @@ _DATE = (1980, 1, 1, 0, 0, 0)  # the same columns give the same bytes
 
 
 def part_name(mark: str, first: int, stop: int) -> str:
-    """Return a name for a new part of these scans."""
-    return f"{mark}-{first:08d}-{stop:08d}-{secrets.token_hex(4)}.npz"
+    """Name of the part of these scans: who writes it a second time writes the same bytes."""
+    return f"{mark}-{first:08d}-{stop:08d}.npz"
 
 
 def probe_name(mark: str, driver: str) -> str:
@@ -57,11 +54,6 @@ def probe_name(mark: str, driver: str) -> str:
 def mark_name(mark: str) -> str:
     """Name of the file that says whose parts are in a folder."""
     return f"{mark}-mark"
-
-
-def is_part_of(mark: str, name: str) -> bool:
-    """Whether a name has the form of the parts of a run, which has no path in it."""
-    return _mark_of(name) == mark and name.endswith(".npz")
 
 
 def own_files(storage: Storage, mark: str | None) -> list[str]:

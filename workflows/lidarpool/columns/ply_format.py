@@ -56,13 +56,17 @@ def as_held(column: Column, values: NDArray[Any]) -> NDArray[Any]:
 
 
 def row_type(real: np.dtype[np.floating], table: Sequence[Column]) -> np.dtype[np.void]:
-    """Row of a file whose positions are of type `real`, in the order in which Open3D writes."""
+    """Row of a file whose positions are of type `real`, in the order of the table.
+
+    Of the size of a row that Open3D writes, in an order of its own: it keeps columns in a hash
+    table.
+    """
     kind = "<f8" if real == np.float64 else "<f4"
     return np.dtype([(axis, kind) for axis in AXES] + [(c.in_files, held_type(c)) for c in table])
 
 
 def header(row: np.dtype[np.void], count: int) -> bytes:
-    """Header of a file of `count` points, as Open3D writes it."""
+    """Header of a file of `count` points, in the words of Open3D."""
     lines = [f"property {_NAMES[row[name].str]} {name}" for name in row.names or ()]
     lines = ["comment Created by Open3D", f"element vertex {count}", *lines, "end_header\n"]
     return (_MAGIC + "\n".join(lines)).encode("ascii")

@@ -1,10 +1,11 @@
 """The survey pipeline: four stages on the partitions of a cluster, and their driver."""
 
 from .driver import SurveyDriver
+from .long_stages import LongStages
 from .messages import Frame, Receipt
 from .names import COLLECT, EXPORT, GENERATE, GPU, INTERSECT, LIDAR, OTHER, SORT
 from .rigs import RigPlan
-from .watch import Watch
+from .workers import CastingWorkers
 
 __all__ = [
     "COLLECT",
@@ -15,9 +16,10 @@ __all__ = [
     "LIDAR",
     "OTHER",
     "SORT",
+    "CastingWorkers",
     "Frame",
+    "LongStages",
     "Receipt",
     "RigPlan",
     "SurveyDriver",
-    "Watch",
 ]

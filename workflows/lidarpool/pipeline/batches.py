@@ -7,8 +7,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import Enum
 
-from distributed import Future
-
 PIECES = 16  # a failing batch is divided into so many
 
 
@@ -37,19 +35,20 @@ class Batch:
     stop: int
     number: int
     place: Place = Place.WAITING
-    offer: int = -1  # number of the last offer; receipts of earlier ones count as well
+    since: float = 0.0  # since when it is in its state
+    offers: int = 0  # how often it was offered to a GPU worker; receipts of all offers count
+    key: str = ""  # of the casting task; "" while waiting
     worker: str = ""  # address of the GPU worker
     collector: str = ""  # name of the task of stage 4
-    future: Future | None = None
-    since: float = 0.0  # since when it is in its state
     deaths: Counter[str] = field(default_factory=Counter)  # {stage: workers that died with it}
-    kills: Counter[str] = field(default_factory=Counter)  # {stage: those with no other batch}
-    suspects: set[str] = field(default_factory=set)  # stages whose workers it may have killed
+
+    def __len__(self) -> int:
+        return self.stop - self.first
 
     @property
-    def scans(self) -> list[int]:
+    def scans(self) -> range:
         """Numbers of its scans."""
-        return list(range(self.first, self.stop))
+        return range(self.first, self.stop)
 
     @property
     def name(self) -> str:
@@ -75,9 +74,6 @@ class Batches:
     def __iter__(self) -> Iterator[Batch]:
         return iter(list(self._batches.values()))
 
-    def __contains__(self, batch: Batch) -> bool:
-        return self._batches.get(batch.first) is batch
-
     @property
     def span(self) -> int:
         """How many batches the newest is ahead of the oldest."""
@@ -90,34 +86,22 @@ class Batches:
 
     def add(self, first: int, stop: int) -> Batch:
         """Take scans."""
-        batch = Batch(first, stop, self._taken)
+        batch = self._batches[first] = Batch(first, stop, self._taken)
         self._taken += 1
-        self._batches[first] = batch
         return batch
 
     def remove(self, batch: Batch) -> None:
-        """Release a batch; its result is no longer needed."""
-        if batch in self:
-            del self._batches[batch.first]
-        batch.future = None
+        """Remove a batch, which must be there."""
+        del self._batches[batch.first]
 
     def within(self, first: int, stop: int) -> list[Batch]:
         """Batches whose scans are all among these."""
         return [b for b in self._batches.values() if first <= b.first and b.stop <= stop]
 
-    def split(self, batch: Batch) -> list[Batch]:
-        """Divide a batch into smaller ones, which inherit its suspicion."""
+    def split(self, batch: Batch, deaths: Counter[str]) -> None:
+        """Divide a batch into smaller ones, which wait, with so many deaths each by stage."""
         self.remove(batch)
-        size = -(-(batch.stop - batch.first) // PIECES)
-        pieces = []
+        size = -(-len(batch) // PIECES)
         for first in range(batch.first, batch.stop, size):
-            piece = Batch(first, min(first + size, batch.stop), batch.number)
-            piece.suspects = set(batch.suspects)
-            self._batches[first] = piece
-            pieces.append(piece)
-        return pieces
-
-    def clear(self) -> None:
-        """Release all batches."""
-        for batch in self:
-            self.remove(batch)
+            stop = min(first + size, batch.stop)
+            self._batches[first] = Batch(first, stop, batch.number, deaths=deaths.copy())

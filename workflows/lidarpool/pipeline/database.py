@@ -1,7 +1,7 @@
 """The database of a run: which parts and trials belong to the result.
 
 One SQLite file. A batch belongs to the result once its receipt is in here; before that anything may
-be lost or done twice, after that a second receipt is dropped. Recovery and resuming offer all other
+be lost or done twice, after that a second receipt is ignored. Recovery and resuming offer all other
 batches again.
 """
 
@@ -22,18 +22,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import LidarpoolError
-from ..columns.parts import is_part_of
+from ..columns.parts import part_name
 from ..plan import Trial
 from .messages import Receipt
 
-FORMAT = 5
+FORMAT = 6
 FILE = "run.db"
 
 _TABLES = """
 CREATE TABLE meta (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
 CREATE TABLE parts (
-    first INTEGER PRIMARY KEY, stop INTEGER NOT NULL, name TEXT NOT NULL, rows INTEGER NOT NULL,
-    size INTEGER NOT NULL, hits INTEGER NOT NULL, cells TEXT NOT NULL, summaries BLOB NOT NULL
+    first INTEGER PRIMARY KEY, stop INTEGER NOT NULL, rows INTEGER NOT NULL, size INTEGER NOT NULL,
+    hits INTEGER NOT NULL, cells TEXT NOT NULL, summaries BLOB NOT NULL
 );
 CREATE TABLE trials (trial INTEGER PRIMARY KEY, data TEXT NOT NULL);
 """
@@ -95,17 +95,15 @@ class RunDatabase:
         mark = _checked_place(self.meta)[0]
         self.frames = self._frames_written = int(self.meta.get("frames", 0))
         rows = self._sql.execute(
-            "SELECT first, stop, name, rows, size, hits, cells, "
+            "SELECT first, stop, rows, size, hits, cells, "
             "CASE WHEN stop > ? THEN summaries ELSE x'' END FROM parts ORDER BY first",
             (self.frames,),
         )
         # From Python 3.12 on, an unfinished cursor in a traceback keeps a closed file locked.
         with closing(rows):
-            for first, stop, name, count, size, hits, cells, summaries in rows:
-                if not is_part_of(mark, name):
-                    raise ValueError(f"{name!r} is not a part of this run")
-                box = tuple(json.loads(cells))
-                self._enter(Receipt(-1, first, stop, name, count, size, hits, box, summaries))
+            for first, stop, count, size, hits, cells, summaries in rows:
+                name, box = part_name(mark, first, stop), tuple(json.loads(cells))
+                self._enter(Receipt(first, stop, name, count, size, hits, box, summaries))
         trials = self._sql.execute("SELECT data FROM trials ORDER BY trial").fetchall()
         self.trials = [_trial_of(json.loads(data)) for (data,) in trials]
 
@@ -137,7 +135,7 @@ class RunDatabase:
 
     def forget_summaries(self, part: Receipt) -> None:
         """Drop the summaries of a part from memory, because all were handed out."""
-        self.parts[part.first] = replace(part, summaries=b"", records=())
+        self.parts[part.first] = replace(part, summaries=b"", record=None)
 
     def summaries_of(self, scans: Sequence[int]) -> list[tuple[int, bytes]]:
         """Summaries of the parts that hold some scans: (first scan, summaries), in order."""
@@ -194,13 +192,12 @@ class RunDatabase:
         if new:
             with self._transaction():
                 self._sql.executemany(
-                    "INSERT INTO parts VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+                    "INSERT INTO parts VALUES (?, ?, ?, ?, ?, ?, ?)",
                     [
-                        (p.first, p.stop, p.name, p.rows, p.size, p.hits, json.dumps(p.cells),
-                         p.summaries)
+                        (p.first, p.stop, p.rows, p.size, p.hits, json.dumps(p.cells), p.summaries)
                         for p in new
                     ],
-                )  # fmt: skip
+                )
                 self._write_frames()
             for receipt in new:
                 self._enter(receipt)

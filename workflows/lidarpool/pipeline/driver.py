@@ -2,34 +2,24 @@
 
 Everything happens in `step`, called repeatedly from one thread; nothing in it waits for long. There
 is one rule of recovery: uncommitted batches are offered again, and frames that were not handed out
-are sorted again, whatever was lost. The number of batches under way, and the distance of the last
-to the first, are limited: that bounds every queue, and the memory of sorter and workers.
+are sorted again, whatever was lost. What arrives twice does no harm: a second receipt of a scan is
+ignored, and its part is the same file with the same bytes. The number of batches under way, and the
+distance of the last to the first, are limited: that bounds every queue, and the memory of sorter
+and workers.
 """
 
 from __future__ import annotations
 
 import secrets
-import statistics
 import time
-import uuid
-from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
-from typing import Any
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from itertools import chain
 
 import numpy as np
-from distributed import Client
 
-from poolpart import (
-    Partition,
-    Pipe,
-    PipeFailed,
-    TaskRecord,
-    fetch_available,
-    forget_pipes,
-    take_held,
-    take_news,
-)
+from poolpart import TaskRecord, Whereabouts
 
 from ..base.errors import LidarpoolError
 from ..base.storage import Storage
@@ -37,30 +27,29 @@ from ..base.task_book import TaskBook
 from ..base.tracing import trace
 from ..columns.cloud import Cloud
 from ..columns.parts import part_name, probe_name
+from ..sensor import Survey
+from . import policies
 from .batches import Batch, Batches, Place
-from .cast import intersect
 from .database import RunDatabase
-from .failures import raise_if_failed, rig_is_missing, was_killed, words_on_memory
-from .long_stages import LongStages, Work
-from .messages import Frame, Receipt, samples_of_scan, summary_type
+from .long_stages import LongStages
+from .messages import (
+    CollectOrder,
+    ColumnsLost,
+    Frame,
+    Receipt,
+    ScanRange,
+    StorageFailed,
+    StorageHidden,
+    Summaries,
+    samples_of_scan,
+    summary_type,
+)
 from .names import COLLECT, GENERATE, GPU, INTERSECT, LIDAR, SORT
-from .rigs import RigPlan
-from .stages import collect, generate, sort_frames
-from .workers import CastingWorkers
+from .policies import Loss, Verdict
+from .workers import CastingWorkers, Outcome
 
-BATCH_SECONDS = 0.2  # casting time that makes a batch worth its overhead
-BATCH_RAYS = 1_000_000  # bounds a batch's memory
-BATCHES_LEAST = 16  # batches for each slot, so that none idles for long at the end
-AHEAD = 2  # batches offered to a worker for each of its slots, so that it need not wait
-COLLECTING = 3  # batches that a collector is given at a time
-SPAN = 8  # batches that the newest may be ahead of the oldest, for each that may be under way
-SUSPECT_DEATHS = 2  # workers that may die with a batch before it is tried alone
-KILLS_MOST = 3  # workers that a single scan may kill, alone
-LATE_S = 60.0  # a batch is late when it takes so long at one place, and
-LATE_FACTOR = 20.0  # so much longer than others
 STALL_S = 60.0  # without news from the sorter; then it gets its summaries again
-LAST_WORDS_S = 3.0  # for the stages to end after everything was committed
-PUT_S = 30.0  # for a pipe that is never full
+CLOSING_S = 0.001  # longest wait while the stages end
 
 
 class SurveyDriver:
@@ -68,14 +57,10 @@ class SurveyDriver:
 
     Parameters
     ----------
-    client
-        Client of the cluster.
-    partitions
-        The GPU and LIDAR partitions, by name.
-    plan
-        Scene, survey and backend.
-    software
-        That of the workers that may cast, see `base.software`.
+    workers, stages
+        Stage 2 and the others: all that it asks of Dask, so that tests can play the cluster.
+    survey
+        What is scanned.
     db
         Committed parts; their scans are not cast again.
     storage
@@ -86,177 +71,65 @@ class SurveyDriver:
         Called with each frame, in scan order, in the driver's thread.
     on_parts
         Called with parts that were committed.
-    queue_capacity
-        Items that stage 1 may be ahead.
-    collectors
-        Number of tasks of stage 4.
-    patience_s
-        How long to wait for workers that are gone, seconds.
     """
 
     def __init__(
         self,
-        client: Client,
-        partitions: dict[str, Partition],
-        plan: RigPlan,
-        software: Mapping[str, str],
+        workers: CastingWorkers,
+        stages: LongStages,
+        survey: Survey,
         db: RunDatabase,
         storage: Storage,
         read: Callable[[int], Cloud],
         on_frame: Callable[[Frame], None],
         on_parts: Callable[[list[Receipt]], None],
-        *,
-        queue_capacity: int,
-        collectors: int,
-        patience_s: float,
     ) -> None:
-        self.client, self.survey, self.run_id = client, plan.survey, uuid.uuid4().hex[:8]
-        self._gpu, self._lidar = partitions[GPU], partitions[LIDAR]
+        self.survey = survey
+        self._workers, self._stages = workers, stages
         self._db, self._storage = db, storage
         self._read, self._on_frame, self._on_parts = read, on_frame, on_parts
-        self._collectors = collectors
+        self._mark = db.meta["mark"]
+        self._probe = (probe_name(self._mark, stages.run), secrets.token_bytes(16))
+        self._summary = summary_type(samples_of_scan(survey.scan_count))
         self.book = TaskBook()
         self.batches = Batches()
-        self.workers = CastingWorkers(client, self._gpu, self.run_id, plan, software)
         self.generated = 0  # scans taken from stage 1, from the first on
         self.cast = 0  # scans that stage 2 has finished
         self.offered_again = 0
-        self.duplicates_dropped = 0
-        self._offers: dict[int, Batch] = {}  # {number of an offer: its batch}
-        self._offer_count = 0
         self._seconds: deque[float] = deque(maxlen=64)  # casting times of batches
         self._condemned: list[str] = []  # why scans cannot be done
-        self._mark = db.meta["mark"]
-        self._probe = (probe_name(self._mark, self.run_id), secrets.token_bytes(16))
-        self._hidden: list[str] = []  # names of LIDAR workers that do not see the storage
-        self._summary = summary_type(samples_of_scan(self.survey.scan_count))
-        self._sorter = -1  # number of the current attempt
+        self._hidden: set[str] = set()  # names of LIDAR workers that do not see the storage
         self._sorted_at = time.monotonic()  # when the last frames came
-        self._scans = self._pipe("scans", queue_capacity)
-        self._receipts = self._pipe("receipts", 64)
-        self._frames = self._pipe("frames", 64)
-        self._inlets: dict[str, Pipe] = {}  # {name of a stage 3 or 4: its pipe}
-        commands: dict[str, Callable[[int], Work]] = {
-            GENERATE: self._generate,
-            SORT: self._sort,
-        }
-        for number in range(collectors):
-            commands[f"{COLLECT}-{number}"] = self._collector(f"{COLLECT}-{number}")
-        self.stages = LongStages(
-            client,
-            self._lidar,
-            self.run_id,
-            software["lidarpool"],
-            commands,
-            self._stage_died,
-            patience_s,
-        )
-        self._inbox: dict[str, list[Any]] = {}  # {name of a pipe: items taken from it}
-        self._closed_at: float | None = None  # when all was committed and the pipes were closed
+        self._closed = False  # all is committed, and the stages are ending
 
-    # -- the long stages -------------------------------------------------------------------
-
-    def _pipe(self, name: str, capacity: int) -> Pipe:
-        return Pipe(f"lidarpool-{self.run_id}-{name}", capacity, self.client)
-
-    def _fields(self, stage: str, number: int) -> dict[str, Any]:
-        return {"run": self.run_id, "stage": stage, "attempt": number}
-
-    def _generate(self, number: int) -> Work:
-        fields = self._fields(GENERATE, number)
-        return generate, (fields, self.survey, self._scans, self.generated)
-
-    def _sort(self, number: int) -> Work:
-        """Start a sorter with its own pipe, which has all summaries not handed out yet."""
-        self._sorter = number
-        self._sorted_at = time.monotonic()
-        inlet = self._new_inlet(SORT, number)
-        self._have_sorted(self._db.unframed())
-        fields = self._fields(SORT, number)
-        size = self._summary.itemsize
-        return sort_frames, (fields, size, self._db.frames, inlet, self._frames)
-
-    def _collector(self, name: str) -> Callable[[int], Work]:
-        def command(number: int) -> Work:
-            inlet = self._new_inlet(name, number)
-            fields = self._fields(COLLECT, number)
-            return collect, (
-                fields,
-                self._storage,
-                self._probe,
-                inlet,
-                self._receipts,
-            )
-
-        return command
-
-    def _new_inlet(self, name: str, number: int) -> Pipe:
-        """Make the pipe for one start of a stage; delete that of an earlier start."""
-        if (earlier := self._inlets.pop(name, None)) is not None:
-            forget_pipes(self.client, [earlier.name])
-        pipe = self._inlets[name] = self._pipe(f"{name}-{number}", 1_000_000).create()
-        return pipe
-
-    def _have_sorted(self, parts: list[Receipt]) -> None:
-        """Send parts to the sorter; an absent one gets them when it is started."""
-        if SORT in self._inlets and parts:
-            items = [{"first": part.first, "data": part.summaries} for part in parts]
-            self._trace("handon", SORT, [s for p in parts for s in range(p.first, p.stop)])
-            self._put(self._inlets[SORT], items)
-
-    def _put(self, pipe: Pipe, item: list[dict[str, Any]]) -> None:
-        """Put into a pipe whose length is bounded by the batches under way."""
-        with suppress(PipeFailed):  # its stage is being replaced, and gets all of it then
-            pipe.put(item, timeout_s=PUT_S, unbounded=True)
-
-    def _stage_died(self, name: str) -> None:
-        """Take back a collector's batches; a sorter gets everything when it is started."""
-        for batch in self.batches.at(Place.COLLECTING):
-            if batch.collector == name:
-                alone = len(self.batches.at(Place.COLLECTING)) == 1
-                batch.to(Place.CAST, time.monotonic())
-                self._count_again(batch, f"the worker of {name} died")
-                self._note_death(batch, COLLECT, alone)
-
-    # -- state -----------------------------------------------------------------------------
+    # -- beginning and state ---------------------------------------------------------------
 
     def start(self) -> None:
         """Make the pipes and start the stages; after this `stop` and `finish` must be called."""
-        try:
+        with self._storing():
             self._storage.prepare()
             self._storage.write(*self._probe)
-        except OSError as error:
-            raise self._unwritable(error.strerror or str(error)) from error
-        for pipe in (self._scans, self._receipts, self._frames):
-            pipe.create()
-        self.workers.look()
-        self.stages.start()
-
-    @property
-    def complete(self) -> bool:
-        """Whether every scan is committed and was handed out."""
-        count = self.survey.scan_count
-        return self._db.scans_done == count and self._db.frames == count
+        self._stages.open(self._probe)
+        self._workers.look()
+        self._look_after_stages()
 
     @property
     def finished(self) -> bool:
         """True once all stages have exited, or the shutdown timeout has elapsed."""
-        if self._closed_at is None:
-            return False
-        return self.stages.done or time.monotonic() - self._closed_at > LAST_WORDS_S
+        return self._closed and self._stages.ended
 
     @property
     def waits_for(self) -> str:
         """Partition whose slots other runs hold, so that the stages cannot start; else empty."""
-        return self._lidar.name if self.stages.waiting else ""
+        return LIDAR if self._stages.waiting else ""
 
     @property
     def notes(self) -> list[str]:
         """Notes on the survey for the user."""
-        notes = [*self.stages.notes, *self.workers.notes]
+        notes = [*self._stages.notes, *self._workers.notes]
         if self._hidden:
             notes.append(
-                f"{', '.join(sorted(set(self._hidden)))} of partition {LIDAR} cannot see "
+                f"{', '.join(sorted(self._hidden))} of partition {LIDAR} cannot see "
                 f"{self._storage.url}: the driver wrote their parts"
             )
         return notes
@@ -271,326 +144,176 @@ class SurveyDriver:
         LidarpoolError
             If a task of the survey has failed, naming stage and scans.
         """
-        moved = self._take_receipts() | self._take_frames()
-        if self._closed_at is not None:  # only receive last messages
+        moved = self._receive()
+        if self._closed:  # only receive last messages
             return moved
-        moved |= self._see_to_casts()
-        self._look()
-        moved |= self._take_scans()
-        moved |= self._hand_on()
+        moved |= self._check_casts()
+        if (seen := self._workers.look()) is not None:
+            self._leave_workers(seen)
+        self._look_after_stages()
+        moved |= self._hand_over()
         moved |= self._offer()
         if self._condemned and not self.batches:
             raise LidarpoolError("\n".join(self._condemned))
-        if self.complete:
-            for pipe in self._inlets.values():
-                pipe.close()
-            self._closed_at = time.monotonic()
+        if self._db.complete:
+            self._stages.close()
+            self._closed = True
         return moved
 
     def wait(self, seconds: float) -> None:
-        """Wait until there may be something to do, at most so long.
+        """Wait until there may be something to do, at most so long."""
+        room = policies.room(len(self.batches), self.batches.span, self._most)
+        self._stages.wait(
+            min(seconds, CLOSING_S) if self._closed else seconds,
+            self._workers.pending,
+            scans=room > 0 and not self._condemned and not self._closed,
+        )
 
-        The same request takes all items: each request costs driver and scheduler a millisecond.
-        """
-        pipes = [self._receipts.name, self._frames.name]
-        if self._room > 0 and self._closed_at is None:
-            pipes.append(self._scans.name)
-        casting = self.batches.at(Place.CASTING)
-        keys = [b.future.key for b in casting if b.future and b.future.status == "pending"]
-        if self._closed_at is not None:
-            seconds = min(seconds, 0.001)
-        news = take_news(self.client, seconds, pipes, [*keys, *self.workers.preparing])
-        for name, items in news.items():
-            self._inbox.setdefault(name, []).extend(items)
-
-    def _trace(self, event: str, stage: str, scans: Sequence[int], **more: Any) -> None:
-        trace(f"driver.{event}", run=self.run_id, stage=stage, scans=list(scans), **more)
-
-    def _look(self) -> None:
-        """Check workers and stages from time to time."""
-        if self.workers.due:
-            casting = self.batches.at(Place.CASTING)
-            self.workers.look([batch.future.key for batch in casting if batch.future])
-            self._leave_lost_workers()
-            self._leave_late()
-        else:
-            self.workers.check()
-        self.stages.look(self._db.scans_done + self._db.frames)
-        if time.monotonic() - self._sorted_at > STALL_S:
-            self._sorted_at = time.monotonic()
-            self._have_sorted(self._db.unframed())
-
-    # -- stage 1: taking scans ---------------------------------------------------------------
+    def _receive(self) -> bool:
+        messages = self._stages.receive()
+        self._commit([m for m in messages if isinstance(m, Receipt) and self._is_stored(m)])
+        for message in messages:
+            match message:
+                case ScanRange():
+                    self._take_scans(message)
+                case Summaries():
+                    self._take_frames(message)
+                case ColumnsLost():
+                    # A replaced collector may report a batch that was offered again.
+                    for batch in self.batches.at(Place.COLLECTING):
+                        if batch.key == message.key:
+                            self._again(batch, "its columns could not be fetched")
+                case StorageHidden():
+                    self._hidden.add(message.worker)
+                case StorageFailed():
+                    raise self._unwritable(message.reason)
+        return bool(messages)
 
     @property
     def _most(self) -> int:
-        """Batches that may be under way."""
-        collecting = COLLECTING * self._collectors
-        return AHEAD * self.workers.slot_count + collecting + 2
+        return policies.most_under_way(self._workers.slot_count, self._stages.collector_count)
 
-    @property
-    def _room(self) -> int:
-        """Batches that may be taken now."""
-        if self._condemned or self.batches.span >= SPAN * self._most:
-            return 0
-        return self._most - len(self.batches)
+    def _trace(self, event: str, stage: str, scans: Iterable[int], **more: str) -> None:
+        trace(f"driver.{event}", run=self._stages.run, stage=stage, scans=list(scans), **more)
 
-    def _take_scans(self) -> bool:
-        items = self._inbox.pop(self._scans.name, [])
-        for first, stop in items:
-            # A restarted generator repeats scans that are here already.
-            new = max(first, self.generated)
-            if new > first:
-                self._drop_duplicates(GENERATE, range(first, min(new, stop)))
-            if new >= stop:
-                continue
-            self._trace("take", GENERATE, range(new, stop))
-            self.generated = stop
-            for run in self._db.missing(new, stop):
+    # -- stage 1: taking scans ---------------------------------------------------------------
+
+    def _take_scans(self, scans: ScanRange) -> None:
+        first = max(scans.first, self.generated)  # a restarted generator repeats some
+        if first < scans.stop:
+            self._trace("take", GENERATE, range(first, scans.stop))
+            self.generated = scans.stop
+            for run in self._db.missing(first, scans.stop):
                 self.batches.add(*run)
-        return bool(items)
-
-    def _drop_duplicates(self, stage: str, scans: range) -> None:
-        self.duplicates_dropped += len(scans)
-        self._trace("duplicate", stage, scans)
 
     # -- stage 2: casting --------------------------------------------------------------------
 
     def _offer(self) -> bool:
         """Offer waiting batches to workers that have room."""
-        waiting = self.batches.at(Place.WAITING)
-        if not waiting or not self.workers.slots:
-            return False
-        load = dict.fromkeys(self.workers.slots, 0)
-        alone: set[str] = set()  # workers with a suspect batch
-        for batch in self.batches.at(Place.CASTING):
-            if batch.worker in load:
-                load[batch.worker] += 1
-                if INTERSECT in batch.suspects:
-                    alone.add(batch.worker)
-        cast = len(self.batches.at(Place.CAST, Place.COLLECTING))
-        moved = False
-        for batch in waiting:
-            suspect = INTERSECT in batch.suspects
-            rooms = {
-                address: load[address] / (1 if suspect else AHEAD * slots)
-                for address, slots in self.workers.slots.items()
-                if address not in alone
-            }
-            address = min(rooms, key=lambda a: (rooms[a], a), default="")
-            if not address or rooms[address] >= 1:
-                if suspect:  # the others must not occupy all workers
-                    break
-                continue
-            if cast + sum(load.values()) >= self._most:
-                break
-            self._cast(batch, address)
-            load[address] += 1
-            if suspect:
-                alone.add(address)
-            moved = True
-        return moved
+        chosen = policies.offers([*self.batches], self._workers.slots, self._most)
+        for batch, worker in chosen:
+            batch.offers += 1
+            batch.worker, batch.collector = worker, ""
+            batch.key = self._workers.cast(batch.first, batch.stop, batch.offers, worker)
+            batch.to(Place.CASTING, time.monotonic())
+            self._trace("submit", INTERSECT, batch.scans)
+        return bool(chosen)
 
-    def _cast(self, batch: Batch, address: str) -> None:
-        offer, self._offer_count = self._offer_count, self._offer_count + 1
-        self._offers[offer] = batch
-        batch.offer, batch.worker, batch.collector = offer, address, ""
-        batch.future = self._gpu.submit(
-            intersect,
-            self.workers.handle,
-            batch.first,
-            batch.stop,
-            self.run_id,
-            key=f"{INTERSECT}-{self.run_id}-{batch.first}.{offer}",
-            workers=address,
-        )
-        batch.to(Place.CASTING, time.monotonic())
-        self._trace("submit", INTERSECT, batch.scans)
-
-    def _see_to_casts(self) -> bool:
+    def _check_casts(self) -> bool:
         moved = False
         for batch in self.batches.at(Place.CASTING):
-            future = batch.future
-            assert future is not None
-            if future.status == "finished":
+            outcome = self._workers.outcome(batch.key, batch.name)
+            if outcome is Outcome.DONE:
                 batch.to(Place.CAST, time.monotonic())
-                self.cast += batch.stop - batch.first
+                self.cast += len(batch)
                 moved = True
-            elif future.status == "error" and rig_is_missing(future):
-                self.workers.drop(batch.worker)
+            elif outcome is Outcome.NO_RIG:
+                self._workers.drop(batch.worker)
                 self._again(batch, "its worker has no scene any more")
-            elif future.status == "error" and was_killed(future):
-                self._lost(batch, died=True)
-            elif future.status not in ("pending", "lost"):
-                raise_if_failed(future, f"stage {INTERSECT}, {batch.name}")
+            elif outcome is Outcome.KILLED:
+                self._lose(batch, Loss.DIED)
         return moved
 
-    def _leave_lost_workers(self) -> None:
-        """Offer batches again whose workers have gone, are silent, or will not start them."""
-        seen = self.workers.seen
-        for batch in self.batches.at(Place.CASTING, Place.CAST):
-            if batch.worker not in seen.members:
-                self._lost(batch, died=batch.place is Place.CASTING)
-            elif batch.worker in seen.silent:
-                if self.workers.slots:
-                    self._lost(batch, died=False)
-            elif batch.worker not in seen.free and batch.place is Place.CASTING:
-                task = seen.tasks.get(batch.future.key) if batch.future else None
-                # "no-worker": not even sent there, as the worker was paused before.
-                if task and task.state in ("no-worker", "processing") and not task.started:
-                    self._again(batch, "its worker takes no tasks")
+    def _leave_workers(self, seen: Whereabouts) -> None:
+        """Offer batches again whose workers died, are silent, late, or take no tasks."""
+        prepared, late_s = len(self._workers.slots), policies.late_after_s(self._seconds)
+        for batch in self.batches:
+            if reason := policies.loss(batch, seen, prepared, time.monotonic(), late_s):
+                self._lose(batch, reason)
 
-    def _lost(self, batch: Batch, died: bool) -> None:
-        alone = not any(
-            other.worker == batch.worker
-            for other in self.batches.at(Place.CASTING)
-            if other is not batch
-        )
-        self._again(batch, "its worker died" if died else "its worker is gone or silent")
-        if died:
-            self._note_death(batch, INTERSECT, alone)
+    def _lose(self, batch: Batch, reason: Loss) -> None:
+        self._again(batch, reason.value)
+        if reason is Loss.DIED:
+            self._blame(batch, INTERSECT, batch.worker)
 
-    def _leave_late(self) -> None:
-        """Offer batches again that take far longer than others."""
-        now = time.monotonic()
-        usual = statistics.median(self._seconds) if self._seconds else 0.0
-        late = max(LATE_S, LATE_FACTOR * usual)
-        for batch in self.batches.at(Place.CASTING, Place.COLLECTING):
-            others = len(self.workers.slots) > 1 or batch.place is Place.COLLECTING
-            if now - batch.since > late and others and self._seconds:
-                self._again(batch, "it is late")
-
-    def _again(self, batch: Batch, reason: str) -> None:
-        """Return a batch to be cast again."""
-        if batch.future is not None:
-            batch.future.cancel()
-            batch.future = None
-        batch.to(Place.WAITING, time.monotonic())
-        self._count_again(batch, reason)
-
-    def _count_again(self, batch: Batch, reason: str) -> None:
+    def _again(self, batch: Batch, reason: str, place: Place = Place.WAITING) -> None:
+        """Return a batch to be cast again, or only to be collected again."""
+        if place is Place.WAITING:
+            self._workers.forget(batch.key)
+        batch.to(place, time.monotonic())
         self.offered_again += 1
         self._trace("replay", INTERSECT, batch.scans, reason=reason)
 
+    def _remove(self, batch: Batch) -> None:
+        self._workers.forget(batch.key)
+        self.batches.remove(batch)
+
     # -- poison batches ----------------------------------------------------------------------
 
-    def _note_death(self, batch: Batch, stage: str, alone: bool) -> None:
-        """Count the death of a worker against its batches.
-
-        A batch with two deaths is tried alone. An innocent batch succeeds; one whose worker dies
-        again is divided, down to single scans. A scan is the cause if several workers in a row
-        die with it alone.
-        """
+    def _blame(self, batch: Batch, stage: str, worker: str) -> None:
+        """Count the death of a worker against its batches, see `policies.verdict`."""
         batch.deaths[stage] += 1
-        if stage not in batch.suspects:
-            if batch.deaths[stage] >= SUSPECT_DEATHS:
-                batch.suspects.add(stage)
-            return
-        if not alone:
-            return
-        if batch.stop - batch.first > 1:
-            for piece in self.batches.split(batch):
-                piece.to(Place.WAITING, time.monotonic())
-            return
-        batch.kills[stage] += 1
-        if batch.kills[stage] >= KILLS_MOST:
-            self.batches.remove(batch)
-            where = self._gpu if stage == INTERSECT else self._lidar
+        judged = policies.verdict(batch.deaths[stage], len(batch))
+        if judged is Verdict.SPLIT:
+            self._workers.forget(batch.key)
+            self.batches.split(batch, Counter({stage: policies.SUSPECT_DEATHS}))
+        elif judged is Verdict.POISON:
+            self._remove(batch)
+            partition = GPU if stage == INTERSECT else LIDAR
             self._condemned.append(
-                f"{batch.name} kills the worker that runs stage {stage}: {KILLS_MOST} workers "
-                "died, one after the other, with no other scan in that stage"
-                f"{words_on_memory(self.client, [batch.worker])}. Look into the logs of the "
-                f"{where.name} workers."
+                f"{batch.name} kills the worker that runs stage {stage}: "
+                f"{policies.KILLS_MOST} workers died, one after the other, with no other scan in "
+                "that stage"
+                f"{self._workers.words_on_memory(worker)}. Look into the logs of the "
+                f"{partition} workers."
             )
 
     # -- stage 4: collecting -----------------------------------------------------------------
 
-    def _hand_on(self) -> bool:
+    def _hand_over(self) -> bool:
         """Assign batches that were cast to collectors."""
-        ready = self.batches.at(Place.CAST)
-        if not ready:
-            return False
-        names = [n for n in self._inlets if n != SORT and self.stages.worker_of(n)]
-        load = dict.fromkeys(names, 0)
-        busy = self.batches.at(Place.COLLECTING)
-        for batch in busy:
-            if batch.collector in load:
-                load[batch.collector] += 1
-        if any(COLLECT in batch.suspects for batch in busy):
-            return False
-        suspects = [batch for batch in ready if COLLECT in batch.suspects]
-        if suspects:
-            ready = suspects[:1]
-            if busy:
-                return False
-        told: dict[str, list[dict[str, Any]]] = {}  # {collector: its message}
-        for batch in ready:
-            room = [name for name in names if load[name] < COLLECTING]
-            if not room:
-                break
-            near = [n for n in room if _host(self.stages.worker_of(n)) == _host(batch.worker)]
-            name = min(near or room, key=lambda n: (load[n], n))
-            load[name] += 1
-            told.setdefault(name, []).append(self._collect(batch, name))
-        for name, items in told.items():
-            self._put(self._inlets[name], items)
-        return bool(told)
+        orders: dict[str, list[CollectOrder]] = {}  # {collector: its message}
+        for batch, name in policies.handovers([*self.batches], self._stages.collectors):
+            batch.collector = name
+            batch.to(Place.COLLECTING, time.monotonic())
+            self._trace("handon", COLLECT, batch.scans)
+            part = part_name(self._mark, batch.first, batch.stop)
+            order = CollectOrder(batch.key, batch.worker, batch.first, batch.stop, part)
+            orders.setdefault(name, []).append(order)
+        for name, messages in orders.items():
+            self._stages.send(name, messages)
+        return bool(orders)
 
-    def _collect(self, batch: Batch, name: str) -> dict[str, Any]:
-        """Assign a batch to a collector; returns the message to it."""
-        assert batch.future is not None
-        batch.collector = name
-        batch.to(Place.COLLECTING, time.monotonic())
-        self._trace("handon", COLLECT, batch.scans)
-        return {
-            "offer": batch.offer,
-            "key": batch.future.key,
-            "at": batch.worker,
-            "first": batch.first,
-            "stop": batch.stop,
-            "name": part_name(self._mark, batch.first, batch.stop),
-        }
-
-    def _under_way(self, offer: int) -> Batch | None:
-        """Batch of an offer; None if it is committed or was divided."""
-        batch = self._offers.get(offer)
-        return batch if batch is not None and batch in self.batches else None
-
-    def _take_receipts(self) -> bool:
-        answers = self._inbox.pop(self._receipts.name, [])
-        receipts: list[Receipt] = []
-        for answer in answers:
-            if "failed" in answer:
-                raise self._unwritable(answer["failed"])
-            if "hidden" in answer:
-                self._hidden.append(answer["hidden"])
-                continue
-            if "lost" in answer:
-                # A replaced collector may report a batch that another has committed.
-                batch = self._under_way(answer["lost"])
-                if batch is not None and batch.place is Place.COLLECTING:
-                    self._again(batch, "its columns could not be fetched")
-                continue
-            receipt = Receipt.from_wire(answer["receipt"])
-            if receipt.held_at and not self._fetch_held(receipt):
-                continue
-            receipts.append(receipt)
-        if receipts:
-            self._commit(receipts)
-        return bool(answers)
-
-    def _fetch_held(self, receipt: Receipt) -> bool:
-        """Write a part from a worker that does not see the storage."""
-        data = take_held(self.client, receipt.held_at, receipt.name)
+    def _is_stored(self, receipt: Receipt) -> bool:
+        """Whether a part is in storage; one that its worker holds is written now."""
+        if not receipt.held_at:
+            return True
+        data = self._stages.take_held(receipt)
         if data is None:
-            if (batch := self._under_way(receipt.offer)) is not None:
-                self._again(batch, "its part was lost")
+            for batch in self.batches.within(receipt.first, receipt.stop):
+                if batch.place is Place.COLLECTING:
+                    self._again(batch, "its part was lost")
             return False
-        try:
+        with self._storing():
             self._storage.write(receipt.name, data)
+        return True
+
+    @contextmanager
+    def _storing(self) -> Iterator[None]:
+        try:
+            yield
         except OSError as error:
             raise self._unwritable(error.strerror or str(error)) from error
-        return True
 
     def _unwritable(self, reason: str) -> LidarpoolError:
         return LidarpoolError(
@@ -600,57 +323,56 @@ class SurveyDriver:
 
     def _commit(self, receipts: list[Receipt]) -> None:
         new = self._db.commit(receipts)
-        for receipt in receipts:
-            scans = range(receipt.first, receipt.stop)
-            if any(receipt is one for one in new):
-                self._trace("points", COLLECT, scans)
-            else:
-                self._drop_duplicates(COLLECT, scans)
-                with suppress(OSError):  # leftovers there are removed at the end
-                    self._storage.remove([receipt.name])
         for receipt in new:
-            self._learn(receipt.records)
+            self._trace("points", COLLECT, range(receipt.first, receipt.stop))
+            if receipt.record is not None:
+                self._learn(receipt.record)
             for batch in self.batches.within(receipt.first, receipt.stop):
-                self.batches.remove(batch)
-            self._offers.pop(receipt.offer, None)
+                self._remove(batch)
         if new:
-            self._have_sorted(new)
+            self._send_summaries(new)
             self._on_parts(new)
 
-    def _learn(self, records: Sequence[TaskRecord]) -> None:
-        """Record tasks of stage 2, and advise stage 1 on the scans in one item."""
-        for record in records:
-            self.book.add(record)
-            if record.stage == INTERSECT:
-                self._seconds.append(record.seconds)
-                self._scans.advise(self._wished_scans(record))
-
-    def _wished_scans(self, last: TaskRecord) -> int:
-        """Choose how many scans an item should have: at most twice as many as the last."""
-        rays_per_scan = max(1, self.survey.ray_count // self.survey.scan_count)
-        slots = self.workers.slot_count
-        most = min(BATCH_RAYS // rays_per_scan, self.survey.scan_count // (BATCHES_LEAST * slots))
-        per_scan = max(last.seconds, 1e-6) / last.items
-        return max(1, min(int(BATCH_SECONDS / per_scan), 2 * last.items, most))
+    def _learn(self, record: TaskRecord) -> None:
+        """Record a task of stage 2, and advise stage 1 on the scans in one item."""
+        self.book.add(record)
+        self._seconds.append(record.seconds)
+        count = self.survey.scan_count
+        rays, slots = self.survey.ray_count // count, self._workers.slot_count
+        self._stages.advise(
+            policies.scans_per_batch(record.seconds, record.items, rays, count, slots)
+        )
 
     # -- stage 3: frames in order --------------------------------------------------------------
 
-    def _take_frames(self) -> bool:
-        items = self._inbox.pop(self._frames.name, [])
-        for item in items:
-            summaries = np.frombuffer(item["data"], self._summary)
-            scans = range(item["first"], item["first"] + len(summaries))
-            if item["attempt"] != self._sorter:
-                self._trace("stale", SORT, scans)
-                continue
+    def _look_after_stages(self) -> None:
+        """Take back the batches of a collector that died; a new sorter gets all that it needs."""
+        done, framed = self._db.scans_done, self._db.frames
+        changes = self._stages.look(done + framed, self.generated, framed)
+        for batch in self.batches.at(Place.COLLECTING):
+            name = batch.collector
+            if name in changes.died or name in changes.started:
+                self._again(batch, f"{name} was replaced", Place.CAST)
+                if name in changes.died:
+                    self._blame(batch, COLLECT, changes.died[name])
+        if SORT in changes.started or time.monotonic() - self._sorted_at > STALL_S:
             self._sorted_at = time.monotonic()
-            if item["first"] < self._db.frames:
-                known = range(item["first"], min(scans.stop, self._db.frames))
-                self._drop_duplicates(SORT, known)
-            for scan, summary in zip(scans, summaries, strict=True):
-                if scan == self._db.frames:
-                    self._hand_out(scan, summary)
-        return bool(items)
+            self._send_summaries(self._db.unframed())
+
+    def _send_summaries(self, parts: list[Receipt]) -> None:
+        """Send parts to the sorter; an absent one gets them when it is started."""
+        if parts:
+            messages = [Summaries(part.first, part.stop, part.summaries) for part in parts]
+            self._trace("handon", SORT, chain.from_iterable(m.scans for m in messages))
+            self._stages.send(SORT, messages)
+
+    def _take_frames(self, ordered: Summaries) -> None:
+        """Hand out frames; some may have been handed out before, by an earlier sorter or run."""
+        self._sorted_at = time.monotonic()
+        summaries = np.frombuffer(ordered.data, self._summary)
+        for scan, summary in zip(ordered.scans, summaries, strict=True):
+            if scan == self._db.frames:
+                self._hand_out(scan, summary)
 
     def _hand_out(self, scan: int, summary: np.void) -> None:
         samples, spec = summary["samples"], self.survey.scan(scan)
@@ -675,43 +397,18 @@ class SurveyDriver:
 
     # -- the end -----------------------------------------------------------------------------
 
-    @property
-    def _pipes(self) -> list[Pipe]:
-        return [self._scans, self._receipts, self._frames, *self._inlets.values()]
-
     def stop(self, reason: str) -> None:
         """End all stages at once; `finish` does the rest."""
-        self.client.cancel([batch.future for batch in self.batches if batch.future is not None])
-        for pipe in self._pipes:
-            with suppress(PipeFailed):  # not made yet, or gone already
-                pipe.fail(reason)
+        for batch in self.batches:
+            self._workers.forget(batch.key)
+        self._stages.stop(reason)
 
     def finish(self) -> None:
-        """Wait a moment for the stages to end, and clean up the scheduler."""
+        """Wait a moment for the stages to end, and clean up scheduler and storage."""
         try:
-            deadline = (self._closed_at or time.monotonic()) + LAST_WORDS_S
-            while not self.stages.done and time.monotonic() < deadline:
-                time.sleep(0.01)
-            self._take_last_records()
+            for record in self._stages.finish(self._workers.futures):
+                self.book.add(record)
         finally:
-            forget_pipes(self.client, [pipe.name for pipe in self._pipes])
-            self.stages.forget_lock()
-            # In one message: the answer to a second one could miss a client that leaves.
-            self.client.cancel([*self.stages.futures.values(), *self.workers.futures])
-            self.workers.release()
-            self.batches.clear()
+            self._workers.release()
             with suppress(OSError):
                 self._storage.remove([self._probe[0]])
-
-    def _take_last_records(self) -> None:
-        """Collect the stages' records; those of unreachable workers are left out."""
-        ended = [f for f in self.stages.futures.values() if f.status == "finished"]
-        found = fetch_available(self.client, [future.key for future in ended])
-        for future in ended:
-            if future.key in found:
-                self.book.add(found[future.key])
-
-
-def _host(address: str) -> str:
-    """Host of a worker's address."""
-    return address.rpartition("/")[2].rpartition(":")[0]

@@ -1,29 +1,49 @@
-"""The long-running tasks of stages 1, 3 and 4: starts them on free slots, and again."""
+"""The long-running stages 1, 3 and 4, and the pipes between them and the driver."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
 from distributed import Client, Future, Lock
 
-from poolpart import Partition, Whereabouts, look_for_tasks
+from poolpart import (
+    Partition,
+    Pipe,
+    PipeFailed,
+    TaskRecord,
+    Whereabouts,
+    fetch_available,
+    forget_pipes,
+    look_for_tasks,
+    take_held,
+    take_news,
+)
 
 from ..base.errors import LidarpoolError
 from ..base.software import call_alike
+from ..base.storage import Storage
+from ..sensor import Survey
 from .failures import raise_if_failed, was_killed, words_on_memory
+from .messages import (
+    CollectOrder,
+    Message,
+    Receipt,
+    StageStart,
+    Summaries,
+)
+from .names import COLLECT, GENERATE, SORT
+from .stages import collect, generate, sort_frames
 
 LOOK_EVERY_S = 0.5
 SETTLE_S = 2.0  # for a task that was just submitted to start
 DEATHS_MOST = 12  # deaths of one stage with nothing committed in between
 ASK_LOCK_S = 0.05
-
-# Makes a stage's task from the number of the attempt: a function and its arguments.
-Work = tuple[Callable[..., Any], tuple[Any, ...]]
-Command = Callable[[int], Work]
+LAST_WORDS_S = 3.0  # for the stages to end after everything was committed
+PUT_S = 30.0  # for a pipe that is never full
 
 
 @dataclass(eq=False)
@@ -32,14 +52,21 @@ class _Task:
 
     future: Future
     worker: str  # address of the one worker that it may run on
+    inlet: Pipe | None  # from the driver; stage 1 has none
     since: float
     dead_since: float | None = None  # it has died, and has not been restarted yet
-    died: list[str] = field(default_factory=list)  # earlier workers, in a row
-    progress: int = -1  # progress when it last died
+
+
+@dataclass(frozen=True)
+class StageChanges:
+    """Stages whose workers have died, and stages that were started, again or for the first time."""
+
+    died: Mapping[str, str] = field(default_factory=dict)  # {name of a stage: address}
+    started: Sequence[str] = ()
 
 
 class LongStages:
-    """Runs each stage on a chosen worker, and restarts it when the worker dies.
+    """Runs each long stage on a chosen worker, and restarts it when the worker dies.
 
     Dask would do both, but not in a way that suits tasks as long as the run: it may give two of
     them to one slot, where the second waits for the first for ever; and it counts the deaths of
@@ -52,13 +79,15 @@ class LongStages:
     client, partition
         Where the stages run.
     run
-        Id of the run, part of the tasks' keys.
+        Id of the run, part of the names of tasks and pipes.
     sources
         ``lidarpool`` of the run's `software`.
-    commands
-        Makers of the stages' tasks, by name; called for each start.
-    on_death
-        Called with the name of a stage whose worker has died.
+    survey, storage
+        What is scanned, and where parts go.
+    queue_capacity
+        Items that stage 1 may be ahead.
+    collectors
+        Number of tasks of stage 4.
     patience_s
         How long to wait for slots, seconds.
     """
@@ -69,47 +98,94 @@ class LongStages:
         partition: Partition,
         run: str,
         sources: str,
-        commands: Mapping[str, Command],
-        on_death: Callable[[str], None],
+        survey: Survey,
+        storage: Storage,
+        *,
+        queue_capacity: int,
+        collectors: int,
         patience_s: float,
     ) -> None:
         self.client, self.partition, self.run = client, partition, run
-        self._sources = sources
-        self._commands, self._on_death, self._patience_s = commands, on_death, patience_s
+        self.collector_count = collectors
+        self._sources, self._survey, self._storage = sources, survey, storage
+        self._patience_s = patience_s
+        self._names = [GENERATE, SORT, *(f"{COLLECT}-{number}" for number in range(collectors))]
         self._tasks: dict[str, _Task] = {}
         self._submitted = 0
+        self._first: dict[str, int] = {}  # {stage: the scan that it begins with when started}
+        self._probe = ("", b"")
+        self._scans = self._pipe("scans", queue_capacity)
+        self._news = self._pipe("news", 64)  # from stages 3 and 4
+        self._inbox: list[Message] = []
         self._looked_at = 0.0
+        self._progress = -1  # when something was last committed
+        self._deaths: dict[str, list[str]] = {}  # {name: workers that have died since then}
         self._enough_at = time.monotonic()  # slots, free or not
         self._waited_from: float | None = None  # waited for slots that others held
-        self.waiting = False  # since when it waits for such slots; None if it does not
+        self.waiting = False  # whether it waits for such slots
+        self._closed_at: float | None = None
         self.notes: list[str] = []  # what a user should know
 
-    @property
-    def futures(self) -> dict[str, Future]:
-        """The stages by name."""
-        return {name: task.future for name, task in self._tasks.items()}
+    def open(self, probe: tuple[str, bytes]) -> None:
+        """Make the pipes; `look` starts the stages.
 
-    @property
-    def done(self) -> bool:
-        """Whether all have ended."""
-        return all(task.future.done() for task in self._tasks.values())
-
-    def worker_of(self, name: str) -> str:
-        """Address of the worker of a running stage; else ""."""
-        task = self._tasks.get(name)
-        return task.worker if task and task.dead_since is None else ""
-
-    def start(self) -> None:
-        """Start every stage, each on a free slot; if there are too few, `look` does it later.
-
-        Raises
-        ------
-        LidarpoolError
-            If the partition has too few slots for too long.
+        Collectors find out by `probe`, name and content of a file, whether they see the storage.
         """
+        self._probe = probe
+        for pipe in (self._scans, self._news):
+            pipe.create()
+
+    # -- messages --------------------------------------------------------------------------
+
+    def wait(self, seconds: float, keys: Sequence[str], *, scans: bool) -> None:
+        """Wait until there are messages or one of some tasks has ended, at most so long.
+
+        The same request takes all messages, those of stage 1 only if `scans` are wanted: each
+        request costs driver and scheduler a millisecond.
+        """
+        pipes = [self._news.name, *([self._scans.name] if scans else [])]
+        for items in take_news(self.client, seconds, pipes, keys).values():
+            self._inbox += items
+
+    def receive(self) -> list[Message]:
+        """Messages since the last call."""
+        messages, self._inbox = self._inbox, []
+        return messages
+
+    def send(self, name: str, messages: Sequence[CollectOrder | Summaries]) -> None:
+        """Send messages to a stage 3 or 4; they are lost if it is not running."""
+        task = self._tasks.get(name)
+        if task is not None and task.inlet is not None:
+            with suppress(PipeFailed):  # it is being replaced, and gets all of it then
+                task.inlet.put(messages, timeout_s=PUT_S, unbounded=True)
+
+    def advise(self, scans: int) -> None:
+        """Tell stage 1 how many scans an item should have."""
+        self._scans.advise(scans)
+
+    def take_held(self, receipt: Receipt) -> Any:
+        """Bytes of a part from a worker that does not see the storage; None if they are lost."""
+        return take_held(self.client, receipt.held_at, receipt.name)
+
+    @property
+    def collectors(self) -> dict[str, str]:
+        """{name of a running task of stage 4: address of its worker}."""
+        return {
+            name: task.worker
+            for name, task in self._tasks.items()
+            if name.startswith(COLLECT) and task.dead_since is None
+        }
+
+    def _pipe(self, name: str, capacity: int) -> Pipe:
+        return Pipe(f"lidarpool-{self.run}-{name}", capacity, self.client)
+
+    # -- starting --------------------------------------------------------------------------
+
+    def _start(self) -> None:
+        """Start every stage, each on a free slot; if there are too few, the next `look` does it."""
         lock = Lock(self._lock_name, scheduler_rpc=self.client.scheduler, loop=self.client.loop)
         acquired = False
-        with suppress(RuntimeError):  # another run has just removed it, see `forget_lock`
+        with suppress(RuntimeError):  # another run has just removed it, see `_forget_lock`
             acquired = lock.acquire(timeout=ASK_LOCK_S)
         if not acquired:
             self.waiting = True
@@ -123,14 +199,10 @@ class LongStages:
     def _lock_name(self) -> str:
         return f"lidarpool-start-{self.partition.name}"
 
-    def forget_lock(self) -> None:
-        """Remove the lock from the scheduler unless another run holds it: Dask would keep it."""
-        self.client.run_on_scheduler(_forget_lock, name=self._lock_name)
-
     def _start_all(self) -> None:
         seen = self._look()
         free = {address: count for address, count in seen.free.items() if count > 0}
-        now, needed = time.monotonic(), len(self._commands)
+        now, needed = time.monotonic(), len(self._names)
         if sum(free.values()) >= needed:
             self.waiting = False
             if self._waited_from is not None:
@@ -138,7 +210,7 @@ class LongStages:
                     f"the survey waited {now - self._waited_from:.1f} s for partition "
                     f"{self.partition.name}, until other runs had left it {needed} slots"
                 )
-            for name in self._commands:
+            for name in self._names:
                 self._submit(name, free)
             # Another run may look once the lock is free: the scheduler must know the tasks by then.
             deadline = now + SETTLE_S
@@ -161,27 +233,33 @@ class LongStages:
         keys = [task.future.key for task in self._tasks.values()]
         return look_for_tasks(self.client, self.partition.name, keys)
 
-    def look(self, progress: int) -> None:
-        """From time to time, restart stages that died or wait behind another.
+    # -- looking after them ------------------------------------------------------------------
 
-        Parameters
-        ----------
-        progress
-            Any number that grows when something is committed.
+    def look(self, progress: int, generated: int, framed: int) -> StageChanges:
+        """From time to time, start all stages, or those again that died or wait behind another.
+
+        `progress` is any number that grows when something is committed; so many scans were
+        `generated`, taken from stage 1, and `framed`, handed out as frames.
 
         Raises
         ------
         LidarpoolError
-            If a stage has failed, or keeps dying with nothing committed in between.
+            If a stage has failed, or keeps dying with nothing committed in between, or the
+            partition has too few slots for too long.
         """
         now = time.monotonic()
         if now - self._looked_at < LOOK_EVERY_S:
-            return
+            return StageChanges()
         self._looked_at = now
+        self._first = {GENERATE: generated, SORT: framed}
+        if progress > self._progress:
+            self._progress, self._deaths = progress, {}
         if not self._tasks:
-            self.start()
-            return
+            self._start()
+            return StageChanges(started=[*self._tasks])
         self._check()
+        died: dict[str, str] = {}
+        started: list[str] = []
         seen = self._look()
         free = dict(seen.free)
         for name, task in list(self._tasks.items()):
@@ -189,30 +267,24 @@ class LongStages:
                 continue
             room = max(free.values(), default=0) > 0
             # A silent worker may wake up: it keeps its stages while there are no other slots.
-            if task.dead_since is None and (
-                self._has_died(task, seen) or (task.worker in seen.silent and room)
-            ):
+            lost = task.future.status == "error" or task.worker not in seen.members
+            if task.dead_since is None and (lost or (task.worker in seen.silent and room)):
                 task.dead_since = now
-                self._on_death(name)
-            if task.dead_since is not None:
-                if room:
-                    self._restart(name, task, free, progress)
-                else:
-                    self._wait_for_slot(name, now - task.dead_since)
-            elif room and self._is_behind_another(task, seen, now):
-                free[task.worker] += 1
-                self._on_death(name)
+                died[name] = task.worker
+                self._count_death(name, task.worker)
+            behind = task.dead_since is None and self._is_behind_another(task, seen, now)
+            if room and (behind or task.dead_since is not None):
+                free[task.worker] = free.get(task.worker, 0) + behind
                 self._submit(name, free)
+                started.append(name)
+            elif task.dead_since is not None:
+                self._wait_for_slot(name, now - task.dead_since)
+        return StageChanges(died, started)
 
     def _check(self) -> None:
         for name, task in self._tasks.items():
             if task.future.status != "error" or not was_killed(task.future):
                 raise_if_failed(task.future, f"stage {name}")
-
-    def _has_died(self, task: _Task, seen: Whereabouts) -> bool:
-        if task.future.status == "error":
-            return True
-        return task.worker not in seen.members
 
     def _is_behind_another(self, task: _Task, seen: Whereabouts, now: float) -> bool:
         """Whether a task waits behind another on a worker with more tasks than slots."""
@@ -237,32 +309,101 @@ class LongStages:
                 f'--resources "{self.partition.name}=1" and run it again.'
             )
 
-    def _restart(self, name: str, task: _Task, free: dict[str, int], progress: int) -> None:
-        died = [*(task.died if progress == task.progress else []), task.worker]
+    def _count_death(self, name: str, worker: str) -> None:
+        """LidarpoolError when a stage keeps dying."""
+        died = self._deaths.setdefault(name, [])
+        died.append(worker)
         if len(died) > DEATHS_MOST:
             raise LidarpoolError(
                 f"stage {name} was started {len(died)} times, and each time its worker died before "
                 f"anything was committed{words_on_memory(self.client, died)}: look into the logs "
                 "of the LIDAR workers."
             )
-        self._submit(name, free)
-        self._tasks[name].died, self._tasks[name].progress = died, progress
 
     def _submit(self, name: str, free: dict[str, int]) -> None:
-        """Start a stage, under a new key, on the worker with the most free slots."""
+        """Start a stage, under a new key, on the worker with the most free slots.
+
+        It gets a new pipe: a predecessor that was only stopped would take items out of a shared
+        one when it wakes up, and keep its slot. Without its pipe it ends.
+        """
         worker = max(free, key=lambda address: (free[address], address))
         free[worker] -= 1
         number, self._submitted = self._submitted, self._submitted + 1
-        function, arguments = self._commands[name](number)
         earlier = self._tasks.get(name)
-        key = f"{name}-{self.run}-{number}"
+        if earlier is not None and earlier.inlet is not None:
+            forget_pipes(self.client, [earlier.inlet.name])
+        inlet = None if name == GENERATE else self._pipe(f"{name}-{number}", 1_000_000).create()
         future = self.partition.submit(
-            call_alike, self._sources, function, *arguments, key=key, workers=worker
+            call_alike,
+            self._sources,
+            *self._work(StageStart(self.run, name.partition("-")[0], number), inlet),
+            key=f"{name}-{self.run}-{number}",
+            workers=worker,
         )
-        self._tasks[name] = _Task(future, worker, time.monotonic())
+        self._tasks[name] = _Task(future, worker, inlet, time.monotonic())
         if earlier is not None:
-            # If it still runs, it ends with its pipe; its result is dropped.
-            earlier.future.cancel()
+            earlier.future.cancel()  # if it still runs, its result is dropped
+
+    def _work(self, me: StageStart, inlet: Pipe | None) -> tuple[Any, ...]:
+        """Return the function of a stage and its arguments."""
+        first = self._first.get(me.stage, 0)
+        if me.stage == GENERATE:
+            return generate, me, self._survey, self._scans, first
+        if me.stage == SORT:
+            return sort_frames, me, first, inlet, self._news
+        return collect, me, self._storage, self._probe, inlet, self._news
+
+    # -- the end -----------------------------------------------------------------------------
+
+    def close(self) -> None:
+        """Let all stages end: everything is committed."""
+        for pipe in self._inlets:
+            pipe.close()
+        self._closed_at = time.monotonic()
+
+    @property
+    def _inlets(self) -> list[Pipe]:
+        return [task.inlet for task in self._tasks.values() if task.inlet is not None]
+
+    @property
+    def _done(self) -> bool:
+        return all(task.future.done() for task in self._tasks.values())
+
+    @property
+    def ended(self) -> bool:
+        """True once all stages have exited after `close`, or the shutdown timeout has elapsed."""
+        if self._closed_at is None:
+            return False
+        return self._done or time.monotonic() - self._closed_at > LAST_WORDS_S
+
+    def stop(self, reason: str) -> None:
+        """End all stages at once, because the run has failed."""
+        for pipe in (self._scans, self._news, *self._inlets):
+            with suppress(PipeFailed):  # not made yet, or gone already
+                pipe.fail(reason)
+
+    def finish(self, others: Sequence[Future]) -> list[TaskRecord]:
+        """Wait a moment for the stages to end, and clean up the scheduler; cancel others as well.
+
+        Returns
+        -------
+        The stages' records, without those of unreachable workers.
+        """
+        futures = [task.future for task in self._tasks.values()]
+        try:
+            deadline = (self._closed_at or time.monotonic()) + LAST_WORDS_S
+            while not self._done and time.monotonic() < deadline:
+                time.sleep(0.01)
+            ended = [future.key for future in futures if future.status == "finished"]
+            found = fetch_available(self.client, ended)
+            return [found[key] for key in ended if key in found]
+        finally:
+            pipes = (self._scans, self._news, *self._inlets)
+            forget_pipes(self.client, [pipe.name for pipe in pipes])
+            # Dask would keep the lock; another run may hold it.
+            self.client.run_on_scheduler(_forget_lock, name=self._lock_name)
+            # In one message: the answer to a second one could miss a client that leaves.
+            self.client.cancel([*futures, *others])
 
 
 def _forget_lock(name: str, dask_scheduler: Any = None) -> None:

@@ -1,19 +1,19 @@
 """Messages between the four stages and the driver: descriptions, summaries and receipts.
 
-Their size does not depend on the number of points. They are plain data.
+Their size does not depend on the number of points.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from poolpart import TaskRecord
 
+from ..base.tracing import trace
 from ..columns.cloud import Cloud
 from ..sensor import Pose
 
@@ -34,14 +34,79 @@ def summary_type(samples: int) -> np.dtype[np.void]:
     return np.dtype([("hits", "<u4"), ("points", "<u4"), ("samples", "<f4", (samples, 3))])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
+class StageStart:
+    """One start of a stage, for its traces."""
+
+    run: str  # id of the survey
+    stage: str
+    attempt: int  # starts of stages before this one
+
+    def trace(self, event: str, scans: Iterable[int] = ()) -> None:
+        """Report that this start of the stage has reached a point with some scans."""
+        trace(f"{self.stage}.{event}", **asdict(self), scans=list(scans))
+
+
+@dataclass(frozen=True, slots=True)
+class ScanRange:
+    """From stage 1: scans `first` to `stop` can be described, and may be cast."""
+
+    first: int
+    stop: int
+
+
+@dataclass(frozen=True, slots=True)
+class Summaries:
+    """To stage 3, and from it in scan order: the summaries of a committed part."""
+
+    first: int
+    stop: int
+    data: bytes  # of an array of `summary_type`
+
+    @property
+    def scans(self) -> range:
+        """Numbers of the scans."""
+        return range(self.first, self.stop)
+
+
+@dataclass(frozen=True, slots=True)
+class CollectOrder:
+    """To stage 4: fetch the columns of scans `first` to `stop`, and write them as a part."""
+
+    key: str  # of the casting task
+    worker: str  # address of the worker that has its result
+    first: int
+    stop: int
+    name: str  # of the part
+
+
+@dataclass(frozen=True, slots=True)
+class ColumnsLost:
+    """From stage 4: the result of casting task `key` could not be fetched."""
+
+    key: str
+
+
+@dataclass(frozen=True, slots=True)
+class StorageHidden:
+    """From stage 4: the worker of this name does not see the storage, and holds its parts."""
+
+    worker: str
+
+
+@dataclass(frozen=True, slots=True)
+class StorageFailed:
+    """From stage 4: a part could not be written."""
+
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
 class Receipt:
-    """A part is whole in storage.
+    """From stage 4: a part is whole in storage.
 
     Parameters
     ----------
-    offer
-        Number of its offer; see `pipeline.batches`.
     first, stop
         Its scans.
     name
@@ -54,14 +119,13 @@ class Receipt:
         Lowest and highest cell as six numbers; empty where there are no points.
     summaries
         Of its scans, as bytes of `summary_type`.
-    records
-        The tasks of stage 2 and 4 that made it.
+    record
+        The casting task; None for a receipt from the database.
     held_at
         Address of the worker that holds the part in memory because it does not see the storage;
         "" if the part is in storage.
     """
 
-    offer: int
     first: int
     stop: int
     name: str
@@ -70,31 +134,12 @@ class Receipt:
     hits: int
     cells: tuple[int, ...]
     summaries: bytes
-    records: tuple[TaskRecord, ...] = ()
+    record: TaskRecord | None = None
     held_at: str = ""
 
-    def wire(self) -> dict[str, Any]:
-        """Plain data, for a pipe."""
-        data = dict(self.__dict__)
-        data["records"] = [pack_record(record) for record in self.records]
-        return data
 
-    @classmethod
-    def from_wire(cls, data: Mapping[str, Any]) -> Receipt:
-        """Inverse of `wire`."""
-        records = tuple(unpack_record(record) for record in data["records"])
-        return cls(**{**data, "records": records, "cells": tuple(data["cells"])})
-
-
-def pack_record(record: TaskRecord) -> list[Any]:
-    """Plain data of the record of a task."""
-    return list(record.__dict__.values())
-
-
-def unpack_record(data: Sequence[Any]) -> TaskRecord:
-    """Inverse of `pack_record`."""
-    stage, partition, worker, resources, *rest = data
-    return TaskRecord(stage, partition, worker, tuple(resources), *rest)
+# To the driver.
+Message = ScanRange | Summaries | ColumnsLost | StorageHidden | StorageFailed | Receipt
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ four LIDAR slots runs all four. A failed pipe ends a stage silently: the driver 
 from __future__ import annotations
 
 from itertools import chain
-from typing import Any
 
 from distributed import get_worker, secede
 
@@ -24,40 +23,43 @@ from poolpart import (
 )
 
 from ..base.storage import Storage
-from ..base.tracing import trace
 from ..columns.parts import pack
 from ..sensor import Survey
 from .cast import CastBatch
 from .failures import naming_scans
-from .messages import Receipt
+from .messages import (
+    CollectOrder,
+    ColumnsLost,
+    Receipt,
+    ScanRange,
+    StageStart,
+    StorageFailed,
+    StorageHidden,
+    Summaries,
+)
 from .names import COLLECT, GENERATE, LIDAR, SORT
 
 FETCH_PATIENCE_S = 2.0  # longest wait for a sign of life of a batch's worker
 
 
 @telling_departure()
-def generate(
-    fields: dict[str, Any],
-    survey: Survey,
-    outlet: Pipe,
-    first: int = 0,
-) -> TaskRecord:
+def generate(me: StageStart, survey: Survey, outlet: Pipe, first: int) -> TaskRecord:
     """Stage 1: describe every scan from `first` on, with the advised number in one item.
 
-    An item is a range of scans: the survey describes them equally on every worker.
+    An item is a `ScanRange`: the survey describes the scans equally on every worker.
     """
     secede()
     recorder = Recorder(GENERATE, LIDAR)
     sent = first
-    trace("generate.start", **fields, scans=[])
+    me.trace("start")
     try:
         while sent < survey.scan_count:
             stop = min(sent + outlet.advice, survey.scan_count)
             with naming_scans(sent, stop - 1):
                 survey.scan(stop - 1)  # raises here if a scan cannot be described
-            trace("generate.put", **fields, scans=list(range(sent, stop)))
-            outlet.put((sent, stop))
-            trace("generate.sent", **fields, scans=list(range(sent, stop)))
+            me.trace("put", range(sent, stop))
+            outlet.put(ScanRange(sent, stop))
+            me.trace("sent", range(sent, stop))
             sent = stop
         outlet.close()
     except PipeFailed:
@@ -68,46 +70,37 @@ def generate(
 
 
 @telling_departure()
-def sort_frames(
-    fields: dict[str, Any], size: int, following: int, inlet: Pipe, outlet: Pipe
-) -> TaskRecord:
+def sort_frames(me: StageStart, following: int, inlet: Pipe, outlet: Pipe) -> TaskRecord:
     """Stage 3: put the summaries of scans into scan order.
 
     Parameters
     ----------
-    fields
-        Identifies this start of the task, for traces and the driver.
-    size
-        Bytes of a summary.
+    me
+        This start of the task.
     following
         The next scan; all before it have been handed out.
     inlet, outlet
-        From the driver lists of {first: a scan, data: summaries from there on}, and to it one such.
+        From the driver lists of `Summaries`, and to it each of them once those before it were.
     """
     secede()
     recorder = Recorder(SORT, LIDAR)
-    waiting: dict[int, bytes] = {}  # {first scan: summaries of consecutive scans}
+    waiting: dict[int, Summaries] = {}  # {first scan that is wanted of them: summaries}
     begin = following
     try:
-        trace("sort.start", **fields, scans=[])
+        me.trace("start")
         while True:
             for item in chain.from_iterable(inlet.get_all()):
-                first, data = item["first"], item["data"]
-                trace("sort.get", **fields, scans=_scans(first, data, size))
-                if first + len(data) // size > following:
-                    skip = max(0, following - first)
-                    waiting[first + skip] = data[skip * size :]
+                me.trace("get", item.scans)
+                if item.stop > following:
+                    waiting[max(item.first, following)] = item
             ready, at = [], following
-            while (data := waiting.pop(following, None)) is not None:
-                ready.append(data)
-                following += len(data) // size
+            while (item := waiting.pop(following, None)) is not None:
+                ready.append(item)
+                following = item.stop
             if ready:
-                whole = b"".join(ready)
-                trace("sort.put", **fields, scans=_scans(at, whole, size))
-                outlet.put(
-                    {"attempt": fields["attempt"], "first": at, "data": whole}, unbounded=True
-                )
-                trace("sort.sent", **fields, scans=_scans(at, whole, size))
+                me.trace("put", range(at, following))
+                outlet.put_many(ready, unbounded=True)
+                me.trace("sent", range(at, following))
     except (PipeClosed, PipeFailed):
         pass
     return recorder.done(following - begin)
@@ -115,7 +108,7 @@ def sort_frames(
 
 @telling_departure()
 def collect(
-    fields: dict[str, Any],
+    me: StageStart,
     storage: Storage,
     probe: tuple[str, bytes],
     inlet: Pipe,
@@ -125,76 +118,68 @@ def collect(
 
     Parameters
     ----------
-    fields
-        As of `sort_frames`.
+    me
+        This start of the task.
     storage, probe
         Place of the parts, and a file there with its content. A worker that does not see that file
         holds its parts in memory, and the driver fetches them.
     inlet
-        From the driver: lists of {offer, key, at, first, stop, name}.
+        From the driver: lists of `CollectOrder`.
     outlet
-        To the driver: {receipt: …}, or {lost: offer} for a batch that could not be fetched,
-        {failed: reason} if the storage fails, {hidden: worker} if it is not seen.
+        To the driver: `Receipt`, `ColumnsLost`, `StorageFailed`, `StorageHidden`.
     """
     secede()
     recorder = Recorder(COLLECT, LIDAR)
     scans = 0
     try:
-        trace("collect.start", **fields, scans=[])
+        me.trace("start")
         seen = storage.sees(*probe)
         if not seen:
-            outlet.put({"hidden": str(get_worker().name)})
+            outlet.put(StorageHidden(str(get_worker().name)), unbounded=True)
         while True:
-            for item in chain.from_iterable(inlet.get_all()):
-                answer = _collected(fields, storage if seen else None, item)
-                if "receipt" in answer:
-                    scans += item["stop"] - item["first"]
-                outlet.put(answer, unbounded=True)  # the driver limits its requests
-                trace("collect.sent", **fields, scans=list(range(item["first"], item["stop"])))
+            for order in chain.from_iterable(inlet.get_all()):
+                answer = _collected(me, storage if seen else None, order)
+                if isinstance(answer, Receipt):
+                    scans += order.stop - order.first
+                outlet.put(answer, unbounded=True)  # the driver limits its orders
+                me.trace("sent", range(order.first, order.stop))
     except (PipeClosed, PipeFailed):
         pass
     return recorder.done(scans)
 
 
 def _collected(
-    fields: dict[str, Any], storage: Storage | None, item: dict[str, Any]
-) -> dict[str, Any]:
+    me: StageStart, storage: Storage | None, order: CollectOrder
+) -> Receipt | ColumnsLost | StorageFailed:
     """Make a part of one batch; returns the message to the driver."""
-    first, stop, offer = item["first"], item["stop"], item["offer"]
-    scans = list(range(first, stop))
-    found = fetch_available(own_client(), [item["key"]], FETCH_PATIENCE_S, at=item["at"])
-    batch: CastBatch | None = found.get(item["key"])
+    scans = range(order.first, order.stop)
+    found = fetch_available(own_client(), [order.key], FETCH_PATIENCE_S, at=order.worker)
+    batch: CastBatch | None = found.get(order.key)
     if batch is None:
-        return {"lost": offer}
-    trace("collect.get", **fields, scans=scans)
-    with naming_scans(first, stop - 1):
+        return ColumnsLost(order.key)
+    me.trace("get", scans)
+    with naming_scans(order.first, order.stop - 1):
         data = pack(batch.part)
         cells = batch.part.cells
-    trace("collect.part", **fields, scans=scans)
+    me.trace("part", scans)
     held_at = ""
     if storage is None:
-        held_at = hold_for_driver(item["name"], data)
+        held_at = hold_for_driver(order.name, data)
     else:
         try:
-            storage.write(item["name"], data)
+            storage.write(order.name, data)
         except OSError as error:
-            return {"failed": f"{error.strerror or error}"}
-        trace("collect.stored", **fields, scans=scans)
-    receipt = Receipt(
-        offer=offer,
-        first=first,
-        stop=stop,
-        name=item["name"],
+            return StorageFailed(f"{error.strerror or error}")
+        me.trace("stored", scans)
+    return Receipt(
+        first=order.first,
+        stop=order.stop,
+        name=order.name,
         rows=len(batch.part),
         size=len(data),
         hits=int(batch.summaries["hits"].sum()),
         cells=() if cells is None else tuple(cells.ravel().tolist()),
         summaries=batch.summaries.tobytes(),
-        records=(batch.record,),
+        record=batch.record,
         held_at=held_at,
     )
-    return {"receipt": receipt.wire()}
-
-
-def _scans(first: int, data: bytes, size: int) -> list[int]:
-    return list(range(first, first + len(data) // size))

@@ -1,11 +1,12 @@
-"""The driver's record of stage 2 workers: prepared, refused, paused, silent, gone."""
+"""The GPU workers and their casting tasks: prepared, refused, paused, silent, gone."""
 
 from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
+from enum import Enum
 from typing import Any
 
 from distributed import Client, Future
@@ -14,7 +15,9 @@ from poolpart import Partition, Whereabouts, fetch_available, look_for_tasks
 
 from ..base.errors import LidarpoolError
 from ..base.software import difference, software_there
-from .failures import raise_if_failed, was_killed, words_on_memory
+from .cast import intersect
+from .failures import raise_if_failed, rig_is_missing, was_killed, words_on_memory
+from .names import INTERSECT
 from .rigs import RigPlan, drop_rig
 
 LOOK_EVERY_S = 1.0
@@ -24,8 +27,17 @@ RELEASE_S = 3.0  # for workers to drop their rigs
 PREPARING = "preparing the scene on the GPU workers"
 
 
+class Outcome(Enum):
+    """State of a casting task that has not failed by itself."""
+
+    PENDING = "pending"
+    DONE = "done"
+    KILLED = "killed"  # its worker died or left
+    NO_RIG = "no rig"  # its worker has dropped the scene
+
+
 class CastingWorkers:
-    """The GPU workers with a rig; each makes its own, including late ones.
+    """The GPU workers with a rig, and their tasks; each makes its own rig, including late ones.
 
     A worker's software is checked before it unpickles anything: a worker with other sources of
     lidarpool, or whose NumPy or ray caster gives other bits, is refused by name and casts nothing.
@@ -57,6 +69,7 @@ class CastingWorkers:
         self._setups: dict[str, Future] = {}  # {address: task that prepares the worker}
         self._refused: dict[str, str] = {}  # {address: reason of refusal}
         self._count = 0
+        self._casts: dict[str, Future] = {}  # {key: casting task}
         self._died: list[str] = []  # workers that died while preparing, in a row
         self._looked_at = float("-inf")
         self.seen = Whereabouts()
@@ -64,49 +77,84 @@ class CastingWorkers:
         self.notes: list[str] = []  # what a user should know
 
     @property
-    def futures(self) -> list[Future]:
-        """All tasks that prepare workers."""
-        return [*self._setups.values(), *([self._plan] if self._plan else [])]
-
-    @property
     def slot_count(self) -> int:
         """Batches that all prepared workers cast at a time; at least 1."""
         return max(1, sum(self.slots.values()))
 
     @property
-    def due(self) -> bool:
-        """Whether it is time to look again."""
-        return time.monotonic() - self._looked_at > LOOK_EVERY_S
+    def futures(self) -> list[Future]:
+        """All tasks."""
+        plan = [self._plan] if self._plan else []
+        return [*self._casts.values(), *self._setups.values(), *plan]
 
     @property
-    def preparing(self) -> list[str]:
-        """Keys of the tasks that prepare workers now."""
-        return [f.key for a, f in self._setups.items() if a not in self.slots]
+    def pending(self) -> list[str]:
+        """Keys of the tasks that have not ended."""
+        casts = [key for key, future in self._casts.items() if future.status == "pending"]
+        return casts + [f.key for a, f in self._setups.items() if a not in self.slots]
 
-    def look(self, keys: Iterable[str] = ()) -> None:
-        """Handle workers that have joined or left, or take no tasks at the moment.
+    # -- casting ---------------------------------------------------------------------------
 
-        Parameters
-        ----------
-        keys
-            Other tasks whose state is wanted in `seen`.
+    def cast(self, first: int, stop: int, offer: int, worker: str) -> str:
+        """Offer the scans from `first` to `stop` to a worker for the n-th time; returns the key."""
+        # A key of its own for each offer: a task that is released and submitted again under its
+        # key stays with the worker that still runs it, whatever `workers` says (in 4 of 4 tries).
+        key = f"{INTERSECT}-{self.handle}-{first}-{stop}.{offer}"
+        self._casts[key] = self._partition.submit(
+            intersect, self.handle, first, stop, self.handle, key=key, workers=worker
+        )
+        return key
+
+    def outcome(self, key: str, what: str) -> Outcome:
+        """State of a casting task; LidarpoolError, with the words `what`, if it has failed."""
+        future = self._casts[key]
+        if future.status == "finished":
+            return Outcome.DONE
+        if future.status == "error" and rig_is_missing(future):
+            return Outcome.NO_RIG
+        if future.status == "error" and was_killed(future):
+            return Outcome.KILLED
+        raise_if_failed(future, f"stage {INTERSECT}, {what}")
+        return Outcome.PENDING
+
+    def forget(self, key: str) -> None:
+        """Cancel a casting task, or drop its result."""
+        if (future := self._casts.pop(key, None)) is not None:
+            future.release()
+
+    def words_on_memory(self, worker: str) -> str:
+        """Clause for a message about a dead worker, if a nanny ended it for its memory."""
+        return words_on_memory(self._client, [worker])
+
+    # -- preparing workers -------------------------------------------------------------------
+
+    def look(self) -> Whereabouts | None:
+        """From time to time, handle workers that have joined or left, or take no tasks.
+
+        Returns
+        -------
+        Where workers and casting tasks are; None if it is not time to look.
 
         Raises
         ------
         LidarpoolError
             If preparing the scene fails, or kills several workers in a row.
         """
+        if time.monotonic() - self._looked_at <= LOOK_EVERY_S:
+            self._check()
+            return None
         self._looked_at = time.monotonic()
-        keys = [*(future.key for future in self.futures), *keys]
+        keys = [future.key for future in self.futures]
         self.seen = look_for_tasks(self._client, self._partition.name, keys)
         for address in self._setups.keys() - self.seen.members:
             self._remove(address)
         for address in sorted(self.seen.free.keys() - self._setups.keys()):
             if address not in self._refused:
                 self._prepare(address)
-        self.check()
+        self._check()
+        return self.seen
 
-    def check(self) -> None:
+    def _check(self) -> None:
         """Record the workers that are prepared."""
         for address, future in list(self._setups.items()):
             if address in self.slots:

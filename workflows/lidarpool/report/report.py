@@ -32,7 +32,7 @@ _PACKAGES = (
 # What `--json` prints of a report.
 _FIGURES = (
     "backend", "notes", "scans", "rays", "hits", "points", "points_by_object", "seconds",
-    "placement_violations", "replayed", "duplicates_dropped", "resumed_scans",
+    "placement_violations", "replayed", "resumed_scans",
 )  # fmt: skip
 _PLANNING = ("trials", "best_length", "shortest_possible", "collision_free")
 
@@ -85,7 +85,6 @@ def make_report(
         "placement_violations": sum(stage.violations for stage in result.stages),
         "misplaced_tasks": [asdict(record) for s in result.stages for record in s.misplaced][:20],
         "replayed": result.replayed,
-        "duplicates_dropped": result.duplicates_dropped,
         "resumed_scans": result.resumed,
         "planning": _planning(result),
         "files": list(files),

@@ -17,9 +17,10 @@ from ..base.errors import LidarpoolError
 from ..base.software import call_alike, software
 from ..base.task_book import TaskBook
 from ..export.pieces import RangeWriter, Span, Written
-from ..pipeline import EXPORT, LIDAR, Watch
+from ..pipeline import EXPORT, LIDAR
 from ..pipeline.failures import raise_if_failed
 from .result import RunResult
+from .watch import Watch
 
 LOOK_EVERY_S = 0.01
 FETCH_S = 1.0

@@ -41,8 +41,8 @@ class RunResult:
         All tasks of each stage together.
     seconds, survey_seconds, planning_seconds
         Wall time of all, of the survey and of the planning.
-    replayed, duplicates_dropped
-        Batches that were offered again, and scans that arrived twice for that reason.
+    replayed
+        Batches that were offered again.
     resumed
         Scans from an earlier run. `records` and seconds are of this run only.
     notes
@@ -71,7 +71,6 @@ class RunResult:
     survey_seconds: float = 0.0
     planning_seconds: float = 0.0
     replayed: int = 0
-    duplicates_dropped: int = 0
 
     @property
     def thinned(self) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import uuid
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -26,10 +27,11 @@ from ..pipeline import (
     GPU,
     LIDAR,
     OTHER,
+    CastingWorkers,
     Frame,
+    LongStages,
     RigPlan,
     SurveyDriver,
-    Watch,
 )
 from ..plan import best
 from .checks import find_workers, gpu_note
@@ -38,6 +40,7 @@ from .result import RunResult
 from .store import RunStore
 from .trials import TrialPump
 from .waiting import Waiting
+from .watch import Watch
 
 T = TypeVar("T")
 
@@ -180,7 +183,6 @@ class Run:
             survey_seconds=times[SurveyDriver],
             planning_seconds=times.get(TrialPump, 0.0),
             replayed=survey.offered_again,
-            duplicates_dropped=survey.duplicates_dropped,
         )
 
     def _survey_driver(self, on_frame: Callable[[Frame], None] | None) -> SurveyDriver:
@@ -188,20 +190,27 @@ class Run:
             if on_frame:
                 self._call(on_frame, frame)
 
-        job = self.job
+        job, store = self.job, self.store
+        run, plan = uuid.uuid4().hex[:8], RigPlan(job.scene, job.survey, store.backend)
         return SurveyDriver(
-            self.client,
-            self.partitions,
-            RigPlan(job.scene, job.survey, self.store.backend),
-            self.store.casting,
-            self.store.db,
-            self.store.storage,
-            self.store.points_of_scan,
+            CastingWorkers(self.client, self.partitions[GPU], run, plan, store.casting),
+            LongStages(
+                self.client,
+                self.partitions[LIDAR],
+                run,
+                store.casting["lidarpool"],
+                job.survey,
+                store.storage,
+                queue_capacity=job.queue_capacity,
+                collectors=job.collectors,
+                patience_s=job.patience_s,
+            ),
+            job.survey,
+            store.db,
+            store.storage,
+            store.points_of_scan,
             take,
-            lambda parts: self.store.on_parts(parts) if self.store.on_parts else None,
-            queue_capacity=job.queue_capacity,
-            collectors=job.collectors,
-            patience_s=job.patience_s,
+            lambda parts: store.on_parts(parts) if store.on_parts else None,
         )
 
     def _call(self, callback: Callable[[T], None], argument: T) -> None:

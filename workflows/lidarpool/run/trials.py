@@ -23,7 +23,7 @@ LOOK_EVERY_S = 1.0
 
 
 class TrialPump:
-    """Runs the trials of a planning; `step` it until `finished`, as `SurveyDriver`.
+    """Runs the trials of a planning; `step` it until `finished`, as a `SurveyDriver`.
 
     Parameters
     ----------

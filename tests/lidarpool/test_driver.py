@@ -1,0 +1,545 @@
+"""The driver's rules of recovery, with workers and stages that are played in this process."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, deque
+from itertools import chain
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidarpool import LidarpoolError, Sensor, Survey
+from lidarpool.base.storage import Storage
+from lidarpool.pipeline import driver, policies
+from lidarpool.pipeline.batches import PIECES, Place
+from lidarpool.pipeline.database import RunDatabase
+from lidarpool.pipeline.driver import STALL_S, SurveyDriver
+from lidarpool.pipeline.long_stages import StageChanges
+from lidarpool.pipeline.messages import (
+    ColumnsLost,
+    Receipt,
+    ScanRange,
+    StorageFailed,
+    StorageHidden,
+    Summaries,
+    samples_of_scan,
+    summary_type,
+)
+from lidarpool.pipeline.policies import LATE_S, SPAN, most_under_way
+from lidarpool.pipeline.workers import Outcome
+from poolpart import TaskRecord, Whereabouts
+
+SCANS = 60
+SURVEY = Survey(Sensor.grid(rays_per_revolution=SCANS, layers=1, step_deg=6), [(0, 0, 1)], SCANS)
+SUMMARY = summary_type(samples_of_scan(SCANS))
+GONE = "tcp://gone:1"
+
+
+class Workers:
+    """Workers that cast a batch when they are told to."""
+
+    notes = futures = pending = ()
+
+    def __init__(self):
+        self.slots = {"tcp://a:1": 1, "tcp://b:1": 1}
+        self.silent = set()
+        self.casts = {}  # {key: (first, stop, worker, outcome)}
+        self.tried = Counter()  # {(first, stop): casting tasks}
+        self.dropped = []
+        self.released = False
+        self._joined = 0
+
+    @property
+    def slot_count(self):
+        return max(1, sum(self.slots.values()))
+
+    def look(self):
+        free = {a: n for a, n in self.slots.items() if a not in self.silent}
+        return Whereabouts(frozenset(self.slots), frozenset(self.silent), free)
+
+    def cast(self, first, stop, offer, worker):
+        assert worker in self.slots
+        self.tried[first, stop] += 1
+        key = f"{first}-{stop}.{offer}"
+        self.casts[key] = (first, stop, worker, Outcome.PENDING)
+        return key
+
+    def outcome(self, key, what):
+        return self.casts[key][-1]
+
+    def forget(self, key):
+        self.casts.pop(key, None)
+
+    def drop(self, worker):
+        self.dropped.append(worker)
+
+    def words_on_memory(self, worker):
+        return ""
+
+    def release(self):
+        self.released = True
+
+    def end(self, key, outcome=Outcome.DONE):
+        self.casts[key] = (*self.casts[key][:-1], outcome)
+
+    @property
+    def open(self):
+        """Keys of the casting tasks that can still end."""
+        alive = [key for key, cast in self.casts.items() if cast[2] in self.slots]
+        return [key for key in alive if self.casts[key][-1] is Outcome.PENDING]
+
+    def die(self, worker):
+        """Kill a worker; another one joins."""
+        del self.slots[worker]
+        self._joined += 1
+        self.slots[f"tcp://later:{self._joined}"] = 1
+
+
+class Stages:
+    """Long stages that do something when they are told to."""
+
+    run, collector_count, waiting, notes = "0a1b2c3d", 2, False, ()
+
+    def __init__(self, storage, workers):
+        self.collectors = {"collect-0": "tcp://a:2", "collect-1": "tcp://c:2"}
+        self.orders = {name: deque() for name in self.collectors}  # what collectors have to do
+        self.unsorted = []
+        self.inbox = []
+        self.advice = 5  # scans in a batch
+        self.held = {}  # {name: part that is not in storage}
+        self.ended = False
+        self.failure = ""
+        self.wanted = True  # whether scans are taken
+        self.changes = StageChanges(started=["generate", "sort", *self.collectors])
+        self._storage, self._workers = storage, workers
+        self._sent = self._following = self._generated = self._framed = 0
+
+    # what the driver asks for
+
+    def open(self, probe):
+        self.probe = probe
+
+    def look(self, progress, generated, framed):
+        self._generated, self._framed = generated, framed
+        changes, self.changes = self.changes, StageChanges()
+        if "generate" in changes.started:
+            self._sent = generated
+        if "sort" in changes.started:
+            self.unsorted, self._following = [], framed
+        return changes
+
+    def wait(self, seconds, keys, *, scans):
+        self.wanted = scans
+
+    def receive(self):
+        messages, self.inbox = self.inbox, []
+        return messages
+
+    def send(self, name, messages):
+        (self.unsorted if name == "sort" else self.orders[name]).extend(messages)
+
+    def advise(self, scans):
+        pass
+
+    def take_held(self, receipt):
+        return self.held.pop(receipt.name, None)
+
+    def close(self):
+        self.ended = True
+
+    def stop(self, reason):
+        self.failure = reason
+
+    def finish(self, others):
+        return []
+
+    # what they do
+
+    def generate(self):
+        if self.wanted and self._sent < SCANS:
+            stop = min(SCANS, self._sent + self.advice)
+            self.inbox.append(ScanRange(self._sent, stop))
+            self._sent = stop
+
+    def collect(self, order, held_at=""):
+        """Write the part of an order, or hold it; a batch that is not there is reported."""
+        there = order.worker in self._workers.slots and order.key in self._workers.casts
+        if not there:
+            return ColumnsLost(order.key)
+        data = f"scans {order.first} to {order.stop}".encode()
+        if held_at:
+            self.held[order.name] = data
+        else:
+            self._storage.write(order.name, data)
+        summaries = np.zeros(order.stop - order.first, SUMMARY)
+        summaries["hits"] = range(order.first, order.stop)
+        record = TaskRecord("intersect", "GPU", "a", ("GPU",), 0.0, 0.1, order.stop - order.first)
+        return Receipt(
+            order.first, order.stop, order.name, 1, len(data), 1, (), summaries.tobytes(),
+            record, held_at,
+        )  # fmt: skip
+
+    def sort(self):
+        """Send on what follows, each part for itself."""
+        while found := [s for s in self.unsorted if self._following in s.scans]:
+            self.inbox.append(found[0])
+            self._following = found[0].stop
+
+    def die(self, name):
+        """Kill the worker of a stage, which is started again; returns what it had to do."""
+        left = list(self.orders.get(name, ()))
+        if name in self.orders:
+            self.orders[name].clear()
+        died = {**self.changes.died, name: GONE}
+        self.changes = StageChanges(died, [*self.changes.started, name])
+        return left
+
+
+class Run:
+    """A driver with what it talks to."""
+
+    def __init__(self, folder):
+        self.storage = Storage.at(folder / "parts", durable=False)
+        self.db = RunDatabase(folder / "run.db", SCANS, durable=False)
+        self.workers = Workers()
+        self.stages = Stages(self.storage, self.workers)
+        self.frames = []
+        self.committed = []
+        self.driver = SurveyDriver(
+            self.workers, self.stages, SURVEY, self.db, self.storage, None,
+            self.frames.append, self.committed.extend,
+        )  # fmt: skip
+        self.driver.start()
+
+    def step(self):
+        self.driver.step()
+        self.driver.wait(0.0)
+
+    def until(self, condition, *, idle=""):
+        """Let everybody work, but for those who are idle, until something is so."""
+        for _ in range(1000):
+            self.step()
+            if condition():
+                return
+            self.stages.generate()
+            for key in self.workers.open if idle != "cast" else ():
+                self.workers.end(key)
+            for orders in self.stages.orders.values() if idle != "collect" else ():
+                while orders:
+                    self.stages.inbox.append(self.stages.collect(orders.popleft()))
+            if idle != "sort":
+                self.stages.sort()
+        raise AssertionError("it does not come to that")
+
+    def end(self):
+        """Let everybody work to the end, and check that each scan has come once, in order."""
+        self.until(lambda: self.driver.finished)
+        self.driver.finish()
+        assert [frame.scan for frame in self.frames] == list(range(SCANS))
+        assert [frame.hits for frame in self.frames] == list(range(SCANS))
+        spans = sorted((part.first, part.stop) for part in self.committed)
+        assert [scan for span in spans for scan in range(*span)] == list(range(SCANS))
+        for part in self.committed:
+            assert self.storage.read(part.name) == f"scans {part.first} to {part.stop}".encode()
+        assert not self.driver.batches and not self.workers.casts and self.workers.released
+        assert self.stages.probe[0] not in self.storage.sizes()
+
+    def at(self, place):
+        return self.driver.batches.at(place)
+
+
+@pytest.fixture
+def run(tmp_path):
+    run = Run(tmp_path)
+    yield run
+    run.db.close()
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock for the driver that only goes when it is told to."""
+    clock = SimpleNamespace(now=time.monotonic())
+    monkeypatch.setattr(driver, "time", SimpleNamespace(monotonic=lambda: clock.now))
+    return clock
+
+
+def test_undisturbed_each_batch_is_cast_once(run):
+    run.end()
+    assert set(run.workers.tried.values()) == {1} and run.driver.offered_again == 0
+    assert run.driver.cast == run.driver.generated == SCANS
+    assert run.driver.book.stages["intersect"].items == SCANS
+
+
+def test_what_an_earlier_run_has_committed_is_not_cast_again(run):
+    run.until(lambda: len(run.committed) >= 4)
+    done = [(part.first, part.stop) for part in run.committed]
+    framed = len(run.frames)
+    later = SurveyDriver(
+        run.workers, run.stages, SURVEY, run.db, run.storage, None,
+        run.frames.append, run.committed.extend,
+    )  # fmt: skip
+    run.workers.tried.clear()
+    run.workers.casts.clear()
+    run.stages.__init__(run.storage, run.workers)
+    run.driver = later
+    later.start()
+    run.end()
+    assert framed > 0 and run.workers.tried.keys().isdisjoint(done)
+
+
+def test_the_batches_of_a_worker_that_dies_are_offered_to_others(run):
+    run.until(lambda: len(run.at(Place.CASTING)) == 4, idle="cast")
+    lost = [batch for batch in run.at(Place.CASTING) if batch.worker == "tcp://a:1"]
+    assert len(lost) == 2
+    run.workers.die("tcp://a:1")
+    run.step()
+    assert not {batch.worker for batch in lost} & {"tcp://a:1"}
+    run.end()
+    assert [n for n in run.workers.tried.values() if n > 1] == [2, 2] == [b.offers for b in lost]
+
+
+def test_columns_on_a_worker_that_dies_are_cast_again_and_nobody_is_blamed(run):
+    run.stages.collectors = {}
+    run.until(lambda: run.at(Place.CAST))
+    for batch in (lost := run.at(Place.CAST)):
+        if batch.worker in run.workers.slots:
+            run.workers.die(batch.worker)
+    run.step()
+    assert all(batch.place is not Place.CAST and not batch.deaths for batch in lost)
+    run.stages.collectors = {"collect-0": "tcp://a:2"}
+    run.end()
+
+
+def test_a_silent_worker_is_left_while_there_are_others(run):
+    run.until(lambda: len(run.at(Place.CASTING)) == 4, idle="cast")
+    run.workers.silent = set(run.workers.slots)
+    slots, run.workers.slots = run.workers.slots, {}
+    run.workers.look = lambda: Whereabouts(frozenset(slots), frozenset(slots), {})
+    run.step()
+    assert len(run.at(Place.CASTING)) == 4, "there is no other worker"
+    del run.workers.look
+    run.workers.slots, run.workers.silent = slots, {"tcp://b:1"}
+    run.step()
+    assert {batch.worker for batch in run.at(Place.CASTING)} >= {"tcp://a:1"}
+    assert run.driver.offered_again == 2
+
+
+def test_a_worker_without_its_scene_gets_it_again(run):
+    run.until(lambda: run.at(Place.CASTING), idle="cast")
+    batch = run.at(Place.CASTING)[0]
+    worker = batch.worker
+    run.workers.end(batch.key, Outcome.NO_RIG)
+    run.step()
+    assert run.workers.dropped == [worker]
+    run.end()
+    assert batch.offers == 2
+
+
+def test_the_batches_of_a_collector_that_dies_are_collected_by_another_without_a_cast(run):
+    run.until(lambda: run.stages.orders["collect-0"], idle="collect")
+    lost = {order.key for order in run.stages.die("collect-0")}
+    run.step()
+    assert lost and lost <= {order.key for orders in run.stages.orders.values() for order in orders}
+    run.end()
+    assert set(run.workers.tried.values()) == {1}
+
+
+def test_a_late_batch_is_offered_again_and_whatever_arrives_second_does_no_harm(run, clock):
+    run.until(lambda: run.committed)
+    run.until(lambda: any(run.stages.orders.values()), idle="collect")
+    order = next(order for orders in run.stages.orders.values() for order in orders)
+    first = run.stages.collect(order)  # ready, and stopped before it is sent
+    for orders in run.stages.orders.values():
+        orders.clear()
+    clock.now += LATE_S + 1
+    run.step()
+    run.until(lambda: order.first in run.db.parts)
+    assert run.workers.tried[order.first, order.stop] == 2
+    before = len(run.committed)
+    written = run.storage.read(order.name)
+    run.storage.write(order.name, written)  # as its collector does when it wakes up
+    run.stages.inbox += [first, first, ColumnsLost(order.key)]
+    run.step()
+    assert len(run.committed) == before and run.db.part_of(order.first).name == order.name
+    run.end()
+    assert len(run.storage.sizes()) == len(run.committed)
+
+
+@pytest.mark.parametrize("how", ["held", "columns"])
+def test_what_is_lost_on_its_way_is_cast_again(run, how):
+    run.until(lambda: any(run.stages.orders.values()), idle="collect")
+    order = next(orders for orders in run.stages.orders.values() if orders).popleft()
+    answer = run.stages.collect(order, held_at=GONE)
+    run.stages.held.clear()  # the worker has died
+    run.stages.inbox.append(answer if how == "held" else ColumnsLost(order.key))
+    run.step()
+    assert order.first not in run.db.parts
+    run.end()
+    assert run.workers.tried[order.first, order.stop] == 2
+
+
+def test_parts_of_a_worker_that_does_not_see_the_storage_are_written_by_the_driver(run):
+    run.until(lambda: any(run.stages.orders.values()), idle="collect")
+    order = next(orders for orders in run.stages.orders.values() if orders).popleft()
+    run.stages.inbox += [StorageHidden("far"), run.stages.collect(order, held_at="tcp://far:1")]
+    run.step()
+    assert order.name in run.storage.sizes() and not run.stages.held
+    run.end()
+    (note,) = run.driver.notes
+    assert note.startswith(f"far of partition LIDAR cannot see {run.storage.url}")
+
+
+def test_a_storage_that_fails_ends_the_run_with_what_to_do(run):
+    run.stages.inbox.append(StorageFailed("No space left on device"))
+    with pytest.raises(LidarpoolError, match=r"kept in .*parts \(No space left .*--parts"):
+        run.step()
+
+
+def test_a_sorter_that_dies_gets_again_what_was_not_handed_out(run):
+    run.until(lambda: len(run.frames) >= 10)
+    run.until(lambda: run.db.scans_done >= len(run.frames) + 20, idle="sort")
+    run.stages.die("sort")
+    run.step()
+    handed_out = len(run.frames)
+    assert min(s.first for s in run.stages.unsorted) == handed_out
+    assert max(s.stop for s in run.stages.unsorted) >= handed_out + 20
+    one = bytes(SUMMARY.itemsize)
+    run.stages.inbox += [Summaries(at, at + 1, one) for at in (0, handed_out + 1)]
+    run.step()
+    assert len(run.frames) == handed_out, "only the next frame is handed out"
+    run.end()
+
+
+def test_a_sorter_that_says_nothing_gets_all_again(run, clock):
+    run.until(lambda: len(run.committed) > 6, idle="sort")
+    run.stages.unsorted.clear()
+    clock.now += STALL_S + 1
+    run.step()
+    assert [s.first for s in run.stages.unsorted] == [p.first for p in run.db.ordered]
+    run.end()
+
+
+def test_a_generator_that_is_started_again_repeats_nothing(run):
+    run.until(lambda: run.driver.generated > 20)
+    run.stages.inbox.append(ScanRange(10, 22))
+    run.stages.die("generate")
+    run.end()
+    assert set(run.workers.tried.values()) == {1}
+
+
+@pytest.mark.parametrize("stage", ["intersect", "collect"])
+def test_a_scan_that_kills_its_workers_is_isolated_and_named(run, stage):
+    poison, deaths = 23, 0
+    run.stages.advice = 20
+
+    def strike():
+        nonlocal deaths
+        for key in run.workers.open if stage == "intersect" else ():
+            first, stop, worker, _ = run.workers.casts[key]
+            if first <= poison < stop and worker in run.workers.slots:
+                run.workers.die(worker)
+                deaths += 1
+        for name, orders in run.stages.orders.items() if stage == "collect" else ():
+            if any(order.first <= poison < order.stop for order in orders):
+                run.stages.die(name)
+                deaths += 1
+        return False
+
+    message = rf"^scan {poison} kills the worker that runs stage {stage}: 3 workers died, one after"
+    with pytest.raises(LidarpoolError, match=message):
+        run.until(strike)
+    # Twice with the whole batch, once alone, once with its piece, and three times by itself.
+    pieces = 20 // -(-20 // PIECES)
+    assert pieces == 10 and deaths == 2 + 1 + 1 + 3
+    assert run.db.missing(0, SCANS) == [(poison, poison + 1)]
+    assert [frame.scan for frame in run.frames] == list(range(poison))
+
+
+def test_a_suspect_that_is_innocent_is_not_divided(run):
+    run.until(lambda: run.at(Place.CASTING), idle="cast")
+    batch = run.at(Place.CASTING)[0]
+    for _ in range(2):
+        run.workers.die(batch.worker)
+        run.until(lambda: batch.place is Place.CASTING, idle="cast")
+    alone = [b for b in run.at(Place.CASTING) if b.worker == batch.worker]
+    assert batch.deaths["intersect"] == 2 and alone == [batch]
+    run.end()
+    assert (batch.first, batch.stop) in {(part.first, part.stop) for part in run.committed}
+
+
+def test_batches_under_way_are_bounded_whoever_is_slow(run):
+    most = most_under_way(2, 2)
+    run.stages.advice = 1
+    for _ in range(5 * most):
+        run.step()
+        run.stages.generate()
+    assert len(run.driver.batches) == most and not run.stages.wanted
+    oldest = min(run.driver.batches, key=lambda batch: batch.first)
+    for _ in range(5 * SPAN * most):  # all the others go on
+        run.step()
+        run.stages.generate()
+        for key in run.workers.open:
+            if key != oldest.key:
+                run.workers.end(key)
+        for order in chain.from_iterable(run.stages.orders.values()):
+            run.stages.inbox.append(run.stages.collect(order))
+        for orders in run.stages.orders.values():
+            orders.clear()
+    assert run.driver.batches.span <= max(SPAN * most, SCANS) and run.frames == []
+
+
+def test_a_run_that_is_stopped_leaves_nothing(run):
+    run.until(lambda: run.at(Place.CASTING) and run.committed)
+    run.driver.stop("enough")
+    assert run.stages.failure == "enough" and not run.workers.casts
+    run.driver.finish()
+    assert run.workers.released and run.stages.probe[0] not in run.storage.sizes()
+
+
+@settings(max_examples=100, deadline=None)
+@given(chance=st.randoms(use_true_random=False))
+def test_whatever_dies_each_scan_arrives_once_in_order(tmp_path_factory, chance):
+    run = Run(tmp_path_factory.mktemp("run"))
+    run.stages.advice = chance.choice((1, 4, 7))
+    late = []  # what collectors have to say that were only stopped
+
+    def collect():
+        orders = chance.choice(list(run.stages.orders.values()))
+        if orders:
+            answer = run.stages.collect(orders.popleft())
+            where = chance.choice((run.stages.inbox, run.stages.inbox, late))
+            where.extend([answer] * chance.choice((1, 1, 2)))
+
+    def cast():
+        if run.workers.open:
+            outcomes = (Outcome.DONE, Outcome.DONE, Outcome.DONE, Outcome.NO_RIG, Outcome.KILLED)
+            run.workers.end(chance.choice(run.workers.open), chance.choice(outcomes))
+
+    def lose_stage():
+        name = chance.choice(["generate", "sort", *run.stages.orders])
+        late.extend(map(run.stages.collect, run.stages.die(name)))
+
+    def lose_worker():
+        run.workers.die(chance.choice(list(run.workers.slots)))
+
+    def wake():
+        run.stages.inbox += late
+        late.clear()
+
+    work = [run.stages.generate, collect, cast, run.stages.sort]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(policies, "KILLS_MOST", 10**6)  # here nobody is to blame
+        for _ in range(100):
+            chance.choice([*work, *work, *work, lose_stage, lose_worker, wake])()
+            if chance.random() < 0.7:
+                run.step()
+        run.stages.die("collect-0")  # what it had taken is not answered
+        run.stages.die("collect-1")
+        run.step()
+        wake()
+        run.end()
+    run.db.close()

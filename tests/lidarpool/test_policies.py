@@ -1,0 +1,210 @@
+"""The driver's policies: how large batches are, where they go, and when they are tried again."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import pytest
+
+from lidarpool.pipeline.batches import Batch, Batches, Place
+from lidarpool.pipeline.policies import (
+    AHEAD,
+    BATCH_RAYS,
+    COLLECTING,
+    KILLS_MOST,
+    LATE_FACTOR,
+    LATE_S,
+    SPAN,
+    SUSPECT_DEATHS,
+    Loss,
+    Verdict,
+    handovers,
+    late_after_s,
+    loss,
+    offers,
+    room,
+    scans_per_batch,
+    verdict,
+)
+from poolpart import Whereabouts
+from poolpart.task_locations import TaskPlace
+
+A, B = "tcp://a:1", "tcp://b:1"
+
+
+def batch(number, place=Place.WAITING, worker="", collector="", suspect=""):
+    deaths = Counter({suspect: SUSPECT_DEATHS} if suspect else {})
+    return Batch(number, number + 1, number, place, 0.0, 1, str(number), worker, collector, deaths)
+
+
+def casting(number, worker, suspect=""):
+    return batch(number, Place.CASTING, worker, suspect=suspect)
+
+
+def waiting(count, first=10):
+    return [batch(number) for number in range(first, first + count)]
+
+
+def numbers(chosen):
+    return [(one.first, where) for one, where in chosen]
+
+
+# -- size ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("seconds", "scans", "rays", "count", "slots", "wanted"),
+    [
+        (0.1, 10, 100, 10**6, 2, 20),  # twice as long
+        (0.4, 10, 100, 10**6, 2, 5),  # half
+        (0.001, 10, 100, 10**6, 2, 20),  # at most twice as many as the last
+        (0.0, 1, 100, 10**6, 2, 2),
+        (9.0, 1, 100, 10**6, 2, 1),  # a scan at least
+        (0.001, 10**5, 1000, 10**9, 1, BATCH_RAYS // 1000),
+        (0.001, 10**5, 10 * BATCH_RAYS, 10**9, 1, 1),
+        (0.001, 10**5, 0, 3200, 2, 100),  # so many that all slots are busy to the end
+        (0.001, 10**5, 100, 5, 2, 1),
+    ],
+)
+def test_scans_of_a_batch(seconds, scans, rays, count, slots, wanted):
+    assert scans_per_batch(seconds, scans, rays, count, slots) == wanted
+
+
+def test_no_batches_are_taken_far_ahead_of_the_oldest():
+    assert room(3, 5, 10) == 7
+    assert room(3, SPAN * 10, 10) == 0
+
+
+# -- where ---------------------------------------------------------------------------------------
+
+
+def test_the_worker_with_the_least_work_for_its_slots_gets_the_next_batch():
+    slots = {A: 1, B: 3}
+    chosen = offers([casting(0, A), casting(1, B), *waiting(9)], slots, most=99)
+    assert numbers(chosen)[:3] == [(10, B), (11, B), (12, A)]
+    assert Counter(where for _, where in chosen) == {A: AHEAD - 1, B: 3 * AHEAD - 1}
+
+
+def test_there_are_at_most_so_many_batches_under_way():
+    collecting = batch(0, Place.COLLECTING)
+    there = [collecting, batch(1, Place.CAST), casting(2, A), *waiting(9)]
+    assert numbers(offers(there, {A: 9}, most=5)) == [(10, A), (11, A)]
+    assert offers(there, {A: 9}, most=2) == []
+    assert offers(there, {}, most=99) == []
+
+
+def test_a_suspect_has_a_worker_for_itself():
+    suspect = batch(5, suspect="intersect")
+    assert numbers(offers([suspect, *waiting(5)], {A: 1, B: 1}, 99)) == [(5, A), (10, B), (11, B)]
+    alone = casting(0, A, suspect="intersect")
+    assert {where for _, where in offers([alone, *waiting(5)], {A: 1, B: 1}, 99)} == {B}
+    # Until a worker is free the others wait, too: they would occupy all.
+    assert offers([casting(0, A), casting(1, B), suspect, *waiting(5)], {A: 1, B: 1}, 99) == []
+
+
+def test_a_collector_on_the_host_of_the_columns_is_preferred():
+    there = [batch(n, Place.CAST, worker) for n, worker in enumerate((A, B, A, A, A, A, A))]
+    chosen = handovers(there, {"collect-0": "tcp://b:7", "collect-1": "tcp://a:7"})
+    assert dict(numbers(chosen)) == {
+        0: "collect-1", 1: "collect-0", 2: "collect-1", 3: "collect-1", 4: "collect-0",
+        5: "collect-0",
+    }  # fmt: skip
+    assert len(chosen) == 2 * COLLECTING
+    assert handovers(there, {}) == []
+
+
+def test_a_suspect_is_collected_alone():
+    collectors = {"collect-0": A, "collect-1": B}
+    suspect = batch(5, Place.CAST, A, suspect="collect")
+    other = batch(6, Place.CAST, A)
+    assert numbers(handovers([other, suspect], collectors)) == [(5, "collect-0")]
+    busy = batch(7, Place.COLLECTING, A, "collect-1")
+    assert handovers([suspect, other, busy], collectors) == []
+    busy = batch(7, Place.COLLECTING, A, "collect-1", suspect="collect")
+    assert handovers([other, busy], collectors) == []
+    assert numbers(handovers([other, batch(8, Place.CAST, A, suspect="intersect")], collectors))
+
+
+# -- again ---------------------------------------------------------------------------------------
+
+HERE = Whereabouts(frozenset({A, B}), frozenset(), {A: 1, B: 1})
+
+
+def test_batches_are_late_by_what_others_took():
+    assert late_after_s([]) == float("inf")
+    assert late_after_s([0.1, 0.2, 99.0]) == LATE_S
+    assert late_after_s([10.0, 20.0, 30.0]) == LATE_FACTOR * 20
+
+
+@pytest.mark.parametrize(
+    ("place", "reason"),
+    [
+        (Place.WAITING, None),
+        (Place.CASTING, Loss.DIED),
+        (Place.CAST, Loss.GONE),
+        (Place.COLLECTING, None),  # its collector may have the columns, and says if it has not
+    ],
+)
+def test_the_batches_of_a_worker_that_is_gone(place, reason):
+    assert loss(batch(0, place, "tcp://gone:1"), HERE, 2, 0.0, LATE_S) is reason
+
+
+def test_a_silent_worker_is_left_if_there_is_another():
+    seen = Whereabouts(frozenset({A, B}), frozenset({A}), {B: 1})
+    for place in (Place.CASTING, Place.CAST):
+        assert loss(batch(0, place, A), seen, 1, 0.0, LATE_S) is Loss.GONE
+        assert loss(batch(0, place, A), seen, 0, 0.0, LATE_S) is None
+
+
+@pytest.mark.parametrize(
+    ("task", "reason"),
+    [
+        (TaskPlace("no-worker", (), 0), Loss.REFUSED),
+        (TaskPlace("processing", (A,), 0), Loss.REFUSED),
+        (TaskPlace("processing", (A,), 0, started=True), None),
+        (TaskPlace("memory", (A,), 0), None),
+        (None, None),
+    ],
+)
+def test_a_worker_that_takes_no_tasks_ends_what_it_has_begun(task, reason):
+    seen = Whereabouts(HERE.members, frozenset(), {B: 1}, tasks={"0": task} if task else {})
+    assert loss(casting(0, A), seen, 1, 0.0, LATE_S) is reason
+
+
+@pytest.mark.parametrize(
+    ("place", "prepared", "reason"),
+    [
+        (Place.WAITING, 2, None),
+        (Place.CASTING, 2, Loss.LATE),
+        (Place.CASTING, 1, None),  # nobody else could do it
+        (Place.CAST, 2, None),  # it waits for a collector
+        (Place.COLLECTING, 1, Loss.LATE),
+    ],
+)
+def test_a_late_batch(place, prepared, reason):
+    assert loss(batch(0, place, A), HERE, prepared, LATE_S + 1, LATE_S) is reason
+    assert loss(batch(0, place, A), HERE, prepared, LATE_S - 1, LATE_S) is None
+
+
+def test_a_batch_is_judged_by_the_deaths_of_those_that_had_it():
+    for deaths in range(SUSPECT_DEATHS + 1):
+        assert verdict(deaths, 10) is verdict(deaths, 1) is Verdict.RETRY
+    assert verdict(SUSPECT_DEATHS + 1, 2) is Verdict.SPLIT
+    for kills in range(1, KILLS_MOST):
+        assert verdict(SUSPECT_DEATHS + kills, 1) is Verdict.RETRY
+    assert verdict(SUSPECT_DEATHS + KILLS_MOST, 1) is Verdict.POISON
+
+
+def test_pieces_hold_the_scans_of_the_whole_and_keep_its_place_in_the_order():
+    batches = Batches()
+    batches.add(0, 5)
+    whole = batches.add(5, 42)
+    batches.add(42, 50)
+    batches.split(whole, Counter(collect=2))
+    pieces = batches.within(5, 42)
+    assert [scan for piece in pieces for scan in piece.scans] == list(range(5, 42))
+    assert {piece.deaths["collect"] for piece in pieces} == {2}
+    assert batches.span == 3 and whole not in [*batches]
+    for done in batches.within(0, 5):
+        batches.remove(done)
+    assert batches.span == 2

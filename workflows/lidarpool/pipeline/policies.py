@@ -1,0 +1,187 @@
+"""Policies of the driver, as pure functions: how large batches are, where they go, when to retry.
+
+Nothing here reads a clock, the cluster or the driver.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from enum import Enum
+
+from poolpart import Whereabouts
+
+from .batches import Batch, Place
+from .names import COLLECT, INTERSECT
+
+BATCH_SECONDS = 0.2  # casting time that makes a batch worth its overhead
+BATCH_RAYS = 1_000_000  # bounds a batch's memory
+BATCHES_LEAST = 16  # batches for each slot, so that none idles for long at the end
+AHEAD = 2  # batches offered to a worker for each of its slots, so that it need not wait
+COLLECTING = 3  # batches that a collector is given at a time
+SPAN = 8  # batches that the newest may be ahead of the oldest, for each that may be under way
+SUSPECT_DEATHS = 2  # workers that may die with a batch before it is tried alone
+KILLS_MOST = 3  # workers that a single scan may kill, alone
+LATE_S = 60.0  # a batch is late when it takes so long at one place, and
+LATE_FACTOR = 20.0  # so much longer than others
+
+
+# -- how much is under way -------------------------------------------------------------------
+
+
+def scans_per_batch(
+    seconds: float, scans: int, rays_per_scan: int, scan_count: int, slots: int
+) -> int:
+    """Choose how many scans a batch should have, at most twice as many as the last.
+
+    The last had so many `scans`, and took so many `seconds` to cast; `slots` are cast at a time.
+    """
+    most = min(BATCH_RAYS // max(1, rays_per_scan), scan_count // (BATCHES_LEAST * slots))
+    return max(1, min(int(BATCH_SECONDS * scans / max(seconds, 1e-6)), 2 * scans, most))
+
+
+def most_under_way(slots: int, collectors: int) -> int:
+    """Batches that may be under way."""
+    return AHEAD * slots + COLLECTING * collectors + 2
+
+
+def room(under_way: int, span: int, most: int) -> int:
+    """Batches that may be taken; none while the newest is far ahead of the oldest."""
+    return 0 if span >= SPAN * most else most - under_way
+
+
+# -- where batches go ------------------------------------------------------------------------
+
+
+def suspect(batch: Batch, stage: str) -> bool:
+    """Whether a batch may be what kills the workers of a stage: then it is tried alone."""
+    return batch.deaths[stage] >= SUSPECT_DEATHS
+
+
+def offers(
+    batches: Sequence[Batch], slots: Mapping[str, int], most: int
+) -> list[tuple[Batch, str]]:
+    """Choose workers for waiting batches, at most so many under way in all.
+
+    The worker with the least work for its slots gets the next batch. A suspect batch gets a worker
+    for itself, and is waited for: the others must not occupy all workers. `slots` says how many
+    batches each worker casts at a time.
+    """
+    casting = [b for b in batches if b.place is Place.CASTING]
+    load = Counter(batch.worker for batch in casting)
+    alone = {batch.worker for batch in casting if suspect(batch, INTERSECT)}
+    left = most - sum(b.place in (Place.CAST, Place.COLLECTING) for b in batches)
+    left -= sum(load[address] for address in slots)
+    chosen: list[tuple[Batch, str]] = []
+    for batch in (b for b in batches if b.place is Place.WAITING):
+        wary = suspect(batch, INTERSECT)
+        fullness = {
+            address: load[address] / (1 if wary else AHEAD * count)
+            for address, count in slots.items()
+            if address not in alone
+        }
+        address = min(fullness, key=lambda a: (fullness[a], a), default="")
+        if not address or fullness[address] >= 1:
+            if wary:
+                break
+            continue
+        if len(chosen) >= left:
+            break
+        chosen.append((batch, address))
+        load[address] += 1
+        if wary:
+            alone.add(address)
+    return chosen
+
+
+def handovers(batches: Sequence[Batch], collectors: Mapping[str, str]) -> list[tuple[Batch, str]]:
+    """Choose collectors for batches that were cast.
+
+    One on the host of the columns is preferred. A suspect batch is collected while there is no
+    other in stage 4: several collectors may share a process. `collectors` has the address of the
+    worker of each.
+    """
+    ready = [b for b in batches if b.place is Place.CAST]
+    busy = [b for b in batches if b.place is Place.COLLECTING]
+    if suspects := [b for b in ready if suspect(b, COLLECT)]:
+        ready = [] if busy else suspects[:1]
+    if any(suspect(b, COLLECT) for b in busy):
+        return []
+    load = Counter(batch.collector for batch in busy)
+    chosen: list[tuple[Batch, str]] = []
+    for batch in ready:
+        free = [name for name in collectors if load[name] < COLLECTING]
+        if not free:
+            break
+        near = [name for name in free if _host(collectors[name]) == _host(batch.worker)]
+        name = min(near or free, key=lambda n: (load[n], n))
+        chosen.append((batch, name))
+        load[name] += 1
+    return chosen
+
+
+def _host(address: str) -> str:
+    """Host of a worker's address."""
+    return address.rpartition("/")[2].rpartition(":")[0]
+
+
+# -- when a batch is tried again -------------------------------------------------------------
+
+
+class Loss(Enum):
+    """Why a batch is offered again although its task has not failed."""
+
+    DIED = "its worker died"
+    GONE = "its worker is gone or silent"
+    REFUSED = "its worker takes no tasks"
+    LATE = "it is late"
+
+
+def late_after_s(seconds: Sequence[float]) -> float:
+    """Seconds after which a batch is late, from the casting times of others; inf without any."""
+    if not seconds:
+        return float("inf")
+    return max(LATE_S, LATE_FACTOR * statistics.median(seconds))
+
+
+def loss(batch: Batch, seen: Whereabouts, prepared: int, now: float, late_s: float) -> Loss | None:
+    """Whether a batch should be offered again, and why.
+
+    It depends on what was `seen` of workers and tasks, and on the number of workers that are
+    `prepared`: while there is no other, a batch is waited for.
+    """
+    if batch.place in (Place.CASTING, Place.CAST):
+        if batch.worker not in seen.members:
+            return Loss.DIED if batch.place is Place.CASTING else Loss.GONE
+        if batch.worker in seen.silent:
+            if prepared:
+                return Loss.GONE
+        elif batch.worker not in seen.free and batch.place is Place.CASTING:
+            task = seen.tasks.get(batch.key)
+            # "no-worker": not even sent there, as the worker was paused before.
+            if task and task.state in ("no-worker", "processing") and not task.started:
+                return Loss.REFUSED
+    late = batch.place in (Place.CASTING, Place.COLLECTING) and now - batch.since > late_s
+    return Loss.LATE if late and (prepared > 1 or batch.place is Place.COLLECTING) else None
+
+
+class Verdict(Enum):
+    """What becomes of a batch that was under way when a worker died."""
+
+    RETRY = "retry"
+    SPLIT = "split"
+    POISON = "poison"
+
+
+def verdict(deaths: int, scans: int) -> Verdict:
+    """Judge a batch of so many scans, with which so many workers of one stage have died.
+
+    After some deaths it is tried alone, see `suspect`. An innocent one succeeds then; one whose
+    worker dies again is divided, down to single scans. A scan is the cause if several workers in a
+    row die with it alone.
+    """
+    kills = deaths - SUSPECT_DEATHS  # those with no other batch in that stage
+    if kills > 0 and scans > 1:
+        return Verdict.SPLIT
+    return Verdict.POISON if kills >= KILLS_MOST else Verdict.RETRY
