@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import operator
 import os
 import reprlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -10,7 +11,17 @@ from functools import cache, wraps
 from numbers import Integral, Real
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    ParamSpec,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -44,6 +55,14 @@ _EXAMPLES = {
     "Sensor": "load_sensor('velodyne/vlp16')",
     "Survey": "Survey(poses=[(0, 0, 1)])",
     "Trajectory": "load_trajectory('drive.tum')",
+}
+# Limits of a field: {as pydantic's `Field` has it: (whether a value fits, in words)}
+_LIMITS: dict[str, tuple[Callable[[Any, Any], bool], str]] = {
+    "ge": (operator.ge, "at least"),
+    "gt": (operator.gt, "above"),
+    "le": (operator.le, "at most"),
+    "lt": (operator.lt, "below"),
+    "min_length": (lambda value, least: len(value) >= least, "at least of length"),
 }
 _PLAIN = (*(kind for kind in _KINDS if kind is not Path), list, tuple, dict, bytes)
 
@@ -120,10 +139,10 @@ def _hints(thing: Any) -> dict[str, Any]:
     """Annotations that can be checked."""
     if isinstance(thing, type):
         names = set(thing.__dict__["__dataclass_fields__"])
-        hints = {name: hint for name, hint in get_type_hints(thing).items() if name in names}
     else:
-        hints = {name: hint for name, hint in get_type_hints(thing).items() if name != "return"}
-    return {name: hint for name, hint in hints.items() if _words(hint)}
+        names = {*thing.__annotations__} - {"return"}
+    hints = get_type_hints(thing, include_extras=True)
+    return {name: hints[name] for name in names if _words(hints[name])}
 
 
 def _check(name: str, value: object, hint: Any) -> None:
@@ -133,10 +152,35 @@ def _check(name: str, value: object, hint: Any) -> None:
         example = f"[{such[0]}]" if such and words.startswith("a list") else "".join(such[:1])
         words += f", such as {example}" if example else ""
         raise LidarpoolError(f"{name} is {shown(value)}; it must be {words}.")
+    limits = _limits(hint)
+    if value is not None and not all(_LIMITS[sign][0](value, at) for sign, at in limits.items()):
+        raise LidarpoolError(f"{name} is {shown(value)}; it must be {_range(limits)}.")
+
+
+def _limits(hint: Any) -> dict[str, Any]:
+    """Limits in an annotation, as pydantic's `Field` has them: {name: limit}."""
+    args = get_args(hint)
+    inner = args[:1] if get_origin(hint) is Annotated else args
+    if get_origin(hint) not in (Annotated, Union, UnionType):
+        return {}
+    limits = {name: limit for one in inner for name, limit in _limits(one).items()}
+    for note in getattr(hint, "__metadata__", ()):
+        for limit in getattr(note, "metadata", ()):
+            limits |= {name: getattr(limit, name) for name in _LIMITS if hasattr(limit, name)}
+    return limits
+
+
+def _range(limits: Mapping[str, Any]) -> str:
+    least, most = limits.get("ge"), limits.get("le")
+    if least is not None and most is not None:
+        return f"{least} to {most}"
+    return ", ".join(f"{_LIMITS[sign][1]} {limit}" for sign, limit in limits.items())
 
 
 def _fits(value: object, hint: Any) -> bool:
     origin, args = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        return _fits(value, args[0])
     if origin in (Union, UnionType):
         return any(_fits(value, one) for one in args)
     if origin is Literal:
@@ -162,11 +206,13 @@ def _fits(value: object, hint: Any) -> bool:
 def _words(hint: Any) -> str:
     """Describe allowed values; empty if they are not checked here, such as arrays."""
     origin, args = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        return _words(args[0])
     if origin in (Union, UnionType):
         words = [_words(one) for one in args]
         return " or ".join(words) if all(words) else ""
     if origin is Literal:
-        return f"one of {', '.join(args)}"
+        return f"one of {', '.join(map(str, args))}"
     if origin in (Sequence, Iterable, tuple):
         of = _words(args[0]).removeprefix("a ").replace("number", "numbers")
         return f"a list of {of}" if of else ""

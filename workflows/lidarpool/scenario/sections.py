@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import (
-    AwareDatetime,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -18,16 +16,14 @@ from pydantic import (
 )
 
 from ..base.arguments import shown
+from ..base.declared import Text, is_text, short
 from ..base.vocabulary import BACKENDS
-from ..columns.table import COORDINATES, OPTIONAL
 from ..export.table import EXPORTS, FORMATS, LAYOUTS
+from ..plan.planning import Search
 from ..scene.transform import Transform
-from ..sensor import Pose, Sensor
-from ..sensor.disc import SUBRAYS
+from ..sensor import Material, Noise, Pose, Returns, Sensor
 from ..sensor.models import load_sensor
-from ..sensor.optics import MODES
-
-COLUMN_NAMES = tuple(column.in_files for column in OPTIONAL)
+from ..sensor.survey import CloudOptions, Weather
 
 # Nothing on Earth is farther from the origin of its map.
 Coordinate = Annotated[float, Field(ge=-1e8, le=1e8)]
@@ -40,17 +36,6 @@ Angles = Annotated[tuple[Angle, Angle, Angle], Strict(False)]
 Factors = Annotated[tuple[Factor, Factor, Factor], Strict(False)]
 Row = Annotated[tuple[Factor, Factor, Factor, Factor], Strict(False)]
 Matrix = Annotated[tuple[Row, Row, Row, Row], Strict(False)]
-
-
-def _short(is_short: Callable[[Any], bool], long: Callable[[Any], Any], allowed: Any) -> Any:
-    """Expand a short form; `allowed` is its type, for the schema."""
-    return BeforeValidator(
-        lambda value: long(value) if is_short(value) else value, json_schema_input_type=allowed
-    )
-
-
-def _is_text(value: Any) -> bool:
-    return isinstance(value, str)
 
 
 class Section(BaseModel):
@@ -92,7 +77,7 @@ class MeshFile(Section):
     ] = (0, 0, 0)
     scale: Annotated[
         Factors,
-        _short(lambda v: type(v) in (int, float), lambda v: [v] * 3, Factor | Factors),
+        short(lambda v: type(v) in (int, float), lambda v: [v] * 3, Factor | Factors),
         Field(description="one factor, or one for each axis; applied first"),
     ] = (1, 1, 1)
     matrix: Annotated[
@@ -115,8 +100,7 @@ class MeshFile(Section):
         return Transform.place(self.translation, self.rotation_deg, self.scale)
 
 
-Text = Annotated[str, Field(min_length=1)]
-MeshEntry = Annotated[MeshFile, _short(_is_text, lambda v: {"file": v}, Text | MeshFile)]
+MeshEntry = Annotated[MeshFile, short(is_text, lambda v: {"file": v}, Text | MeshFile)]
 MeshEntries = Annotated[tuple[MeshEntry, ...], Strict(False)]
 
 
@@ -144,7 +128,7 @@ class SceneSection(Section):
     ] = None
     files: Annotated[
         MeshEntries,
-        _short(lambda v: isinstance(v, (str, dict)), lambda v: [v], MeshEntry | MeshEntries),
+        short(lambda v: isinstance(v, (str, dict)), lambda v: [v], MeshEntry | MeshEntries),
         Field(
             max_length=10_000,
             description="mesh files, by name or with unit, up_axis, scale, rotation_deg, "
@@ -304,52 +288,8 @@ PoseEntry = Annotated[
 ]
 
 
-class CloudSection(Section):
+class CloudSection(Section, CloudOptions):
     """Which hits become points, and their columns."""
-
-    keep_every: Annotated[
-        Annotated[int, Field(ge=1, le=1_000_000)] | None,
-        Field(
-            description="keep every n-th hit of a scan; by default every hit, of a scene with the "
-            "default objects every 5th",
-            examples=[5],
-        ),
-    ] = None
-    precision_m: Annotated[
-        Annotated[float, Field(ge=1e-6, le=1000)] | None,
-        Field(
-            description="step in metres that points are rounded to; by default the sensor's, "
-            "or 0.01",
-            examples=[0.01],
-        ),
-    ] = None
-    coordinates: Annotated[
-        Literal[COORDINATES],  # type: ignore[valid-type]
-        Field(description="world; or sensor: its axes when it fired, as sensor drivers have them"),
-    ] = "world"
-    columns: Annotated[
-        tuple[Literal[COLUMN_NAMES], ...],  # type: ignore[valid-type]
-        Strict(False),
-        Field(
-            description="columns in addition to x, y, z, scan, channel and object: "
-            + ", ".join(COLUMN_NAMES),
-            examples=[["time", "range", "intensity"]],
-        ),
-    ] = ()
-    epsg: Annotated[
-        Annotated[int, Field(ge=1024, le=32767)] | None,
-        Field(
-            description="EPSG code of the world's coordinate system, for LAS and LAZ",
-            examples=[25832],
-        ),
-    ] = None
-    start: Annotated[
-        Annotated[AwareDatetime, Strict(False)] | None,
-        Field(
-            description="when the survey starts, with its time zone, for LAS, LAZ and bags",
-            examples=["2026-11-21T10:00:00Z"],
-        ),
-    ] = None
 
 
 class ExportSection(Section):
@@ -370,9 +310,7 @@ class OutputSection(Section):
 
     write: Annotated[
         tuple[
-            Annotated[
-                ExportSection, _short(_is_text, lambda v: {"format": v}, Text | ExportSection)
-            ],
+            Annotated[ExportSection, short(is_text, lambda v: {"format": v}, Text | ExportSection)],
             ...,
         ],
         Strict(False),
@@ -399,97 +337,20 @@ class OutputSection(Section):
         return tuple(dict.fromkeys(chain.from_iterable(needed)))
 
 
-Names = Annotated[tuple[Text, ...], Strict(False)]
-Share = Annotated[float, Field(ge=0, le=1)]
-
-
-class MaterialSection(Section):
+class MaterialSection(Section, Material):
     """Material of objects; the last entry for an object counts."""
 
-    objects: Annotated[
-        Names,
-        _short(_is_text, lambda v: [v], Text | Names),
-        Field(min_length=1, description="names of objects, with * and ?"),
-    ]
-    reflectance: Annotated[
-        Share | None,
-        Field(description="share of light that is scattered; by default 0.5, for glass 0"),
-    ] = None
-    semantic_class: Annotated[
-        int, Field(alias="class", ge=0, le=65_535, description="value of the column class")
-    ] = 0
-    retro: Annotated[
-        bool, Field(description="whether light returns in its own direction, as from traffic signs")
-    ] = False
-    transparent: Annotated[
-        Literal["none", "pass", "mirror"],
-        Field(description="the rest of the light passes through (pass), or is reflected (mirror)"),
-    ] = "none"
 
-
-class ReturnsSection(Section):
+class ReturnsSection(Section, Returns):
     """Sub-rays of a beam, and which of its returns are reported."""
 
-    mode: Annotated[
-        Literal[MODES],  # type: ignore[valid-type]
-        Field(description="returns reported for a pulse; dual: strongest and last"),
-    ] = "strongest"
-    subrays: Annotated[
-        Literal[SUBRAYS],  # type: ignore[valid-type]
-        Field(description="rays in a beam: 1, 7, 19, 37, 61, … 217"),
-    ] = 1
-    divergence_mrad: Annotated[
-        Annotated[float, Field(ge=0, le=1000)] | None,
-        Field(description="full angle of the beam; by default the sensor's", examples=[3.0]),
-    ] = None
-    pulse_ns: Annotated[
-        Annotated[float, Field(ge=0, le=1e6)] | None,
-        Field(
-            description="length of the pulse: surfaces less than half of it apart are "
-            "one return; by default the sensor's, or 5",
-            examples=[5.0],
-        ),
-    ] = None
 
-
-class NoiseSection(Section):
+class NoiseSection(Section, Noise):
     """Noise of ranges and angles, and lost returns."""
 
-    range_m: Annotated[
-        float, Field(ge=0, le=1000, description="standard deviation of ranges, metres")
-    ] = 0.0
-    range_per_m: Annotated[
-        float, Field(ge=0, le=1, description="standard deviation added for each metre of range")
-    ] = 0.0
-    angle_deg: Annotated[
-        float, Field(ge=0, le=10, description="standard deviation of beam directions, in both axes")
-    ] = 0.0
-    dropout: Annotated[
-        Share, Field(description="share of returns that are lost, whatever their energy")
-    ] = 0.0
-    detection_range_m: Annotated[
-        Annotated[float, Field(ge=0.001, le=1e8)] | None,
-        Field(
-            description="range at which a surface of 10 % reflectance returns half the pulses; "
-            "weaker returns are lost",
-            examples=[100.0],
-        ),
-    ] = None
-    seed: Annotated[
-        int, Field(ge=0, le=2**63 - 1, description="the same seed gives the same noise")
-    ] = 0
 
-
-class WeatherSection(Section):
+class WeatherSection(Section, Weather):
     """Extinction of the air."""
-
-    visibility_km: Annotated[
-        Annotated[float, Field(ge=0.001, le=1e6)] | None,
-        Field(
-            description="meteorological visibility; by default without extinction",
-            examples=[10.0],
-        ),
-    ] = None
 
 
 class Obstacle(Section):
@@ -519,18 +380,13 @@ class Obstacle(Section):
 
 
 Obstacles = Annotated[
-    tuple[Annotated[Obstacle, _short(_is_text, lambda v: {"object": v}, Text | Obstacle)], ...],
+    tuple[Annotated[Obstacle, short(is_text, lambda v: {"object": v}, Text | Obstacle)], ...],
     Strict(False),
 ]
 
 
-class PlanningSection(Section):
-    """Path planning in the plane, in world coordinates.
-
-    `enabled` is by default whether there are a start and a target. `obstacles` is 'auto' (the
-    bounding circle of each object that is not flat) or a list; `clearance_m` is added to each
-    radius.
-    """
+class _Route:
+    """Fields of a planning that a scenario has in other words than `Planning`."""
 
     enabled: Annotated[
         bool | None,
@@ -546,7 +402,7 @@ class PlanningSection(Section):
     ] = None
     obstacles: Annotated[
         Obstacles | None,
-        _short(lambda v: v == "auto", lambda v: None, Literal["auto"] | Obstacles | None),
+        short(lambda v: v == "auto", lambda v: None, Literal["auto"] | Obstacles | None),
         Field(
             description="bounding circles of all objects that are not flat (auto), or a list",
             examples=["auto", ["Shelf*", {"centre": [-6, -1], "radius_m": 1}]],
@@ -555,17 +411,15 @@ class PlanningSection(Section):
     clearance_m: Annotated[
         float, Field(ge=0, le=1000, description="distance to keep from obstacles, metres")
     ] = 0.0
-    trials: Annotated[
-        int, Field(ge=1, le=1_000_000, description="particle swarms, each with its own seed")
-    ] = 100
-    particles: Annotated[int, Field(ge=1, le=10_000_000, description="of each swarm")] = 1000
-    iterations: Annotated[int, Field(ge=1, le=1_000_000, description="of each swarm")] = 300
-    waypoints: Annotated[
-        int, Field(ge=1, le=100, description="corners of the path between start and target")
-    ] = 5
-    seed: Annotated[
-        int, Field(ge=0, le=2**63 - 1, description="the same seed gives the same path")
-    ] = 0
+
+
+class PlanningSection(Section, Search, _Route):
+    """Path planning in the plane, in world coordinates.
+
+    `enabled` is by default whether there are a start and a target. `obstacles` is 'auto' (the
+    bounding circle of each object that is not flat) or a list; `clearance_m` is added to each
+    radius.
+    """
 
 
 class PoolSection(Section):
@@ -597,7 +451,7 @@ class PoolSection(Section):
 
 def may_be_empty(section: type[Section]) -> Any:
     """Treat a section with all fields commented out as one of defaults."""
-    return _short(lambda v: v is None, lambda v: {}, section | None)
+    return short(lambda v: v is None, lambda v: {}, section | None)
 
 
 def _scene_of(value: str | list[Any] | None) -> dict[str, Any]:
@@ -605,7 +459,7 @@ def _scene_of(value: str | list[Any] | None) -> dict[str, Any]:
 
 
 # Short form of a scene: the name of a mesh file or preset, or a list of files.
-scene_in_short = _short(
+scene_in_short = short(
     lambda v: v is None or isinstance(v, (str, list)),
     _scene_of,
     Text | MeshEntries | SceneSection | None,
