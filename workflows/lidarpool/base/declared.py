@@ -8,6 +8,7 @@ inherits the fields (`lidarpool.scenario.sections`).
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import fields
 from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field, GetPydanticSchema, Strict
@@ -18,6 +19,11 @@ Text = Annotated[str, Field(min_length=1)]
 
 # A field that may be empty in a scenario, because lidarpool then fills it in.
 FILLED_IN = GetPydanticSchema(lambda kind, handler: handler(kind | None))
+
+
+def declared(thing: Any, by: type) -> dict[str, Any]:
+    """Values that a thing has for the fields of one of its bases: {name: value}."""
+    return {field.name: getattr(thing, field.name) for field in fields(by)}
 
 
 def written_as(kind: Any) -> GetPydanticSchema:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import fields, replace
+from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field, PrivateAttr, Strict, ValidationError
 
-from ..base.declared import Text
+from ..base.declared import Text, declared
 from ..base.errors import LidarpoolError, Mistakes
 from ..base.words import counted, did_you_mean
 from ..base.yamlfile import read_yaml
@@ -416,7 +416,7 @@ class Scenario(Section):
                 target=local[1],
                 centres=discs[:, :2],
                 radii=discs[:, 2],
-                **{field.name: getattr(section, field.name) for field in fields(Search)},
+                **declared(section, Search),
             )
 
     def _sensors(self) -> dict[str, Any]:
