@@ -86,7 +86,7 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
         hints = _hints(function)
         for name, value in given.items():
             if name in hints and value is not signature.parameters[name].default:
-                _check(name, value, hints[name])
+                _check(name, value, *hints[name])
         return function(*args, **kwargs)
 
     return refusing
@@ -100,11 +100,13 @@ def checked_fields(cls: C) -> C:
     after: Callable[[Any], None] = getattr(cls, "__post_init__", lambda self: None)
 
     def __post_init__(self: Any) -> None:  # noqa: N807
-        for name, hint in _hints(cls).items():
+        for name, (hint, limits) in _hints(cls).items():
             value = getattr(self, name)
             # Most are of the very type, or what the field is if nobody says otherwise.
-            if type(value) is not hint and value is not getattr(cls, name, inspect.Parameter.empty):
-                _check(name, value, hint)
+            if (limits or type(value) is not hint) and value is not getattr(
+                cls, name, inspect.Parameter.empty
+            ):
+                _check(name, value, hint, limits)
         after(self)
 
     cls.__post_init__ = __post_init__  # type: ignore[attr-defined]
@@ -135,24 +137,23 @@ def _with_article(name: str) -> str:
 
 
 @cache
-def _hints(thing: Any) -> dict[str, Any]:
-    """Annotations that can be checked."""
+def _hints(thing: Any) -> dict[str, tuple[Any, dict[str, Any]]]:
+    """Annotations that can be checked, and the limits of the values: {name: both}."""
     if isinstance(thing, type):
         names = set(thing.__dict__["__dataclass_fields__"])
     else:
         names = {*thing.__annotations__} - {"return"}
-    hints = get_type_hints(thing, include_extras=True)
-    return {name: hints[name] for name in names if _words(hints[name])}
+    hints, declared = get_type_hints(thing), get_type_hints(thing, include_extras=True)
+    return {name: (hints[name], _limits(declared[name])) for name in names if _words(hints[name])}
 
 
-def _check(name: str, value: object, hint: Any) -> None:
+def _check(name: str, value: object, hint: Any, limits: dict[str, Any]) -> None:
     if not _fits(value, hint):
         words = _words(hint)
         such = [_EXAMPLES[word] for word in words.split() if word in _EXAMPLES]
         example = f"[{such[0]}]" if such and words.startswith("a list") else "".join(such[:1])
         words += f", such as {example}" if example else ""
         raise LidarpoolError(f"{name} is {shown(value)}; it must be {words}.")
-    limits = _limits(hint)
     if value is not None and not all(_LIMITS[sign][0](value, at) for sign, at in limits.items()):
         raise LidarpoolError(f"{name} is {shown(value)}; it must be {_range(limits)}.")
 
@@ -171,16 +172,14 @@ def _limits(hint: Any) -> dict[str, Any]:
 
 
 def _range(limits: Mapping[str, Any]) -> str:
-    least, most = limits.get("ge"), limits.get("le")
-    if least is not None and most is not None:
-        return f"{least} to {most}"
-    return ", ".join(f"{_LIMITS[sign][1]} {limit}" for sign, limit in limits.items())
+    numbers = {name: limit if limit % 1 else int(limit) for name, limit in limits.items()}
+    if numbers.keys() == {"ge", "le"}:
+        return f"{numbers['ge']} to {numbers['le']}"
+    return ", ".join(f"{_LIMITS[name][1]} {number}" for name, number in numbers.items())
 
 
 def _fits(value: object, hint: Any) -> bool:
     origin, args = get_origin(hint), get_args(hint)
-    if origin is Annotated:
-        return _fits(value, args[0])
     if origin in (Union, UnionType):
         return any(_fits(value, one) for one in args)
     if origin is Literal:
@@ -206,8 +205,6 @@ def _fits(value: object, hint: Any) -> bool:
 def _words(hint: Any) -> str:
     """Describe allowed values; empty if they are not checked here, such as arrays."""
     origin, args = get_origin(hint), get_args(hint)
-    if origin is Annotated:
-        return _words(args[0])
     if origin in (Union, UnionType):
         words = [_words(one) for one in args]
         return " or ".join(words) if all(words) else ""

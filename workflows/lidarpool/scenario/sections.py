@@ -22,7 +22,9 @@ from ..export.table import EXPORTS, FORMATS, LAYOUTS
 from ..plan.planning import Search
 from ..scene.transform import Transform
 from ..sensor import Material, Noise, Pose, Returns, Sensor
+from ..sensor.beams import Rate, Step
 from ..sensor.models import load_sensor
+from ..sensor.sensor import Fov, Layers, MaxRange, MinRange, RaysPerRevolution
 from ..sensor.survey import CloudOptions, Weather
 
 # Nothing on Earth is farther from the origin of its map.
@@ -184,34 +186,26 @@ class SensorSection(Section):
             description="for an Ouster or a table of beams: azimuths in one turn", examples=[512]
         ),
     ] = None
-    rays_per_revolution: Annotated[
-        int, Field(ge=1, le=10_000_000, description="for a grid: azimuths in one turn")
-    ] = 1000
-    layers: Annotated[int, Field(ge=1, le=65_535, description="for a grid: elevations (rings)")] = (
-        40
-    )
-    vertical_fov_deg: Annotated[
-        float, Field(gt=0, le=180, description="for a grid: degrees, half of it below the horizon")
-    ] = 60.0
-    step_deg: Annotated[
-        float, Field(gt=0, le=360, description="degrees that the head turns in one time step")
-    ] = 10.0
+    rays_per_revolution: RaysPerRevolution = 1000
+    layers: Layers = 40
+    vertical_fov_deg: Fov = 60.0
+    step_deg: Step = 10.0
     rate_hz: Annotated[
-        Annotated[float, Field(gt=0, le=1e6)] | None,
+        Rate | None,
         Field(
             description="turns, lines or frames a second; by default the model's, or 10",
             examples=[20.0],
         ),
     ] = None
     min_range_m: Annotated[
-        Annotated[float, Field(ge=0, le=1e8)] | None,
+        MinRange | None,
         Field(
             description="nearer returns are ignored; by default the model's, or 0",
             examples=[0.5],
         ),
     ] = None
     max_range_m: Annotated[
-        Annotated[float, Field(gt=0, allow_inf_nan=True)] | None,
+        MaxRange | None,
         Field(
             description="farther returns are ignored; by default the model's, or .inf",
             examples=[100.0],
