@@ -16,6 +16,11 @@ from pydantic import BeforeValidator, Field, GetPydanticSchema, Strict
 Share = Annotated[float, Field(ge=0, le=1)]
 Seed = Annotated[int, Field(ge=0, le=2**63 - 1)]
 Text = Annotated[str, Field(min_length=1)]
+# Nothing on Earth is farther from the origin of its map.
+Coordinate = Annotated[float, Field(ge=-1e8, le=1e8)]
+Angle = Annotated[float, Field(ge=-36_000, le=36_000)]
+# YAML has only lists, which strict validation does not accept as tuples.
+Triple = Annotated[tuple[Coordinate, Coordinate, Coordinate], Strict(False)]
 
 # A field that may be empty in a scenario, because lidarpool then fills it in.
 FILLED_IN = GetPydanticSchema(lambda kind, handler: handler(kind | None))

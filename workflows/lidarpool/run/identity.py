@@ -7,11 +7,12 @@ from dataclasses import fields
 
 from ..base.fingerprint import fingerprint
 from ..base.software import software
+from ..scenario.sections import TaskOptions
 from .job import Job
 
 # Fields of a job that do not change a result: a run may go on with others. Every other field is
 # part of its identity, with all of its own fields.
-_MAY_CHANGE = {"backend", "queue_capacity", "collectors", "wait_s", "patience_s"}
+_MAY_CHANGE = {*TaskOptions.__dataclass_fields__, "wait_s", "patience_s"}
 
 
 def identity_of(job: Job) -> dict[str, str]:

@@ -10,36 +10,27 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, Strict, model_validator
 
-from ..base.declared import Text, is_text, short
+from ..base.declared import Text, Triple, is_text, short
 from ..base.errors import LidarpoolError
-from ..sensor import Mounted, Pose, Track, load_trajectory
+from ..sensor import Mounted, Track, load_trajectory
 from ..sensor.materials import SemanticClass
 from ..sensor.survey import Steps
 from ..sensor.trajectory_files import FORMATS, quaternions_from_degrees
 from .sections import (
-    Angle,
     MeshEntry,
     PoseSection,
     Section,
     SensorSection,
-    Triple,
 )
 
 Seconds = Annotated[float, Field(ge=-1e11, le=1e11)]
 Duration = Annotated[float, Field(gt=0, le=1e9)]
 
 
-class MountSection(Section):
+class MountSection(PoseSection):
     """Position and angles of a sensor on its carrier, in the carrier's axes."""
 
     position: Annotated[Triple, Field(description="x, y and z, metres")] = (0, 0, 0)
-    yaw_deg: Annotated[Angle, Field(description="rotation about z, first")] = 0.0
-    pitch_deg: Annotated[Angle, Field(description="rotation about the new y, second")] = 0.0
-    roll_deg: Annotated[Angle, Field(description="rotation about the new x, last")] = 0.0
-
-    def pose(self) -> Pose:
-        """Return it as a pose."""
-        return Pose(self.position, self.yaw_deg, self.pitch_deg, self.roll_deg)
 
 
 class CarriedSection(SensorSection):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -16,7 +17,7 @@ from pydantic import (
 )
 
 from ..base.arguments import shown
-from ..base.declared import Text, is_text, short
+from ..base.declared import Angle, Coordinate, Text, Triple, declared, is_text, short
 from ..base.vocabulary import BACKENDS
 from ..export.table import EXPORTS, FORMATS, LAYOUTS
 from ..plan.planning import Search
@@ -27,13 +28,8 @@ from ..sensor.models import load_sensor
 from ..sensor.sensor import Fov, Layers, MaxRange, MinRange, RaysPerRevolution
 from ..sensor.survey import CloudOptions, Weather
 
-# Nothing on Earth is farther from the origin of its map.
-Coordinate = Annotated[float, Field(ge=-1e8, le=1e8)]
-Angle = Annotated[float, Field(ge=-36_000, le=36_000)]
 Factor = Annotated[float, Field(ge=-1e9, le=1e9)]
-# YAML has only lists, which strict validation does not accept as tuples.
 Pair = Annotated[tuple[Coordinate, Coordinate], Strict(False)]
-Triple = Annotated[tuple[Coordinate, Coordinate, Coordinate], Strict(False)]
 Angles = Annotated[tuple[Angle, Angle, Angle], Strict(False)]
 Factors = Annotated[tuple[Factor, Factor, Factor], Strict(False)]
 Row = Annotated[tuple[Factor, Factor, Factor, Factor], Strict(False)]
@@ -253,17 +249,12 @@ _GRID = {  # {field of a grid: its default}
 }
 
 
-class PoseSection(Section):
+class PoseSection(Section, Pose):
     """Pose of the sensor, in world coordinates."""
-
-    position: Annotated[Triple, Field(description="x, y and z, metres")]
-    yaw_deg: Annotated[Angle, Field(description="rotation about z, first")] = 0.0
-    pitch_deg: Annotated[Angle, Field(description="rotation about the new y, second")] = 0.0
-    roll_deg: Annotated[Angle, Field(description="rotation about the new x, last")] = 0.0
 
     def pose(self) -> Pose:
         """Return the pose, world coordinates."""
-        return Pose(self.position, self.yaw_deg, self.pitch_deg, self.roll_deg)
+        return Pose(**declared(self, Pose))
 
 
 def _pose(value: Any) -> Any:
@@ -416,12 +407,22 @@ class PlanningSection(Section, Search, _Route):
     """
 
 
-class PoolSection(Section):
-    """The partitions and their tasks; default sizes depend on the machine.
+@dataclass(frozen=True, kw_only=True)
+class TaskOptions:
+    """Tasks of a run, on whatever cluster."""
 
-    `gpu` and `other` set the workers of a local cluster, not of one that is running already.
-    `collectors` and `queue_capacity` apply to both.
-    """
+    collectors: Annotated[int, Field(ge=1, le=64, description="tasks that write the parts")] = 2
+    queue_capacity: Annotated[
+        int, Field(ge=1, le=100_000, description="how many items stage 1 may be ahead of stage 2")
+    ] = 10
+    backend: Annotated[
+        Literal[BACKENDS],  # type: ignore[valid-type]
+        Field(description="cuda, embree or numpy; auto takes the fastest available"),
+    ] = "auto"
+
+
+class _Workers:
+    """Workers of a local cluster."""
 
     gpu: Annotated[
         Annotated[int, Field(ge=1, le=10_000)] | None,
@@ -433,14 +434,14 @@ class PoolSection(Section):
             description="workers that plan paths; by default by the number of cores", examples=[1]
         ),
     ] = None
-    collectors: Annotated[int, Field(ge=1, le=64, description="tasks that write the parts")] = 2
-    queue_capacity: Annotated[
-        int, Field(ge=1, le=100_000, description="how many items stage 1 may be ahead of stage 2")
-    ] = 10
-    backend: Annotated[
-        Literal[BACKENDS],  # type: ignore[valid-type]
-        Field(description="cuda, embree or numpy; auto takes the fastest available"),
-    ] = "auto"
+
+
+class PoolSection(Section, TaskOptions, _Workers):
+    """The partitions and their tasks; default sizes depend on the machine.
+
+    `gpu` and `other` set the workers of a local cluster, not of one that is running already.
+    `collectors` and `queue_capacity` apply to both.
+    """
 
 
 def may_be_empty(section: type[Section]) -> Any:
