@@ -102,10 +102,7 @@ def checked_fields(cls: C) -> C:
     def __post_init__(self: Any) -> None:  # noqa: N807
         for name, (hint, limits) in _hints(cls).items():
             value = getattr(self, name)
-            # Most are of the very type, or what the field is if nobody says otherwise.
-            if (limits or type(value) is not hint) and value is not getattr(
-                cls, name, inspect.Parameter.empty
-            ):
+            if value is not getattr(cls, name, inspect.Parameter.empty):
                 _check(name, value, hint, limits)
         after(self)
 
@@ -148,14 +145,15 @@ def _hints(thing: Any) -> dict[str, tuple[Any, dict[str, Any]]]:
 
 
 def _check(name: str, value: object, hint: Any, limits: dict[str, Any]) -> None:
-    if not _fits(value, hint):
+    if type(value) is not hint and not _fits(value, hint):  # most are of the very type
         words = _words(hint)
         such = [_EXAMPLES[word] for word in words.split() if word in _EXAMPLES]
         example = f"[{such[0]}]" if such and words.startswith("a list") else "".join(such[:1])
         words += f", such as {example}" if example else ""
         raise LidarpoolError(f"{name} is {shown(value)}; it must be {words}.")
-    if value is not None and not all(_LIMITS[sign][0](value, at) for sign, at in limits.items()):
-        raise LidarpoolError(f"{name} is {shown(value)}; it must be {_range(limits)}.")
+    for limit in limits if value is not None else ():
+        if not _LIMITS[limit][0](value, limits[limit]):  # nor NaN
+            raise LidarpoolError(f"{name} is {shown(value)}; it must be {_range(limits)}.")
 
 
 def _limits(hint: Any) -> dict[str, Any]:
