@@ -18,7 +18,7 @@ from pydantic import (
 
 from ..base.arguments import shown
 from ..base.declared import Angle, Coordinate, Text, Triple, declared, is_text, short
-from ..base.vocabulary import BACKENDS
+from ..base.vocabulary import BACKENDS, UNITS_M
 from ..export.table import EXPORTS, FORMATS, LAYOUTS
 from ..plan.planning import Search
 from ..scene.transform import Transform
@@ -58,7 +58,7 @@ class MeshFile(Section):
         ),
     ]
     unit: Annotated[
-        Literal["um", "mm", "cm", "dm", "m", "km", "in", "ft", "yd", "mi"] | None,
+        Literal[tuple(UNITS_M)] | None,  # type: ignore[valid-type]
         Field(description="length unit of the file; by default the one it states, else metres"),
     ] = None
     up_axis: Annotated[
@@ -371,7 +371,7 @@ Obstacles = Annotated[
 
 
 class _Route:
-    """Fields of a planning that a scenario has in other words than `Planning`."""
+    """Fields of a planning that a scenario has in other words than `Planning`; they come first."""
 
     enabled: Annotated[
         bool | None,
@@ -422,7 +422,7 @@ class TaskOptions:
 
 
 class _Workers:
-    """Workers of a local cluster."""
+    """Workers of a local cluster; they come first."""
 
     gpu: Annotated[
         Annotated[int, Field(ge=1, le=10_000)] | None,

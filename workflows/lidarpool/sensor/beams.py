@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property
-from typing import Annotated, Protocol
+from typing import Annotated, Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -118,6 +118,9 @@ Step = Annotated[
     float, Field(gt=0, le=360, description="degrees that the head turns in one time step")
 ]
 Rate = Annotated[float, Field(gt=0, le=1e6)]
+Motion = Literal["sine", "triangle", "sawtooth"]
+Width = Annotated[float, Field(gt=0, le=360)]
+Duty = Annotated[float, Field(gt=0, le=1)]
 
 
 @dataclass(frozen=True)
@@ -211,6 +214,7 @@ class Spin:
 
 
 @dataclass(frozen=True)
+@checked_fields
 class Mirror(Spin):
     """A mirror that sweeps the beams over a line, to and fro or in one direction.
 
@@ -227,9 +231,9 @@ class Mirror(Spin):
         Share of each cycle in which it fires: a polygon's facets cover more than is used.
     """
 
-    motion: str = "triangle"
-    width_deg: float = 60.0
-    duty: float = 1.0
+    motion: Motion = "triangle"
+    width_deg: Width = 60.0
+    duty: Duty = 1.0
 
     def times_ns(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
         """See `Head.times_ns`."""

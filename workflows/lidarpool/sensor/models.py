@@ -19,7 +19,7 @@ from ..base.arguments import checked
 from ..base.errors import LidarpoolError
 from ..base.words import did_you_mean
 from ..base.yamlfile import load_yaml
-from .beams import Beams, Mirror, Rate, Spin, Step
+from .beams import Beams, Duty, Mirror, Motion, Rate, Spin, Step, Width
 from .calibrations import Calibration, read_calibration, said
 from .optics import Optics
 from .rays import ListedSensor, Prism, PrismSensor
@@ -84,9 +84,9 @@ class BeamTable(_Part):
 class MirrorPart(_Part):
     """See `Mirror`."""
 
-    motion: Literal["sine", "triangle", "sawtooth"]
-    width_deg: Annotated[float, Field(gt=0, le=360)]
-    duty: Annotated[float, Field(gt=0, le=1)] = 1.0
+    motion: Motion
+    width_deg: Width
+    duty: Duty = 1.0
 
 
 class PrismPart(_Part, Prism):
