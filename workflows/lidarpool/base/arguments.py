@@ -62,7 +62,7 @@ _LIMITS: dict[str, tuple[Callable[[Any, Any], bool], str]] = {
     "gt": (operator.gt, "above"),
     "le": (operator.le, "at most"),
     "lt": (operator.lt, "below"),
-    "min_length": (lambda value, least: len(value) >= least, "at least of length"),
+    "min_length": (lambda value, least: len(value) >= least, "of length at least"),
 }
 _PLAIN = (*(kind for kind in _KINDS if kind is not Path), list, tuple, dict, bytes)
 

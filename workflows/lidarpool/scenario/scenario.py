@@ -252,7 +252,7 @@ class Scenario(Section):
             if section.calibration is None:
                 with mistakes.noted(), self._named():
                     sensor = section.sensor(self._folder)
-                    Returns(**dict(self.returns)).of(sensor.optics)
+                    self.returns.of(sensor.optics)
         entries = [*self.scene.files, *(actor.file for actor in self.actors if actor.file)]
         files = [entry.file for entry in entries]
         files += [one for one in (self.trajectory and self.trajectory.file,) if one]
