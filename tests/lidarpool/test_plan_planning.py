@@ -59,3 +59,7 @@ def test_the_description_does_not_change():
     assert planning.centres.tolist() == [[0, 0]]
     with pytest.raises(ValueError, match="read-only"):
         planning.centres[:] = 1
+
+
+def test_plannings_of_the_same_effort_are_not_the_same():
+    assert Planning((0, 0), (1, 1)) != Planning((0, 0), (2, 2))

@@ -17,7 +17,7 @@ from ..base.errors import LidarpoolError
 from .geometry import Floats, segment_distances
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Search:
     """Effort of a search by particle swarms.
 

@@ -15,16 +15,13 @@ from ..base.errors import LidarpoolError
 from ..sensor import Mounted, Track, load_trajectory
 from ..sensor.materials import SemanticClass
 from ..sensor.survey import Steps
-from ..sensor.trajectory_files import FORMATS, quaternions_from_degrees
+from ..sensor.trajectory_files import Duration, Seconds, TrajectoryFormat, quaternions_from_degrees
 from .sections import (
     MeshEntry,
     PoseSection,
     Section,
     SensorSection,
 )
-
-Seconds = Annotated[float, Field(ge=-1e11, le=1e11)]
-Duration = Annotated[float, Field(gt=0, le=1e9)]
 
 
 class MountSection(PoseSection):
@@ -66,7 +63,7 @@ class TrajectorySection(Section):
         Field(description="TUM, KITTI or .csv, from the scenario's folder", examples=["drive.tum"]),
     ] = None
     format: Annotated[
-        Literal[FORMATS] | None,  # type: ignore[valid-type]
+        TrajectoryFormat | None,
         Field(description="by default kitti with times, csv for a .csv, else tum"),
     ] = None
     times: Annotated[Text | None, Field(description="for KITTI poses: the file of times")] = None

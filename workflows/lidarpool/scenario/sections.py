@@ -407,7 +407,7 @@ class PlanningSection(Section, Search, _Route):
     """
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class TaskOptions:
     """Tasks of a run, on whatever cluster."""
 
