@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
+from dataclasses import is_dataclass
 from importlib import import_module
-from typing import Any
+from typing import Any, get_type_hints
 
 import click
 import numpy as np
+from pydantic import TypeAdapter
+from pydantic.warnings import UnsupportedFieldAttributeWarning
 
 from lidarpool.cli.commands import cli
 from lidarpool.columns.ply_format import held_type
@@ -61,8 +65,23 @@ def members_page(package: str) -> str:
     if not names.issuperset(first):
         raise ValueError(f"{package} has none of these names: {set(first) - names}")
     parts = [f"# `{package}`\n\n{module.__doc__}\n"]
-    parts += [f"::: {package}.{name}\n" for name in (*first, *sorted(names - {*first}))]
+    for name in (*first, *sorted(names - {*first})):
+        parts += [f"::: {package}.{name}\n", *_declared(getattr(module, name))]
     return "\n".join(parts)
+
+
+def _declared(member: Any) -> Iterator[str]:
+    """Table of the fields that a dataclass declares with a description, if there are any."""
+    hints = get_type_hints(member, include_extras=True) if is_dataclass(member) else {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UnsupportedFieldAttributeWarning)  # an alias in scenarios
+        fields = {
+            name: {"default": getattr(member, name, None), **TypeAdapter(hint).json_schema()}
+            for name, hint in hints.items()
+            if any(getattr(note, "description", "") for note in getattr(hint, "__metadata__", ()))
+        }
+    if fields:
+        yield _table(fields)
 
 
 def command_page() -> str:

@@ -81,7 +81,7 @@ WRONG = {
         (905, None, None, "pulse_ns"),
     ],
     Planning: [
-        ("a", "two finite"),
+        ("a", "start is 'a'"),
         ((0, 0),
         (1, 1), [(1, 2, 3)], "(m, 2)"),
         ((0, 0), 5, "target is 5"),
@@ -134,10 +134,9 @@ WRONG = {
         (GRID, [1, 2, 3], "such as [(0, 0, 1)]"),
         ("velodyne/vlp16", AT, "load_sensor('velodyne/vlp16')"),
         (GRID, AT, "36", "whole number or None"),
-        (GRID, AT, 36, 1, 0.01, "time", "columns is 'time'; it must be a list of text or a Column"),
-        (GRID, (), 36, 1, 0.01, (), "drive.tum", "load_trajectory('drive.tum')"),
-        (GRID, AT, 36, 1, 0.01, (), None, [GRID], "[Mounted("),
-        (GRID, AT, 36, 1, 0.01, (), None, (), "world", ["glass"], "[Material("),
+        (GRID, (), 36, "drive.tum", "load_trajectory('drive.tum')"),
+        (GRID, AT, 36, None, [GRID], "[Mounted("),
+        (GRID, AT, 36, None, (), ["glass"], "[Material("),
     ],
     Track: [
         ("a", "b", "times_s is 'a'"),
@@ -167,6 +166,20 @@ def test_it_is_told_what_is_expected(call, arguments, says):
         call(*arguments)
     assert says in str(raised.value)
     assert len(str(raised.value).splitlines()) <= 2 and len(str(raised.value)) < 320
+
+
+def test_options_of_a_survey_are_checked_too():
+    for options, says in (
+        ({"columns": "time"}, "columns is 'time'; it must be a list of text or a Column"),
+        ({"keep_every": 0}, "keep_every is 0; it must be 1 to 1000000"),
+        ({"precision_m": "fine"}, "precision_m is 'fine'; it must be a number"),
+        ({"visibility_km": float("nan")}, "visibility_km is nan"),
+        ({"epsg": 25832.5}, "epsg is 25832.5; it must be a whole number or None"),
+        ({"coordinates": "map"}, "coordinates is 'map'; it must be one of world, sensor"),
+    ):
+        with pytest.raises(LidarpoolError) as raised:
+            Survey(poses=AT, **options)
+        assert says in str(raised.value)
 
 
 def test_nothing_public_is_left_out():

@@ -110,7 +110,7 @@ def test_an_unfinished_run_is_to_be_gone_on_with(tmp_path):
 def test_a_run_is_watched_from_its_first_part_to_its_path():
     planning = Planning((25, 25), (-30, -20), [(0, 0)], 2.0, trials=2, iterations=20)
     survey = Survey(poses=[(0, 0, 1), (0, 0, 3)], columns=["intensity", WETNESS])
-    job = Job(SCENE, survey, planning, "numpy")
+    job = Job(SCENE, survey, planning, backend="numpy")
     shown, busy, scans, words = [], set(), [], []
     with (
         thread_cluster({"GPU": 1}, {"LIDAR": 4}, {"OTHER": 1}) as cluster,

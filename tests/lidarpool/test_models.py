@@ -345,7 +345,7 @@ OWN = "name: Own\nsources: {}\n"
 BAD = {
     "field.yaml": (GOOD + "firing_us: 5\nrage_m: [0, 1]", "rage_m: this is not a field"),
     "optic.yaml": (GOOD + "firing_us: 5\noptics: {wavelenght_nm: 9}", "mean 'wavelength_nm'"),
-    "light.yaml": (GOOD + "firing_us: 5\noptics: {wavelength_nm: 0.9}", "light.* is 0.9; it must"),
+    "light.yaml": (GOOD + "firing_us: 5\noptics: {wavelength_nm: 0.9}", "wavelength_nm.*200"),
     "both.yaml": (GOOD + "firing_us: 5\nfirings_per_turn: 5", "either firing_us or"),
     "mirror.yaml": (GOOD + "firing_us: 5\nmirror: {motion: x, width_deg: 9}", "mirror.motion: Inp"),
     "zero.yaml": (GOOD + "firing_us: 0\nbeams: {elevation_deg: [0]}", "firing_us: Input should be"),

@@ -6,7 +6,7 @@ import errno
 import gc
 import sqlite3
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import fields, make_dataclass, replace
 
 import numpy as np
 import pytest
@@ -120,6 +120,33 @@ def test_another_run_cannot_go_on(other, unfinished):
             RunStore(OTHERS[other], unfinished, resume=resume)
     remove_run(unfinished)
     RunStore(OTHERS[other], unfinished).db.close()
+
+
+def with_another_field(thing, value):
+    """Make the same thing of a class with one field more."""
+    later = make_dataclass("Later", [("gain", float, 1.0)], bases=(type(thing),), frozen=True)
+    kept = {field.name: getattr(thing, field.name) for field in fields(thing) if field.init}
+    return later(**kept, gain=value)
+
+
+@pytest.mark.parametrize("at", ["survey", "noise", "sensor", "scene", "planning", "job"])
+def test_a_field_that_comes_later_is_part_of_the_identity(at, folder):
+    def job(gain):
+        base = replace(JOB, planning=PLANNING)
+        if at == "job":
+            return with_another_field(base, gain)
+        if at in ("noise", "sensor"):
+            inner = with_another_field(getattr(SURVEY, at), gain)
+            return replace(base, survey=replace(SURVEY, **{at: inner}))
+        return replace(base, **{at: with_another_field(getattr(base, at), gain)})
+
+    store = RunStore(job(1.0), folder)
+    store.backend = "numpy"
+    add(store, 0, 2)
+    store.db.close()
+    with pytest.raises(LidarpoolError, match="cannot be continued"):
+        RunStore(job(2.0), folder, resume=True)
+    RunStore(job(1.0), folder, resume=True).db.close()
 
 
 def test_another_version_cannot_go_on(unfinished, monkeypatch):

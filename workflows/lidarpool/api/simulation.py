@@ -126,11 +126,11 @@ def simulate(
         scene,
         survey,
         planning,
-        backend,
-        queue_capacity,
-        collectors,
-        wait_s,
-        patience_s,
+        backend=backend,
+        queue_capacity=queue_capacity,
+        collectors=collectors,
+        wait_s=wait_s,
+        patience_s=patience_s,
     )
     if client is None:  # before anything is made in the folder
         check_backend_here(backend)

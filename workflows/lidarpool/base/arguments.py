@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import operator
 import os
 import reprlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -10,7 +11,17 @@ from functools import cache, wraps
 from numbers import Integral, Real
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    ParamSpec,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -45,6 +56,14 @@ _EXAMPLES = {
     "Survey": "Survey(poses=[(0, 0, 1)])",
     "Trajectory": "load_trajectory('drive.tum')",
 }
+# Limits of a field: {as pydantic's `Field` has it: (whether a value fits, in words)}
+_LIMITS: dict[str, tuple[Callable[[Any, Any], bool], str]] = {
+    "ge": (operator.ge, "at least"),
+    "gt": (operator.gt, "above"),
+    "le": (operator.le, "at most"),
+    "lt": (operator.lt, "below"),
+    "min_length": (lambda value, least: len(value) >= least, "of length at least"),
+}
 _PLAIN = (*(kind for kind in _KINDS if kind is not Path), list, tuple, dict, bytes)
 
 
@@ -67,7 +86,7 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
         hints = _hints(function)
         for name, value in given.items():
             if name in hints and value is not signature.parameters[name].default:
-                _check(name, value, hints[name])
+                _check(name, value, *hints[name])
         return function(*args, **kwargs)
 
     return refusing
@@ -81,11 +100,10 @@ def checked_fields(cls: C) -> C:
     after: Callable[[Any], None] = getattr(cls, "__post_init__", lambda self: None)
 
     def __post_init__(self: Any) -> None:  # noqa: N807
-        for name, hint in _hints(cls).items():
+        for name, (hint, limits) in _hints(cls).items():
             value = getattr(self, name)
-            # Most are of the very type, or what the field is if nobody says otherwise.
-            if type(value) is not hint and value is not getattr(cls, name, inspect.Parameter.empty):
-                _check(name, value, hint)
+            if value is not getattr(cls, name, inspect.Parameter.empty):
+                _check(name, value, hint, limits)
         after(self)
 
     cls.__post_init__ = __post_init__  # type: ignore[attr-defined]
@@ -116,23 +134,46 @@ def _with_article(name: str) -> str:
 
 
 @cache
-def _hints(thing: Any) -> dict[str, Any]:
-    """Annotations that can be checked."""
+def _hints(thing: Any) -> dict[str, tuple[Any, dict[str, Any]]]:
+    """Annotations that can be checked, and the limits of the values: {name: both}."""
     if isinstance(thing, type):
         names = set(thing.__dict__["__dataclass_fields__"])
-        hints = {name: hint for name, hint in get_type_hints(thing).items() if name in names}
     else:
-        hints = {name: hint for name, hint in get_type_hints(thing).items() if name != "return"}
-    return {name: hint for name, hint in hints.items() if _words(hint)}
+        names = {*thing.__annotations__} - {"return"}
+    hints, declared = get_type_hints(thing), get_type_hints(thing, include_extras=True)
+    return {name: (hints[name], _limits(declared[name])) for name in names if _words(hints[name])}
 
 
-def _check(name: str, value: object, hint: Any) -> None:
-    if not _fits(value, hint):
+def _check(name: str, value: object, hint: Any, limits: dict[str, Any]) -> None:
+    if type(value) is not hint and not _fits(value, hint):  # most are of the very type
         words = _words(hint)
         such = [_EXAMPLES[word] for word in words.split() if word in _EXAMPLES]
         example = f"[{such[0]}]" if such and words.startswith("a list") else "".join(such[:1])
         words += f", such as {example}" if example else ""
         raise LidarpoolError(f"{name} is {shown(value)}; it must be {words}.")
+    for limit in limits if value is not None else ():
+        if not _LIMITS[limit][0](value, limits[limit]):  # nor NaN
+            raise LidarpoolError(f"{name} is {shown(value)}; it must be {_range(limits)}.")
+
+
+def _limits(hint: Any) -> dict[str, Any]:
+    """Limits in an annotation, as pydantic's `Field` has them: {name: limit}."""
+    args = get_args(hint)
+    inner = args[:1] if get_origin(hint) is Annotated else args
+    if get_origin(hint) not in (Annotated, Union, UnionType):
+        return {}
+    limits = {name: limit for one in inner for name, limit in _limits(one).items()}
+    for note in getattr(hint, "__metadata__", ()):
+        for limit in getattr(note, "metadata", ()):
+            limits |= {name: getattr(limit, name) for name in _LIMITS if hasattr(limit, name)}
+    return limits
+
+
+def _range(limits: Mapping[str, Any]) -> str:
+    numbers = {name: limit if limit % 1 else int(limit) for name, limit in limits.items()}
+    if numbers.keys() == {"ge", "le"}:
+        return f"{numbers['ge']} to {numbers['le']}"
+    return ", ".join(f"{_LIMITS[name][1]} {number}" for name, number in numbers.items())
 
 
 def _fits(value: object, hint: Any) -> bool:
@@ -166,7 +207,7 @@ def _words(hint: Any) -> str:
         words = [_words(one) for one in args]
         return " or ".join(words) if all(words) else ""
     if origin is Literal:
-        return f"one of {', '.join(args)}"
+        return f"one of {', '.join(map(str, args))}"
     if origin in (Sequence, Iterable, tuple):
         of = _words(args[0]).removeprefix("a ").replace("number", "numbers")
         return f"a list of {of}" if of else ""

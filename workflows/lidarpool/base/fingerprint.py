@@ -11,6 +11,7 @@ import hashlib
 import reprlib
 import types
 from collections.abc import Mapping, Set
+from datetime import datetime
 from fractions import Fraction
 from functools import cached_property, partial
 from pathlib import PurePath
@@ -88,6 +89,8 @@ class _Digest:
         if isinstance(thing, _PLAIN):
             # repr writes each float with enough digits to identify it.
             self._mark(type(thing).__name__, repr(thing))
+        elif isinstance(thing, datetime):
+            self._mark("datetime", thing.isoformat())
         elif isinstance(thing, np.ndarray):
             if thing.dtype.hasobject:
                 raise _refusal(thing)

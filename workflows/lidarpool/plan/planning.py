@@ -5,18 +5,40 @@ from __future__ import annotations
 import reprlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from numbers import Integral
-from typing import Any
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import Field
 
+from ..base.arguments import checked_fields
+from ..base.declared import Seed
 from ..base.errors import LidarpoolError
 from .geometry import Floats, segment_distances
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Search:
+    """Effort of a search by particle swarms.
+
+    More waypoints let a path turn about more discs; the time is proportional to them, and the
+    swarms converge more slowly.
+    """
+
+    trials: Annotated[
+        int, Field(ge=1, le=1_000_000, description="particle swarms, each with its own seed")
+    ] = 100
+    particles: Annotated[int, Field(ge=1, le=10_000_000, description="of each swarm")] = 1000
+    iterations: Annotated[int, Field(ge=1, le=1_000_000, description="of each swarm")] = 300
+    waypoints: Annotated[
+        int, Field(ge=1, le=100, description="corners of the path between start and target")
+    ] = 5
+    seed: Annotated[Seed, Field(description="the same seed gives the same path")] = 0
+
+
 @dataclass(frozen=True, eq=False)
-class Planning:
+@checked_fields
+class Planning(Search):
     """Search for a path in the plane from `start` to `target` that enters no disc.
 
     It uses `trials` independent particle swarms; see `run_trial`.
@@ -29,17 +51,9 @@ class Planning:
         Centres of the discs to keep out of: (m, 2), metres; m may be 0.
     radii
         Their radii in metres, above 0: (m,), or one number for all.
-    trials
-        Swarms to run, each with its own seed.
-    particles
-        Particles of a swarm; each is one path.
-    iterations
-        Moves of the particles of a swarm.
-    waypoints
-        Corners of a path between its two ends, so the number of discs that it can turn about. The
-        time is proportional to them, and more corners converge more slowly.
-    seed
-        0 or above. The same seed gives the same plan, to the bit, wherever the trials run.
+    **search
+        The fields of `Search`. The same seed gives the same plan, to the bit, wherever the trials
+        run.
 
     Raises
     ------
@@ -58,16 +72,8 @@ class Planning:
     target: tuple[float, float] = (-30.0, -20.0)
     centres: Floats = field(default_factory=lambda: np.empty((0, 2)))  # (m, 2), metres
     radii: Floats = field(default_factory=lambda: np.empty(0))  # (m,), metres
-    trials: int = 100
-    particles: int = 1000
-    iterations: int = 300
-    waypoints: int = 5
-    seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("trials", "particles", "iterations", "waypoints"):
-            _check_count(name, getattr(self, name), least=1)
-        _check_count("seed", self.seed, least=0)
         start, target = _point("start", self.start), _point("target", self.target)
         if start == target:
             raise LidarpoolError(
@@ -94,13 +100,6 @@ class Planning:
             ("start", start), ("target", target), ("centres", centres), ("radii", radii)
         ):  # fmt: skip
             object.__setattr__(self, name, value)
-
-
-def _check_count(name: str, value: Any, least: int) -> None:
-    if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
-        raise LidarpoolError(
-            f"planning: {name} is {value!r}; it must be a whole number, at least {least}."
-        )
 
 
 def _point(name: str, value: ArrayLike) -> tuple[float, float]:

@@ -13,13 +13,16 @@ from typing import Any
 import numpy as np
 
 from .._version import __version__
+from ..base.declared import declared
 from ..base.storage import Storage
 from ..base.task_book import StageTotals, union
 from ..pipeline import COLLECT, EXPORT, GENERATE, INTERSECT, SORT
+from ..plan.planning import Search
 from ..run.result import RunResult
 from ..run.trials import TRIAL
 from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
+from ..sensor.survey import CloudOptions, Weather
 from .cloud_numbers import CountedCloud
 
 ELEVATION_RAYS = 20_000  # whose elevations are examined
@@ -111,6 +114,8 @@ def summary(folder: Path | Storage, report: dict[str, Any]) -> dict[str, Any]:
 
 
 def _parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
+    options = declared(survey, CloudOptions) | declared(survey, Weather)
+    del options["columns"]  # which have a table of their own
     return {
         "objects": len(scene.all_names),
         "triangles": scene.triangles,
@@ -122,14 +127,10 @@ def _parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
         "duration_s": survey.duration_ns / 1e9,
         "trajectory_s": survey.duration_ns / 1e9 if survey.path.moves else None,
         "steps": survey.steps_each[0],
-        "coordinates": survey.coordinates,
-        "keep_every": survey.keep_every,
-        "precision_m": survey.precision_m,
         "materials": len(survey.materials),
         "returns": asdict(survey.returns),
         "noise": asdict(survey.noise),
-        "visibility_km": survey.visibility_km,
-        "epsg": survey.epsg,
+        **options,
         "start": None if survey.start is None else survey.start.isoformat(),
     }
 
@@ -214,11 +215,9 @@ def _planning(result: RunResult) -> dict[str, Any] | None:
         "start": (planning.start + origin).tolist(),
         "target": (planning.target + origin).tolist(),
         "obstacles": len(planning.radii),
+        **declared(planning, Search),
         "trials": plan.trials,
         "collision_free_trials": sum(trial.collision_free for trial in result.trials),
-        "particles": planning.particles,
-        "iterations": planning.iterations,
-        "seed": planning.seed,
         "best_trial": plan.trial,
         "best_length": plan.length,
         "shortest_possible": _finite(plan.shortest_possible),

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import fields
 
 from ..base.fingerprint import fingerprint
 from ..base.software import software
+from ..scenario.sections import TaskOptions
 from .job import Job
 
-_CONTENT = ("scene", "survey", "planning")
+# Fields of a job that do not change a result: a run may go on with others. Every other field is
+# part of its identity, with all of its own fields.
+_MAY_CHANGE = {*TaskOptions.__dataclass_fields__, "wait_s", "patience_s"}
 
 
 def identity_of(job: Job) -> dict[str, str]:
@@ -21,36 +25,15 @@ def identity_of(job: Job) -> dict[str, str]:
     LidarpoolError
         If a sensor, column or trajectory has a field without a fingerprint.
     """
-    scene, survey = job.scene, job.survey
-    return {
-        **software(),
-        "scene": fingerprint(
-            scene.vertices, scene.faces, scene.face_object, scene.origin, scene.names, scene.actors
-        ),
-        "survey": fingerprint(
-            survey.carried,
-            survey.path,
-            survey.steps_each,
-            survey.coordinates,
-            survey.keep_every,
-            survey.precision_m,
-            survey.columns,
-            survey.materials,
-            survey.returns,
-            survey.noise,
-            survey.visibility_km,
-            survey.epsg,
-            str(survey.start),
-        ),
-        "planning": "" if job.planning is None else fingerprint(job.planning),
-    }
+    names = [field.name for field in fields(job) if field.name not in _MAY_CHANGE]
+    return software() | {name: fingerprint(getattr(job, name)) for name in names}
 
 
 def difference(here: Mapping[str, str], there: Mapping[str, str]) -> str:
     """Describe the difference of an earlier run in a clause; empty if there is none."""
     for name, value in here.items():
         if there.get(name) != value:
-            if name in _CONTENT:
+            if name in Job.__dataclass_fields__:
                 return f"it is of another {name}"
             return f"it was written with {name} {there.get(name, 'none')}, here it is {value}"
     return ""

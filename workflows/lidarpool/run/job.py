@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
-from ..base.errors import LidarpoolError, Mistakes
+from pydantic import Field
+
+from ..base.arguments import checked_fields
+from ..base.declared import declared
+from ..base.errors import Mistakes
 from ..base.vocabulary import PATIENCE_S, WAIT_S
 from ..plan import Planning
 from ..scenario.scenario import Scenario
+from ..scenario.sections import TaskOptions
 from ..scene.scene import Scene
 from ..sensor import Survey
 from ..sensor.materials import MaterialTable
@@ -16,19 +21,14 @@ from .checks import check_precision
 
 
 @dataclass(frozen=True, eq=False)
-class Job:
+@checked_fields
+class Job(TaskOptions):
     """A survey, possibly a planning, and how to run both.
 
     Parameters
     ----------
     scene, survey, planning
         The scene, how to scan it, and what to plan.
-    backend
-        Ray-casting backend of stage 2: auto, cuda, embree or numpy.
-    queue_capacity
-        How many items stage 1 may be ahead of stage 2.
-    collectors
-        Tasks of stage 4.
     wait_s
         How long to wait for partitions that are empty at the start, seconds.
     patience_s
@@ -44,23 +44,14 @@ class Job:
     scene: Scene
     survey: Survey
     planning: Planning | None = None
-    backend: str = "auto"
-    queue_capacity: int = 10
-    collectors: int = 2
-    wait_s: float = WAIT_S
-    patience_s: float = PATIENCE_S
+    wait_s: Annotated[float, Field(ge=0)] = WAIT_S
+    patience_s: Annotated[float, Field(ge=0)] = PATIENCE_S
 
     def __post_init__(self) -> None:
         MaterialTable.of(self.survey.materials, self.scene.all_names)  # that they fit
         for actor in self.scene.actors:
             actor.check(0.0, self.survey.duration_ns)
         check_precision(self.scene, self.survey)
-        limits = {"queue_capacity": 1, "collectors": 1, "wait_s": 0, "patience_s": 0}
-        for name, least in limits.items():
-            if not getattr(self, name) >= least:  # nor NaN
-                raise LidarpoolError(
-                    f"{name} is {getattr(self, name)}; it must be at least {least}."
-                )
 
     @property
     def trials(self) -> int:
@@ -87,12 +78,5 @@ def make_job(
         planning = None if no_plan else scenario.plan(scene)
     mistakes.tell()
     assert survey is not None, "a survey without mistakes"
-    return Job(
-        scene,
-        survey,
-        planning,
-        backend or scenario.pool.backend,
-        scenario.pool.queue_capacity,
-        scenario.pool.collectors,
-        **options,
-    )
+    tasks = declared(scenario.pool, TaskOptions) | ({"backend": backend} if backend else {})
+    return Job(scene, survey, planning, **tasks, **options)

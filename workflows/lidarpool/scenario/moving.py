@@ -10,23 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, Strict, model_validator
 
+from ..base.declared import Text, Triple, is_text, short
 from ..base.errors import LidarpoolError
 from ..sensor import Mounted, Track, load_trajectory
-from ..sensor.survey import STEPS_MOST
-from ..sensor.trajectory_files import FORMATS, quaternions_from_degrees
+from ..sensor.materials import SemanticClass
+from ..sensor.survey import Steps
+from ..sensor.trajectory_files import Duration, Seconds, TrajectoryFormat, quaternions_from_degrees
 from .sections import (
     MeshEntry,
     PoseSection,
     Section,
     SensorSection,
-    Text,
-    Triple,
-    _is_text,
-    _short,
 )
-
-Seconds = Annotated[float, Field(ge=-1e11, le=1e11)]
-Duration = Annotated[float, Field(gt=0, le=1e9)]
 
 
 class MountSection(PoseSection):
@@ -44,7 +39,7 @@ class CarriedSection(SensorSection):
         Field(ge=0, le=1e9, description="start, in seconds after that of the survey or station"),
     ] = 0.0
     steps: Annotated[
-        Annotated[int, Field(ge=1, le=STEPS_MOST)] | None,
+        Steps | None,
         Field(description="its time steps (scans), instead of the survey's", examples=[120]),
     ] = None
 
@@ -68,7 +63,7 @@ class TrajectorySection(Section):
         Field(description="TUM, KITTI or .csv, from the scenario's folder", examples=["drive.tum"]),
     ] = None
     format: Annotated[
-        Literal[FORMATS] | None,  # type: ignore[valid-type]
+        TrajectoryFormat | None,
         Field(description="by default kitti with times, csv for a .csv, else tum"),
     ] = None
     times: Annotated[Text | None, Field(description="for KITTI poses: the file of times")] = None
@@ -143,7 +138,7 @@ class TrajectorySection(Section):
 
 TrajectoryEntry = Annotated[
     TrajectorySection,
-    _short(_is_text, lambda v: {"file": v}, Text | TrajectorySection),
+    short(is_text, lambda v: {"file": v}, Text | TrajectorySection),
 ]
 Length = Annotated[float, Field(gt=0, le=1e4)]
 
@@ -164,7 +159,7 @@ class ActorSection(Section):
         TrajectoryEntry, Field(description="its trajectory, by the clock of the survey's")
     ]
     semantic_class: Annotated[
-        Annotated[int, Field(ge=0, le=65_535)] | None,
+        SemanticClass | None,
         Field(alias="class", description="class of its points; by default that of its material"),
     ] = None
 

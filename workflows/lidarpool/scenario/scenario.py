@@ -13,17 +13,19 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field, PrivateAttr, Strict, ValidationError
 
+from ..base.declared import Text, declared
 from ..base.errors import LidarpoolError, Mistakes
 from ..base.words import counted, did_you_mean
 from ..base.yamlfile import read_yaml
 from ..plan import Planning
+from ..plan.planning import Search
 from ..scene.actors import Actor, box, one_mesh
 from ..scene.mesh import Mesh
 from ..scene.meshfile import SUFFIXES, UNITLESS, load_meshes, wrote_it
 from ..scene.scene import Scene
 from ..scene.shapes import seed_objects
 from ..sensor import Material, Mounted, Noise, Pose, Returns, Survey
-from ..sensor.survey import SENSORS_MOST, STEPS_MOST
+from ..sensor.survey import SENSORS_MOST, Steps
 from .moving import ActorSection, CarriedSection, MountSection, TrajectoryEntry
 from .placing import Placing, inside_note, place
 from .sections import (
@@ -40,7 +42,6 @@ from .sections import (
     SceneSection,
     Section,
     SensorSection,
-    Text,
     WeatherSection,
     may_be_empty,
     scene_in_short,
@@ -135,7 +136,7 @@ class Scenario(Section):
         ),
     ] = None
     steps: Annotated[
-        Annotated[int, Field(ge=1, le=STEPS_MOST)] | None,
+        Steps | None,
         Field(
             description="time steps (scans) at each pose; by default along a trajectory as many "
             "as fit into it",
@@ -251,7 +252,7 @@ class Scenario(Section):
             if section.calibration is None:
                 with mistakes.noted(), self._named():
                     sensor = section.sensor(self._folder)
-                    Returns(**self.returns.model_dump()).of(sensor.optics)
+                    self.returns.of(sensor.optics)
         entries = [*self.scene.files, *(actor.file for actor in self.actors if actor.file)]
         files = [entry.file for entry in entries]
         files += [one for one in (self.trajectory and self.trajectory.file,) if one]
@@ -347,7 +348,7 @@ class Scenario(Section):
 
     def _materials(self) -> list[Material]:
         """Materials by name; classes of actors come last, so that they count."""
-        given = [Material(**entry.model_dump()) for entry in self.materials]
+        given = [Material(**dict(entry)) for entry in self.materials]
         own = []
         for entry in self.actors:
             if entry.semantic_class is not None:
@@ -372,21 +373,19 @@ class Scenario(Section):
                     replace(pose, position=tuple(np.subtract(pose.position, scene.origin)))
                     for pose in self._world_poses(scene)
                 ]
+            cloud = dict(self.cloud) | {"columns": (*self.cloud.columns, *self.output.needs)}
+            if self.scene.has_seed and cloud["keep_every"] is None:
+                cloud["keep_every"] = SEED_KEPT
             return Survey(
                 poses=poses,
                 trajectory=track,
                 **sensors,
-                coordinates=self.cloud.coordinates,
                 steps=self.steps,
-                keep_every=self.cloud.keep_every or (SEED_KEPT if self.scene.has_seed else 1),
-                precision_m=self.cloud.precision_m,  # type: ignore[arg-type]  # the sensor's
-                columns=(*self.cloud.columns, *self.output.needs),
                 materials=self._materials(),
-                returns=Returns(**self.returns.model_dump()),
-                noise=Noise(**self.noise.model_dump()),
-                visibility_km=self.weather.visibility_km,
-                epsg=self.cloud.epsg,
-                start=self.cloud.start,
+                returns=Returns(**dict(self.returns)),
+                noise=Noise(**dict(self.noise)),
+                **dict(self.weather),
+                **cloud,
             )
 
     def plan(self, scene: Scene) -> Planning | None:
@@ -417,11 +416,7 @@ class Scenario(Section):
                 target=local[1],
                 centres=discs[:, :2],
                 radii=discs[:, 2],
-                trials=section.trials,
-                particles=section.particles,
-                iterations=section.iterations,
-                waypoints=section.waypoints,
-                seed=section.seed,
+                **declared(section, Search),
             )
 
     def _sensors(self) -> dict[str, Any]:

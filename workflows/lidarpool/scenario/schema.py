@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 from typing import Any
 
@@ -17,6 +18,10 @@ class _Plain(GenerateJsonSchema):
 
     def field_title_should_be_set(self, schema: Any) -> bool:
         return False
+
+    def model_schema(self, schema: Any) -> dict[str, Any]:
+        # pydantic 2.12 leaves out the docstrings of models that are dataclasses as well.
+        return {"description": inspect.getdoc(schema["cls"])} | super().model_schema(schema)
 
     def default_schema(self, schema: Any) -> dict[str, Any]:
         made = super().default_schema(schema)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import (
-    AwareDatetime,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -18,39 +17,23 @@ from pydantic import (
 )
 
 from ..base.arguments import shown
-from ..base.vocabulary import BACKENDS
-from ..columns.table import COORDINATES, OPTIONAL
+from ..base.declared import Angle, Coordinate, Text, Triple, declared, is_text, short
+from ..base.vocabulary import BACKENDS, UNITS_M
 from ..export.table import EXPORTS, FORMATS, LAYOUTS
+from ..plan.planning import Search
 from ..scene.transform import Transform
-from ..sensor import Pose, Sensor
-from ..sensor.disc import SUBRAYS
+from ..sensor import Material, Noise, Pose, Returns, Sensor
+from ..sensor.beams import Rate, Step
 from ..sensor.models import load_sensor
-from ..sensor.optics import MODES
+from ..sensor.sensor import Fov, Layers, MaxRange, MinRange, RaysPerRevolution
+from ..sensor.survey import CloudOptions, Weather
 
-COLUMN_NAMES = tuple(column.in_files for column in OPTIONAL)
-
-# Nothing on Earth is farther from the origin of its map.
-Coordinate = Annotated[float, Field(ge=-1e8, le=1e8)]
-Angle = Annotated[float, Field(ge=-36_000, le=36_000)]
 Factor = Annotated[float, Field(ge=-1e9, le=1e9)]
-# YAML has only lists, which strict validation does not accept as tuples.
 Pair = Annotated[tuple[Coordinate, Coordinate], Strict(False)]
-Triple = Annotated[tuple[Coordinate, Coordinate, Coordinate], Strict(False)]
 Angles = Annotated[tuple[Angle, Angle, Angle], Strict(False)]
 Factors = Annotated[tuple[Factor, Factor, Factor], Strict(False)]
 Row = Annotated[tuple[Factor, Factor, Factor, Factor], Strict(False)]
 Matrix = Annotated[tuple[Row, Row, Row, Row], Strict(False)]
-
-
-def _short(is_short: Callable[[Any], bool], long: Callable[[Any], Any], allowed: Any) -> Any:
-    """Expand a short form; `allowed` is its type, for the schema."""
-    return BeforeValidator(
-        lambda value: long(value) if is_short(value) else value, json_schema_input_type=allowed
-    )
-
-
-def _is_text(value: Any) -> bool:
-    return isinstance(value, str)
 
 
 class Section(BaseModel):
@@ -75,7 +58,7 @@ class MeshFile(Section):
         ),
     ]
     unit: Annotated[
-        Literal["um", "mm", "cm", "dm", "m", "km", "in", "ft", "yd", "mi"] | None,
+        Literal[tuple(UNITS_M)] | None,  # type: ignore[valid-type]
         Field(description="length unit of the file; by default the one it states, else metres"),
     ] = None
     up_axis: Annotated[
@@ -92,7 +75,7 @@ class MeshFile(Section):
     ] = (0, 0, 0)
     scale: Annotated[
         Factors,
-        _short(lambda v: type(v) in (int, float), lambda v: [v] * 3, Factor | Factors),
+        short(lambda v: type(v) in (int, float), lambda v: [v] * 3, Factor | Factors),
         Field(description="one factor, or one for each axis; applied first"),
     ] = (1, 1, 1)
     matrix: Annotated[
@@ -115,8 +98,7 @@ class MeshFile(Section):
         return Transform.place(self.translation, self.rotation_deg, self.scale)
 
 
-Text = Annotated[str, Field(min_length=1)]
-MeshEntry = Annotated[MeshFile, _short(_is_text, lambda v: {"file": v}, Text | MeshFile)]
+MeshEntry = Annotated[MeshFile, short(is_text, lambda v: {"file": v}, Text | MeshFile)]
 MeshEntries = Annotated[tuple[MeshEntry, ...], Strict(False)]
 
 
@@ -144,7 +126,7 @@ class SceneSection(Section):
     ] = None
     files: Annotated[
         MeshEntries,
-        _short(lambda v: isinstance(v, (str, dict)), lambda v: [v], MeshEntry | MeshEntries),
+        short(lambda v: isinstance(v, (str, dict)), lambda v: [v], MeshEntry | MeshEntries),
         Field(
             max_length=10_000,
             description="mesh files, by name or with unit, up_axis, scale, rotation_deg, "
@@ -200,34 +182,26 @@ class SensorSection(Section):
             description="for an Ouster or a table of beams: azimuths in one turn", examples=[512]
         ),
     ] = None
-    rays_per_revolution: Annotated[
-        int, Field(ge=1, le=10_000_000, description="for a grid: azimuths in one turn")
-    ] = 1000
-    layers: Annotated[int, Field(ge=1, le=65_535, description="for a grid: elevations (rings)")] = (
-        40
-    )
-    vertical_fov_deg: Annotated[
-        float, Field(gt=0, le=180, description="for a grid: degrees, half of it below the horizon")
-    ] = 60.0
-    step_deg: Annotated[
-        float, Field(gt=0, le=360, description="degrees that the head turns in one time step")
-    ] = 10.0
+    rays_per_revolution: RaysPerRevolution = 1000
+    layers: Layers = 40
+    vertical_fov_deg: Fov = 60.0
+    step_deg: Step = 10.0
     rate_hz: Annotated[
-        Annotated[float, Field(gt=0, le=1e6)] | None,
+        Rate | None,
         Field(
             description="turns, lines or frames a second; by default the model's, or 10",
             examples=[20.0],
         ),
     ] = None
     min_range_m: Annotated[
-        Annotated[float, Field(ge=0, le=1e8)] | None,
+        MinRange | None,
         Field(
             description="nearer returns are ignored; by default the model's, or 0",
             examples=[0.5],
         ),
     ] = None
     max_range_m: Annotated[
-        Annotated[float, Field(gt=0, allow_inf_nan=True)] | None,
+        MaxRange | None,
         Field(
             description="farther returns are ignored; by default the model's, or .inf",
             examples=[100.0],
@@ -275,17 +249,12 @@ _GRID = {  # {field of a grid: its default}
 }
 
 
-class PoseSection(Section):
+class PoseSection(Section, Pose):
     """Pose of the sensor, in world coordinates."""
-
-    position: Annotated[Triple, Field(description="x, y and z, metres")]
-    yaw_deg: Annotated[Angle, Field(description="rotation about z, first")] = 0.0
-    pitch_deg: Annotated[Angle, Field(description="rotation about the new y, second")] = 0.0
-    roll_deg: Annotated[Angle, Field(description="rotation about the new x, last")] = 0.0
 
     def pose(self) -> Pose:
         """Return it as a pose."""
-        return Pose(self.position, self.yaw_deg, self.pitch_deg, self.roll_deg)
+        return Pose(**declared(self, Pose))
 
 
 def _pose(value: Any) -> Any:
@@ -304,52 +273,8 @@ PoseEntry = Annotated[
 ]
 
 
-class CloudSection(Section):
+class CloudSection(Section, CloudOptions):
     """Which hits become points, and their columns."""
-
-    keep_every: Annotated[
-        Annotated[int, Field(ge=1, le=1_000_000)] | None,
-        Field(
-            description="keep every n-th hit of a scan; by default every hit, of a scene with the "
-            "default objects every 5th",
-            examples=[5],
-        ),
-    ] = None
-    precision_m: Annotated[
-        Annotated[float, Field(ge=1e-6, le=1000)] | None,
-        Field(
-            description="step in metres that points are rounded to; by default the sensor's, "
-            "or 0.01",
-            examples=[0.01],
-        ),
-    ] = None
-    coordinates: Annotated[
-        Literal[COORDINATES],  # type: ignore[valid-type]
-        Field(description="world; or sensor: its axes when it fired, as sensor drivers have them"),
-    ] = "world"
-    columns: Annotated[
-        tuple[Literal[COLUMN_NAMES], ...],  # type: ignore[valid-type]
-        Strict(False),
-        Field(
-            description="columns in addition to x, y, z, scan, channel and object: "
-            + ", ".join(COLUMN_NAMES),
-            examples=[["time", "range", "intensity"]],
-        ),
-    ] = ()
-    epsg: Annotated[
-        Annotated[int, Field(ge=1024, le=32767)] | None,
-        Field(
-            description="EPSG code of the world's coordinate system, for LAS and LAZ",
-            examples=[25832],
-        ),
-    ] = None
-    start: Annotated[
-        Annotated[AwareDatetime, Strict(False)] | None,
-        Field(
-            description="when the survey starts, with its time zone, for LAS, LAZ and bags",
-            examples=["2026-11-21T10:00:00Z"],
-        ),
-    ] = None
 
 
 class ExportSection(Section):
@@ -370,9 +295,7 @@ class OutputSection(Section):
 
     write: Annotated[
         tuple[
-            Annotated[
-                ExportSection, _short(_is_text, lambda v: {"format": v}, Text | ExportSection)
-            ],
+            Annotated[ExportSection, short(is_text, lambda v: {"format": v}, Text | ExportSection)],
             ...,
         ],
         Strict(False),
@@ -399,97 +322,20 @@ class OutputSection(Section):
         return tuple(dict.fromkeys(chain.from_iterable(needed)))
 
 
-Names = Annotated[tuple[Text, ...], Strict(False)]
-Share = Annotated[float, Field(ge=0, le=1)]
-
-
-class MaterialSection(Section):
+class MaterialSection(Section, Material):
     """Material of objects; the last entry for an object counts."""
 
-    objects: Annotated[
-        Names,
-        _short(_is_text, lambda v: [v], Text | Names),
-        Field(min_length=1, description="names of objects, with * and ?"),
-    ]
-    reflectance: Annotated[
-        Share | None,
-        Field(description="share of light that is scattered; by default 0.5, for glass 0"),
-    ] = None
-    semantic_class: Annotated[
-        int, Field(alias="class", ge=0, le=65_535, description="value of the column class")
-    ] = 0
-    retro: Annotated[
-        bool, Field(description="whether light returns in its own direction, as from traffic signs")
-    ] = False
-    transparent: Annotated[
-        Literal["none", "pass", "mirror"],
-        Field(description="the rest of the light passes through (pass), or is reflected (mirror)"),
-    ] = "none"
 
-
-class ReturnsSection(Section):
+class ReturnsSection(Section, Returns):
     """Sub-rays of a beam, and which of its returns are reported."""
 
-    mode: Annotated[
-        Literal[MODES],  # type: ignore[valid-type]
-        Field(description="returns reported for a pulse; dual: strongest and last"),
-    ] = "strongest"
-    subrays: Annotated[
-        Literal[SUBRAYS],  # type: ignore[valid-type]
-        Field(description="rays in a beam: 1, 7, 19, 37, 61, … 217"),
-    ] = 1
-    divergence_mrad: Annotated[
-        Annotated[float, Field(ge=0, le=1000)] | None,
-        Field(description="full angle of the beam; by default the sensor's", examples=[3.0]),
-    ] = None
-    pulse_ns: Annotated[
-        Annotated[float, Field(ge=0, le=1e6)] | None,
-        Field(
-            description="length of the pulse: surfaces less than half of it apart are "
-            "one return; by default the sensor's, or 5",
-            examples=[5.0],
-        ),
-    ] = None
 
-
-class NoiseSection(Section):
+class NoiseSection(Section, Noise):
     """Noise of ranges and angles, and lost returns."""
 
-    range_m: Annotated[
-        float, Field(ge=0, le=1000, description="standard deviation of ranges, metres")
-    ] = 0.0
-    range_per_m: Annotated[
-        float, Field(ge=0, le=1, description="standard deviation added for each metre of range")
-    ] = 0.0
-    angle_deg: Annotated[
-        float, Field(ge=0, le=10, description="standard deviation of beam directions, in both axes")
-    ] = 0.0
-    dropout: Annotated[
-        Share, Field(description="share of returns that are lost, whatever their energy")
-    ] = 0.0
-    detection_range_m: Annotated[
-        Annotated[float, Field(ge=0.001, le=1e8)] | None,
-        Field(
-            description="range at which a surface of 10 % reflectance returns half the pulses; "
-            "weaker returns are lost",
-            examples=[100.0],
-        ),
-    ] = None
-    seed: Annotated[
-        int, Field(ge=0, le=2**63 - 1, description="the same seed gives the same noise")
-    ] = 0
 
-
-class WeatherSection(Section):
+class WeatherSection(Section, Weather):
     """Extinction of the air."""
-
-    visibility_km: Annotated[
-        Annotated[float, Field(ge=0.001, le=1e6)] | None,
-        Field(
-            description="meteorological visibility; by default without extinction",
-            examples=[10.0],
-        ),
-    ] = None
 
 
 class Obstacle(Section):
@@ -519,18 +365,13 @@ class Obstacle(Section):
 
 
 Obstacles = Annotated[
-    tuple[Annotated[Obstacle, _short(_is_text, lambda v: {"object": v}, Text | Obstacle)], ...],
+    tuple[Annotated[Obstacle, short(is_text, lambda v: {"object": v}, Text | Obstacle)], ...],
     Strict(False),
 ]
 
 
-class PlanningSection(Section):
-    """Path planning in the plane, in world coordinates.
-
-    `enabled` is by default whether there are a start and a target. `obstacles` is 'auto' (the
-    bounding circle of each object that is not flat) or a list; `clearance_m` is added to each
-    radius.
-    """
+class _Route:
+    """Fields of a planning that a scenario has in other words than `Planning`; they come first."""
 
     enabled: Annotated[
         bool | None,
@@ -546,7 +387,7 @@ class PlanningSection(Section):
     ] = None
     obstacles: Annotated[
         Obstacles | None,
-        _short(lambda v: v == "auto", lambda v: None, Literal["auto"] | Obstacles | None),
+        short(lambda v: v == "auto", lambda v: None, Literal["auto"] | Obstacles | None),
         Field(
             description="bounding circles of all objects that are not flat (auto), or a list",
             examples=["auto", ["Shelf*", {"centre": [-6, -1], "radius_m": 1}]],
@@ -555,25 +396,33 @@ class PlanningSection(Section):
     clearance_m: Annotated[
         float, Field(ge=0, le=1000, description="distance to keep from obstacles, metres")
     ] = 0.0
-    trials: Annotated[
-        int, Field(ge=1, le=1_000_000, description="particle swarms, each with its own seed")
-    ] = 100
-    particles: Annotated[int, Field(ge=1, le=10_000_000, description="of each swarm")] = 1000
-    iterations: Annotated[int, Field(ge=1, le=1_000_000, description="of each swarm")] = 300
-    waypoints: Annotated[
-        int, Field(ge=1, le=100, description="corners of the path between start and target")
-    ] = 5
-    seed: Annotated[
-        int, Field(ge=0, le=2**63 - 1, description="the same seed gives the same path")
-    ] = 0
 
 
-class PoolSection(Section):
-    """The partitions and their tasks; default sizes depend on the machine.
+class PlanningSection(Section, Search, _Route):
+    """Path planning in the plane, in world coordinates.
 
-    `gpu` and `other` set the workers of a local cluster, not of one that is running already.
-    `collectors` and `queue_capacity` apply to both.
+    `enabled` is by default whether there are a start and a target. `obstacles` is 'auto' (the
+    bounding circle of each object that is not flat) or a list; `clearance_m` is added to each
+    radius.
     """
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TaskOptions:
+    """Tasks of a run, on whatever cluster."""
+
+    collectors: Annotated[int, Field(ge=1, le=64, description="tasks that write the parts")] = 2
+    queue_capacity: Annotated[
+        int, Field(ge=1, le=100_000, description="how many items stage 1 may be ahead of stage 2")
+    ] = 10
+    backend: Annotated[
+        Literal[BACKENDS],  # type: ignore[valid-type]
+        Field(description="cuda, embree or numpy; auto takes the fastest available"),
+    ] = "auto"
+
+
+class _Workers:
+    """Workers of a local cluster; they come first."""
 
     gpu: Annotated[
         Annotated[int, Field(ge=1, le=10_000)] | None,
@@ -585,19 +434,19 @@ class PoolSection(Section):
             description="workers that plan paths; by default by the number of cores", examples=[1]
         ),
     ] = None
-    collectors: Annotated[int, Field(ge=1, le=64, description="tasks that write the parts")] = 2
-    queue_capacity: Annotated[
-        int, Field(ge=1, le=100_000, description="how many items stage 1 may be ahead of stage 2")
-    ] = 10
-    backend: Annotated[
-        Literal[BACKENDS],  # type: ignore[valid-type]
-        Field(description="cuda, embree or numpy; auto takes the fastest available"),
-    ] = "auto"
+
+
+class PoolSection(Section, TaskOptions, _Workers):
+    """The partitions and their tasks; default sizes depend on the machine.
+
+    `gpu` and `other` set the workers of a local cluster, not of one that is running already.
+    `collectors` and `queue_capacity` apply to both.
+    """
 
 
 def may_be_empty(section: type[Section]) -> Any:
     """Treat a section with all fields commented out as one of defaults."""
-    return _short(lambda v: v is None, lambda v: {}, section | None)
+    return short(lambda v: v is None, lambda v: {}, section | None)
 
 
 def _scene_of(value: str | list[Any] | None) -> dict[str, Any]:
@@ -605,7 +454,7 @@ def _scene_of(value: str | list[Any] | None) -> dict[str, Any]:
 
 
 # Short form of a scene: the name of a mesh file or preset, or a list of files.
-scene_in_short = _short(
+scene_in_short = short(
     lambda v: v is None or isinstance(v, (str, list)),
     _scene_of,
     Text | MeshEntries | SceneSection | None,

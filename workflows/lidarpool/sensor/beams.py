@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property
-from typing import Protocol
+from typing import Annotated, Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
 
 from ..base.arguments import as_array, checked, checked_fields
 from ..base.errors import LidarpoolError
@@ -113,6 +114,15 @@ class Head(Protocol):
         """Azimuth of the head at firings, radians: (k,)."""
 
 
+Step = Annotated[
+    float, Field(gt=0, le=360, description="degrees that the head turns in one time step")
+]
+Rate = Annotated[float, Field(gt=0, le=1e6)]
+Motion = Literal["sine", "triangle", "sawtooth"]
+Width = Annotated[float, Field(gt=0, le=360)]
+Duty = Annotated[float, Field(gt=0, le=1)]
+
+
 @dataclass(frozen=True)
 @checked_fields
 class Spin:
@@ -143,21 +153,13 @@ class Spin:
     ((0, 28), (28, 56))
     """
 
-    firings_per_turn: float = 1000
-    step_deg: float = 10.0
-    rate_hz: float = 10.0
+    firings_per_turn: Annotated[float, Field(ge=1, lt=2**31)] = 1000
+    step_deg: Step = 10.0
+    rate_hz: Rate = 10.0
     clockwise: bool = False
     zero_deg: float = 0.0
 
     def __post_init__(self) -> None:
-        checks = (
-            ("firings_per_turn", 1 <= self.firings_per_turn < 2**31, "1 to 2147483647"),
-            ("step_deg", 0 < self.step_deg <= 360, "above 0, at most 360"),
-            ("rate_hz", 0 < self.rate_hz <= 1e6, "above 0, at most 1e6"),
-        )
-        for name, good, allowed in checks:
-            if not good:
-                raise LidarpoolError(f"{name} is {getattr(self, name)}; it must be {allowed}.")
         if self._firings_per_step < 1:
             raise LidarpoolError(
                 f"step_deg {self.step_deg} is less than one firing "
@@ -212,6 +214,7 @@ class Spin:
 
 
 @dataclass(frozen=True)
+@checked_fields
 class Mirror(Spin):
     """A mirror that sweeps the beams over a line, to and fro or in one direction.
 
@@ -228,9 +231,9 @@ class Mirror(Spin):
         Share of each cycle in which it fires: a polygon's facets cover more than is used.
     """
 
-    motion: str = "triangle"
-    width_deg: float = 60.0
-    duty: float = 1.0
+    motion: Motion = "triangle"
+    width_deg: Width = 60.0
+    duty: Duty = 1.0
 
     def times_ns(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
         """See `Head.times_ns`."""

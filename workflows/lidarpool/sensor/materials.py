@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from ..base.arguments import checked_fields
+from ..base.declared import Share, TextOrTexts, written_as
 from ..base.errors import LidarpoolError
 from ..base.words import did_you_mean
-from .optics import check_numbers
 
 REFERENCE_M = 10.0  # energy is 1 for a white surface hit at right angles from here
 REFLECTANCE = 0.5  # default reflectance: between asphalt (0.1 to 0.2) and white paint (0.8)
@@ -22,28 +23,17 @@ RETRO_GAIN = 220.0
 GLASS_INDEX = 1.5
 NEAREST_M = 1e-3  # energies do not grow below this distance
 
+SemanticClass = Annotated[int, Field(ge=0, le=65_535)]
 Transparent = Literal["none", "pass", "mirror"]
 
 
 @dataclass(frozen=True)
 @checked_fields
 class Material:
-    """Material of some objects.
+    """Material of objects; the last entry for an object counts.
 
-    Parameters
-    ----------
-    objects
-        Names of objects, with * and ?; one or several.
-    reflectance
-        Share of the light that is scattered back in all directions, 0 to 1, at the sensor's
-        wavelength; by default 0.5, and 0 where `transparent` is "pass" or "mirror".
-    semantic_class
-        Value of the column `class`.
-    retro
-        Whether light returns in its own direction, as from traffic signs and licence plates.
-    transparent
-        Light that is not scattered: "none" (is lost), "pass" (passes straight through, minus the
-        reflection of glass), "mirror" (is reflected).
+    Reflectance is that at the sensor's wavelength, in all directions. Of light that is not
+    scattered, "pass" reflects what glass reflects; with "none" it is lost.
 
     Raises
     ------
@@ -51,18 +41,33 @@ class Material:
         If a value is outside its range.
     """
 
-    objects: str | Sequence[str]
-    reflectance: float | None = None
-    semantic_class: int = 0
-    retro: bool = False
-    transparent: Transparent = "none"
+    objects: Annotated[
+        str | Sequence[str],
+        written_as(TextOrTexts),
+        Field(min_length=1, description="names of objects, with * and ?"),
+    ]
+    reflectance: Annotated[
+        Share | None,
+        Field(
+            description="share of light that is scattered; by default 0.5, for glass and mirrors 0"
+        ),
+    ] = None
+    semantic_class: Annotated[
+        SemanticClass, Field(alias="class", description="value of the column class")
+    ] = 0
+    retro: Annotated[
+        bool, Field(description="whether light returns in its own direction, as from traffic signs")
+    ] = False
+    transparent: Annotated[
+        Transparent,
+        Field(description="the rest of the light passes through (pass), or is reflected (mirror)"),
+    ] = "none"
 
     def __post_init__(self) -> None:
         names = (self.objects,) if isinstance(self.objects, str) else tuple(self.objects)
-        if not names or not all(names):
+        if not all(names):
             raise LidarpoolError(f"objects is {self.objects!r}; it must be names of objects.")
         object.__setattr__(self, "objects", names)
-        check_numbers(self, {"reflectance": (0, 1), "semantic_class": (0, 65_535)})
 
     def named(self, name: str) -> bool:
         """Whether this material applies to an object."""

@@ -19,11 +19,11 @@ from ..base.arguments import checked
 from ..base.errors import LidarpoolError
 from ..base.words import did_you_mean
 from ..base.yamlfile import load_yaml
-from .beams import Beams, Mirror, Spin
+from .beams import Beams, Duty, Mirror, Motion, Rate, Spin, Step, Width
 from .calibrations import Calibration, read_calibration, said
 from .optics import Optics
 from .rays import ListedSensor, Prism, PrismSensor
-from .sensor import LineSensor, Sensor
+from .sensor import LineSensor, MaxRange, MinRange, Sensor
 
 _BUILT_IN = files("lidarpool.sensor") / "data"
 
@@ -84,28 +84,17 @@ class BeamTable(_Part):
 class MirrorPart(_Part):
     """See `Mirror`."""
 
-    motion: Literal["sine", "triangle", "sawtooth"]
-    width_deg: Annotated[float, Field(gt=0, le=360)]
-    duty: Annotated[float, Field(gt=0, le=1)] = 1.0
+    motion: Motion
+    width_deg: Width
+    duty: Duty = 1.0
 
 
-class PrismPart(_Part):
+class PrismPart(_Part, Prism):
     """See `Prism`."""
 
-    wedge_deg: float
-    index: Positive
-    rpm: float
-    phase_deg: float = 0.0
-    inclined_first: bool = False
 
-
-class OpticsPart(_Part):
+class OpticsPart(_Part, Optics):
     """See `Optics`."""
-
-    wavelength_nm: Positive = Optics.wavelength_nm
-    divergence_mrad: Positive | None = None
-    pulse_ns: Positive = Optics.pulse_ns
-    resolution_m: Positive = Optics.resolution_m
 
 
 class SensorModel(_Part):
@@ -138,7 +127,6 @@ class SensorModel(_Part):
         if any(abs(angle) > 90 for angle in self.beams.elevation_deg):
             raise ValueError("beams.elevation_deg goes beyond 90 degrees")
         self.beams.beams()  # LidarpoolError if it cannot be made
-        Optics(**self.optics.model_dump())  # the same
         return self
 
     @property
@@ -149,8 +137,6 @@ class SensorModel(_Part):
     def turn(self, rate_hz: float | None, columns: int | None) -> tuple[float, float]:
         """Return the firings in a turn, and turns a second."""
         rate = self.rate_hz if rate_hz is None else rate_hz
-        if not rate > 0:
-            raise LidarpoolError(f"rate_hz is {rate}; it must be above 0.")
         if self.firing_us is not None:
             if columns is not None:
                 raise LidarpoolError(
@@ -234,10 +220,10 @@ def load_sensor(
     *,
     calibration: str | Path | None = None,
     columns: int | None = None,
-    rate_hz: float | None = None,
-    step_deg: float = 10.0,
-    min_range_m: float | None = None,
-    max_range_m: float | None = None,
+    rate_hz: Rate | None = None,
+    step_deg: Step = 10.0,
+    min_range_m: MinRange | None = None,
+    max_range_m: MaxRange | None = None,
 ) -> Sensor:
     """Make a sensor from a model, or from the calibration of a unit.
 

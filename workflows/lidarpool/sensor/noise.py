@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from ..base.arguments import checked_fields
+from ..base.declared import Seed, Share
 from .counted import normal, uniform
 from .materials import at_right_angles
-from .optics import check_numbers
 
 # Detection threshold for signal plus noise, in standard deviations.
 THRESHOLD_SIGMAS = 5.0
@@ -26,22 +27,11 @@ Real = NDArray[np.float64]
 @dataclass(frozen=True)
 @checked_fields
 class Noise:
-    """Noise; without arguments there is none.
+    """Noise of ranges and angles, and lost returns; without arguments there is none.
 
-    Parameters
-    ----------
-    range_m, range_per_m
-        Standard deviation of a range of r metres: ``range_m + range_per_m * r``.
-    angle_deg
-        Standard deviation of beam directions, in each of the two directions across. The ray is
-        cast there; the reported angle has no noise.
-    dropout
-        Share of returns that are lost whatever their energy, 0 to 1.
-    detection_range_m
-        Range at which half of the pulses from a surface of 10 % reflectance are detected, at right
-        angles in clear air; None if all are detected, at any range.
-    seed
-        Another seed gives other noise.
+    The standard deviation of a range of r metres is ``range_m + range_per_m * r``. Rays are cast in
+    directions with noise, and reported with angles without. Stated detection ranges are for
+    surfaces at right angles in clear air.
 
     Raises
     ------
@@ -49,17 +39,29 @@ class Noise:
         If a number is outside its range.
     """
 
-    range_m: float = 0.0
-    range_per_m: float = 0.0
-    angle_deg: float = 0.0
-    dropout: float = 0.0
-    detection_range_m: float | None = None
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        check_numbers(self, {"range_m": (0, 1e3), "range_per_m": (0, 1), "angle_deg": (0, 10)})
-        check_numbers(self, {"dropout": (0, 1), "detection_range_m": (1e-3, 1e8)})
-        check_numbers(self, {"seed": (0, 2**63 - 1)})
+    range_m: Annotated[
+        float, Field(ge=0, le=1000, description="standard deviation of ranges, metres")
+    ] = 0.0
+    range_per_m: Annotated[
+        float, Field(ge=0, le=1, description="standard deviation added for each metre of range")
+    ] = 0.0
+    angle_deg: Annotated[
+        float, Field(ge=0, le=10, description="standard deviation of beam directions, in both axes")
+    ] = 0.0
+    dropout: Annotated[
+        Share, Field(description="share of returns that are lost, whatever their energy")
+    ] = 0.0
+    detection_range_m: Annotated[
+        float | None,
+        Field(
+            ge=0.001,
+            le=1e8,
+            description="range at which a surface of 10 % reflectance returns half the pulses; "
+            "weaker returns are lost",
+            examples=[100.0],
+        ),
+    ] = None
+    seed: Annotated[Seed, Field(description="the same seed gives the same noise")] = 0
 
     @property
     def loses(self) -> bool:

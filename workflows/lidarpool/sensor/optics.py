@@ -2,75 +2,49 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from ..base.arguments import checked_fields
 from ..base.errors import LidarpoolError
 from .disc import SUBRAYS
 
 LIGHT_M_NS = 0.299792458  # in vacuum; in air it is slower by 0.03 %
-MODES = ("strongest", "first", "last", "dual", "all")
 
 Mode = Literal["strongest", "first", "last", "dual", "all"]
-
-
-def check_numbers(thing: object, limits: Mapping[str, tuple[float, float]]) -> None:
-    """Refuse fields outside their limits, both included; LidarpoolError names the first."""
-    for name, (least, most) in limits.items():
-        value = getattr(thing, name)
-        if value is not None and not least <= value <= most:  # nor NaN
-            allowed = f"at least {least:g}" if most == np.inf else f"{least:g} to {most:g}"
-            raise LidarpoolError(f"{name} is {value}; it must be {allowed}.")
+# Full angle of a beam's cone, at 1/e² of its maximum.
+Divergence = Annotated[float, Field(ge=0, le=1000)]
+Pulse = Annotated[float, Field(ge=0, le=1e6)]
+Precision = Annotated[float, Field(ge=1e-6, le=1000)]
 
 
 @dataclass(frozen=True)
 @checked_fields
 class Optics:
-    """Light and resolution of a sensor.
+    """Light and resolution of a sensor."""
 
-    Parameters
-    ----------
-    wavelength_nm
-        Of the laser; 905 if no source states it.
-    divergence_mrad
-        Full angle of the beam's cone, at 1/e² of its maximum; None if unknown.
-    pulse_ns
-        Length of a pulse.
-    resolution_m
-        Of reported ranges: default step for rounding positions.
-    """
-
-    wavelength_nm: float = 905.0
-    divergence_mrad: float | None = None
-    pulse_ns: float = 5.0
-    resolution_m: float = 0.01
-
-    def __post_init__(self) -> None:
-        limits = {"wavelength_nm": (200, 20_000), "divergence_mrad": (0, 1000)}
-        check_numbers(self, {**limits, "pulse_ns": (0, 1e6), "resolution_m": (1e-6, 1000)})
+    wavelength_nm: Annotated[
+        float, Field(ge=200, le=20_000, description="of the laser; 905 if no source states it")
+    ] = 905.0
+    divergence_mrad: Annotated[
+        Divergence | None, Field(description="full angle of the beam; None if unknown")
+    ] = None
+    pulse_ns: Annotated[Pulse, Field(description="length of a pulse")] = 5.0
+    resolution_m: Annotated[
+        Precision, Field(description="of reported ranges: default step for rounding positions")
+    ] = 0.01
 
 
 @dataclass(frozen=True)
 @checked_fields
 class Returns:
-    """Sub-rays of a beam, and which returns are reported.
+    """Sub-rays of a beam, and which of its returns are reported.
 
-    Parameters
-    ----------
-    mode
-        Returns of a pulse to report: the strongest, the first, the last, the strongest and the
-        last ("dual"; the two strongest if those are one), or all.
-    subrays
-        Rays in a beam: 1, 7, 19, 37, 61, 91, 127, 169 or 217.
-    divergence_mrad
-        Full angle of the beam; None for the sensor's.
-    pulse_ns
-        Length of the pulse; None for the sensor's. Hits within half of it are one return.
+    "dual" reports the strongest and the last return, or the two strongest if those are one.
 
     Raises
     ------
@@ -78,16 +52,25 @@ class Returns:
         If there is no such mode, or a number is outside its range.
     """
 
-    mode: Mode = "strongest"
-    subrays: int = 1
-    divergence_mrad: float | None = None
-    pulse_ns: float | None = None
-
-    def __post_init__(self) -> None:
-        if self.subrays not in SUBRAYS:
-            known = ", ".join(map(str, SUBRAYS))
-            raise LidarpoolError(f"subrays is {self.subrays}; it must be one of {known}.")
-        check_numbers(self, {"divergence_mrad": (0, 1000), "pulse_ns": (0, 1e6)})
+    mode: Annotated[
+        Mode, Field(description="returns reported for a pulse; dual: strongest and last")
+    ] = "strongest"
+    subrays: Annotated[
+        Literal[SUBRAYS],  # type: ignore[valid-type]
+        Field(description="rays in a beam: 1, 7, 19, 37, 61, … 217"),
+    ] = 1
+    divergence_mrad: Annotated[
+        Divergence | None,
+        Field(description="full angle of the beam; by default the sensor's", examples=[3.0]),
+    ] = None
+    pulse_ns: Annotated[
+        Pulse | None,
+        Field(
+            description="length of the pulse: surfaces less than half of it apart are "
+            "one return; by default the sensor's, or 5",
+            examples=[5.0],
+        ),
+    ] = None
 
     def of(self, optics: Optics) -> tuple[float, float]:
         """Divergence, radians, and least distance of two returns, metres.

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from ..base.errors import LidarpoolError
 from .beams import Beams
@@ -32,7 +33,7 @@ class Prism:
     """
 
     wedge_deg: float
-    index: float
+    index: Annotated[float, Field(gt=0)]
     rpm: float
     phase_deg: float = 0.0
     inclined_first: bool = False

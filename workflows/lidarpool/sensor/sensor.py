@@ -5,15 +5,26 @@ from __future__ import annotations
 from bisect import bisect_left
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
 
 from ..base.arguments import checked, checked_fields
 from ..base.errors import LidarpoolError
-from .beams import CHANNELS_MOST, Beams, Head, Spin
+from .beams import CHANNELS_MOST, Beams, Head, Rate, Spin, Step
 from .optics import Optics
+
+RaysPerRevolution = Annotated[
+    int, Field(ge=1, le=10_000_000, description="for a grid: azimuths in one turn")
+]
+Layers = Annotated[int, Field(ge=1, le=CHANNELS_MOST, description="for a grid: elevations (rings)")]
+Fov = Annotated[
+    float, Field(gt=0, le=180, description="for a grid: degrees, half of it below the horizon")
+]
+MinRange = Annotated[float, Field(ge=0, le=1e8)]
+MaxRange = Annotated[float, Field(gt=0, allow_inf_nan=True)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,22 +64,18 @@ class Sensor:
 
     beams: Beams = field(default_factory=lambda: Beams.even(40, 60.0))
     head: Head = field(default_factory=Spin)
-    min_range_m: float = 0.0
-    max_range_m: float = float("inf")
+    min_range_m: MinRange = 0.0
+    max_range_m: MaxRange = float("inf")
     name: str = ""
     optics: Optics = field(default_factory=Optics)
-    start_ns: float = 0.0
+    start_ns: Annotated[float, Field(ge=0, lt=float("inf"))] = 0.0
     cycle: ClassVar[str] = "turn"  # name of a cycle
 
     def __post_init__(self) -> None:
-        checks = (
-            ("min_range_m", 0 <= self.min_range_m < float("inf"), "finite, at least 0"),
-            ("max_range_m", self.max_range_m > self.min_range_m, "above min_range_m"),
-            ("start_ns", 0 <= self.start_ns < float("inf"), "finite, at least 0"),
-        )
-        for name, good, allowed in checks:
-            if not good:
-                raise LidarpoolError(f"{name} is {getattr(self, name)}; it must be {allowed}.")
+        if not self.max_range_m > self.min_range_m:
+            raise LidarpoolError(
+                f"max_range_m is {self.max_range_m}; it must be above min_range_m."
+            )
 
     @property
     def model(self) -> str:
@@ -79,13 +86,13 @@ class Sensor:
     @checked
     def grid(
         cls,
-        rays_per_revolution: int = 1000,
-        layers: int = 40,
-        vertical_fov_deg: float = 60.0,
-        step_deg: float = 10.0,
-        min_range_m: float = 0.0,
-        max_range_m: float = float("inf"),
-        rate_hz: float = 10.0,
+        rays_per_revolution: RaysPerRevolution = 1000,
+        layers: Layers = 40,
+        vertical_fov_deg: Fov = 60.0,
+        step_deg: Step = 10.0,
+        min_range_m: MinRange = 0.0,
+        max_range_m: MaxRange = float("inf"),
+        rate_hz: Rate = 10.0,
     ) -> Sensor:
         """Make a spinning sensor with evenly spaced azimuths and elevations.
 
@@ -113,19 +120,6 @@ class Sensor:
         LidarpoolError
             If a value is outside its range, or a time step holds no firing at all.
         """
-        checks = (
-            ("rays_per_revolution", rays_per_revolution, rays_per_revolution >= 1, "at least 1"),
-            ("layers", layers, 1 <= layers <= CHANNELS_MOST, f"1 to {CHANNELS_MOST}"),
-            (
-                "vertical_fov_deg",
-                vertical_fov_deg,
-                0 < vertical_fov_deg <= 180,
-                "above 0, at most 180",
-            ),
-        )
-        for name, value, good, allowed in checks:
-            if not good:
-                raise LidarpoolError(f"{name} is {value}; it must be {allowed}.")
         return cls(
             Beams.even(layers, vertical_fov_deg),
             Spin(rays_per_revolution, step_deg, rate_hz),

@@ -8,21 +8,25 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from functools import cached_property, partial
 from itertools import accumulate
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import AwareDatetime, Field, Strict
 
 from ..base.arguments import checked_fields, shown
+from ..base.declared import FILLED_IN, written_as
 from ..base.errors import LidarpoolError
-from ..columns.table import COORDINATES, Column, chosen, stored
+from ..columns.table import COORDINATES, OPTIONAL, Column, chosen, stored
 from .materials import Material, extinction
 from .noise import Noise
-from .optics import Returns, check_numbers
+from .optics import Precision, Returns
 from .sensor import Sensor
 from .trajectory import CENTRE, Pose, Stations, Trajectory
 
 STEPS = 36  # default at each pose: one turn of most sensors
 STEPS_MOST = 10_000_000  # along a trajectory
+Steps = Annotated[int, Field(ge=1, le=STEPS_MOST)]
+OPTIONAL_NAMES = tuple(column.in_files for column in OPTIONAL)
 SENSORS_MOST = 255  # the type of the column
 RAYS_MOST = 1 << 32  # of a scan, which is cast in one call
 START_FROM = datetime(2017, 1, 1, tzinfo=UTC)  # since when GPS and UTC have been 18 s apart
@@ -54,7 +58,7 @@ class Mounted:
     sensor: Sensor
     mount: Pose = CENTRE
     name: str = ""
-    steps: int | None = None
+    steps: Steps | None = None
 
 
 @dataclass(frozen=True)
@@ -90,14 +94,91 @@ class ScanSpec:
         return (self.firings[1] - self.firings[0]) * self.channels
 
 
+@dataclass(frozen=True, kw_only=True)
+class Weather:
+    """Extinction of the air."""
+
+    visibility_km: Annotated[
+        float | None,
+        Field(
+            ge=0.001,
+            le=1e6,
+            description="meteorological visibility; by default without extinction",
+            examples=[10.0],
+        ),
+    ] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class CloudOptions:
+    """Which hits become points, and their columns.
+
+    In Python a column may also be your own `Column`.
+    """
+
+    keep_every: Annotated[
+        int,
+        FILLED_IN,
+        Field(
+            ge=1,
+            le=1_000_000,
+            description="keep every n-th hit of a scan; by default every hit, of a scene with the "
+            "default objects every 5th",
+            examples=[5],
+        ),
+    ] = None  # type: ignore[assignment]
+    precision_m: Annotated[
+        Precision,
+        FILLED_IN,
+        Field(
+            description="step in metres that points are rounded to; by default the sensor's, "
+            "or 0.01",
+            examples=[0.01],
+        ),
+    ] = None  # type: ignore[assignment]
+    coordinates: Annotated[
+        Literal[COORDINATES],  # type: ignore[valid-type]
+        Field(description="world; or sensor: its axes when it fired, as sensor drivers have them"),
+    ] = "world"
+    columns: Annotated[
+        Sequence[str | Column],
+        written_as(Annotated[tuple[Literal[OPTIONAL_NAMES], ...], Strict(False)]),
+        Field(
+            description="columns in addition to x, y, z, scan, channel and object: "
+            + ", ".join(OPTIONAL_NAMES),
+            examples=[["time", "range", "intensity"]],
+        ),
+    ] = ()
+    epsg: Annotated[
+        int | None,
+        Field(
+            ge=1024,
+            le=32767,
+            description="EPSG code of the world's coordinate system, for LAS and LAZ",
+            examples=[25832],
+        ),
+    ] = None
+    start: Annotated[
+        datetime | None,
+        written_as(Annotated[AwareDatetime, Strict(False)] | None),
+        Field(
+            description="when the survey starts, with its time zone, for LAS, LAZ and bags",
+            examples=["2026-11-21T10:00:00Z"],
+        ),
+    ] = None
+
+
 @dataclass(frozen=True)
 @checked_fields
-class Survey:
+class Survey(CloudOptions, Weather):
     """All scans of a carrier's sensors.
 
     Scans of a sensor are in time order, and all scans of one sensor come before those of the next,
     so that a batch is one cast, and each part belongs to one sensor or two. The column `time`
     shows which points are simultaneous.
+
+    Several sensors always have the column `sensor`. Without materials, all objects scatter half of
+    the light.
 
     Parameters
     ----------
@@ -107,34 +188,18 @@ class Survey:
         Its poses one after the other: `Pose`, or x, y, z.
     steps
         Time steps from each pose, 36 by default; along a `Track` by default as many as it lasts.
-    keep_every
-        The cloud keeps every n-th hit of each scan.
-    precision_m
-        Points are rounded to multiples of this, in metres; None for the sensor's resolution.
-    columns
-        Columns in addition to x, y, z, scan, channel and object: names of the table of columns
-        (`lidarpool.columns.table`), or your own `Column`. Several sensors always have the column
-        `sensor`.
     trajectory
         Instead of `poses`, if the carrier moves.
     sensors
         Instead of `sensor`: `Mounted`, each with its own name if there are several.
-    coordinates
-        Of the points: "world", or "sensor" for the axes of the sensor at the time of each ray, as
-        sensor drivers have them.
     materials
-        Materials of objects by name; the last entry for an object counts. Without any, all objects
-        scatter half of the light.
+        Materials of objects by name; the last entry for an object counts.
     returns
         Sub-rays of a beam, and which returns of a pulse are reported.
     noise
         Noise of ranges and angles, and lost returns.
-    visibility_km
-        Meteorological visibility; None for air without extinction.
-    epsg
-        EPSG code of the world's coordinate system, for files that name one.
-    start
-        When the survey starts, from 2017 on and with a time zone, for files that hold dates.
+    **options
+        The fields of `Weather` and `CloudOptions`, such as `visibility_km` and `keep_every`.
 
     Raises
     ------
@@ -151,19 +216,12 @@ class Survey:
 
     sensor: Sensor = field(default_factory=Sensor.grid)
     poses: Sequence[Any] = ()
-    steps: int | None = None
-    keep_every: int = 1
-    precision_m: float = None  # type: ignore[assignment]  # filled in below
-    columns: Sequence[str | Column] = ()
+    steps: Steps | None = None
     trajectory: Trajectory | None = None
     sensors: Sequence[Mounted] = ()
-    coordinates: str = "world"
     materials: Sequence[Material] = ()
     returns: Returns = field(default_factory=Returns)
     noise: Noise = field(default_factory=Noise)
-    visibility_km: float | None = None
-    epsg: int | None = None
-    start: datetime | None = None
 
     def __post_init__(self) -> None:
         self._set(poses=_poses(self.poses), sensors=tuple(self.sensors))
@@ -173,9 +231,10 @@ class Survey:
             self._set(sensor=self.sensors[0].sensor)
         extra = ("sensor",) if len(self.sensors) > 1 else ()
         self._set(columns=chosen((*self.columns, *extra)))
-        if getattr(self, "precision_m", None) is None:
-            finest = min(carried.sensor.optics.resolution_m for carried in self.carried)
-            self._set(precision_m=finest)
+        finest = min(carried.sensor.optics.resolution_m for carried in self.carried)
+        for name, default in {"keep_every": 1, "precision_m": finest}.items():
+            if getattr(self, name) is None:
+                self._set(**{name: default})
         self._check_values()
         if self.steps is None and self.path.duration_ns == float("inf"):
             self._set(steps=STEPS)
@@ -204,9 +263,6 @@ class Survey:
             )
 
     def _check_values(self) -> None:
-        if self.coordinates not in COORDINATES:
-            raise LidarpoolError(f"coordinates are {' or '.join(COORDINATES)}.")
-        check_numbers(self, {"visibility_km": (1e-3, 1e6), "epsg": (1024, 32767)})
         if self.start is not None and (self.start.tzinfo is None or self.start < START_FROM):
             raise LidarpoolError(
                 f"start is {self.start}; it must be a time from 2017 on, with its time zone: "
@@ -214,11 +270,6 @@ class Survey:
             )
         for carried in self.carried:
             self.returns.of(carried.sensor.optics)  # LidarpoolError if they do not fit together
-        limits = [("keep_every", 1), ("precision_m", 1e-6), ("steps", 1)]
-        values = [(name, getattr(self, name), least) for name, least in limits]
-        for name, value, least in [*values, *(("steps", c.steps, 1) for c in self.carried)]:
-            if value is not None and not least <= value < float("inf"):
-                raise LidarpoolError(f"{name} is {value}; it must be at least {least}.")
 
     def _check_duration(self, sensor: Sensor, steps: int) -> None:
         """Check that the trajectory lasts as long as a sensor, and that its numbers do not end."""

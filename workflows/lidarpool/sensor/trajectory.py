@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Annotated, Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
 
 from ..base.arguments import as_array, checked_fields
+from ..base.declared import Angle, Triple, written_as
 from ..base.errors import LidarpoolError
 
 QUATERNION_SLACK = 1e-3  # tolerance of a quaternion's length, which files round
@@ -21,20 +23,17 @@ _CLOCK_S, _FIRING_S = 1e-6, 1e-3
 @dataclass(frozen=True)
 @checked_fields
 class Pose:
-    """Position and rotation of a sensor.
+    """Position and rotation of a sensor, in the scene's own coordinates.
 
-    Parameters
-    ----------
-    position
-        x, y, z in metres, in the scene's own coordinates.
-    yaw_deg, pitch_deg, roll_deg
-        Rotations about z, then the new y, then the new x, in degrees (aerospace order).
+    Angles are in degrees, in aerospace order.
     """
 
-    position: tuple[float, float, float]
-    yaw_deg: float = 0.0
-    pitch_deg: float = 0.0
-    roll_deg: float = 0.0
+    position: Annotated[
+        tuple[float, float, float], written_as(Triple), Field(description="x, y and z, metres")
+    ]
+    yaw_deg: Annotated[Angle, Field(description="rotation about z, first")] = 0.0
+    pitch_deg: Annotated[Angle, Field(description="rotation about the new y, second")] = 0.0
+    roll_deg: Annotated[Angle, Field(description="rotation about the new x, last")] = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "position", tuple(map(float, self.position)))

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from ..base.allowance import check_fits
 from ..base.arguments import checked
@@ -15,7 +16,9 @@ from ..base.errors import LidarpoolError
 from .calibrations import said
 from .trajectory import Pose, Track, quaternions_of
 
-FORMATS = ("tum", "kitti", "csv")
+TrajectoryFormat = Literal["tum", "kitti", "csv"]
+Seconds = Annotated[float, Field(ge=-1e11, le=1e11)]
+Duration = Annotated[float, Field(gt=0, le=1e9)]
 _PLACE = ("x", "y", "z")
 _TURNS = (("qx", "qy", "qz", "qw"), ("yaw_deg", "pitch_deg", "roll_deg"))
 _MARKS = ",;\t"  # that separate the columns of a table
@@ -27,14 +30,14 @@ _CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 def load_trajectory(
     path: str | Path,
     *,
-    format: str | None = None,  # noqa: A002 - its name in scenarios
+    format: TrajectoryFormat | None = None,  # noqa: A002 - its name in scenarios
     times: str | Path | None = None,
     columns: Mapping[str, str] | None = None,
     camera_axes: bool | None = None,
-    offset_s: float = 0.0,
+    offset_s: Seconds = 0.0,
     smooth: bool = False,
-    start_s: float | None = None,
-    duration_s: float | None = None,
+    start_s: Seconds | None = None,
+    duration_s: Duration | None = None,
 ) -> Track:
     """Read the trajectory of a carrier.
 
@@ -82,11 +85,9 @@ def load_trajectory(
             if len(rows) != len(seconds):
                 raise ValueError(f"it has {len(rows)} poses and {times} {len(seconds)} times")
             places, turns = rows[..., 3], quaternions_of(_rotations(rows[..., :3]))
-        elif kind == "tum":
+        else:
             rows = _numbers(text, 8)
             seconds, places, turns = rows[:, 0], rows[:, 1:4], rows[:, 4:]
-        else:
-            raise ValueError(f"there is no format {kind!r}, only {', '.join(FORMATS)}")
         track = Track(seconds + offset_s, places, turns, smooth, start_s, duration_s)
         if camera_axes or (camera_axes is None and kind == "kitti"):
             track = _from_camera(track)

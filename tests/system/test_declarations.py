@@ -1,0 +1,104 @@
+"""A quantity that is declared in one line is all there is to do for it."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import lidarpool
+
+ROOT = Path(__file__).parents[2]
+LINE = '    gain_db: Annotated[float, Field(ge=0, le=9, description="of the receiver")] = 0.5\n'
+SMALL = """
+sensor: {{rays_per_revolution: 36, layers: 2}}
+poses: [[0, 0, 1]]
+steps: 6
+noise: {{gain_db: {gain}}}
+planning: {{enabled: false}}
+pool: {{backend: numpy, gpu: 1, other: 1, collectors: 1}}
+"""
+UNFINISHED = """
+import sys
+from tests.lidarpool.committing import commit
+from lidarpool import LidarpoolError, Noise
+from lidarpool.run.job import make_job
+from lidarpool.run.store import RunStore
+from lidarpool.scenario.scenario import Scenario
+
+store = RunStore(make_job(Scenario.load(sys.argv[1])), sys.argv[2])
+store.backend = "numpy"
+commit(store, 0, [3, 3], [0, 1], [3, 3])
+store.db.close()
+try:
+    Noise(gain_db=10)
+except LidarpoolError as error:
+    print(error)
+"""
+
+Run = Callable[..., "subprocess.CompletedProcess[str]"]
+
+
+@pytest.fixture(scope="module")
+def python(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Run Python with a copy of the package in which `Noise` has one line more."""
+    copy = tmp_path_factory.mktemp("declared") / "lidarpool"
+    assert lidarpool.__file__
+    shutil.copytree(
+        Path(lidarpool.__file__).parent, copy, ignore=shutil.ignore_patterns("__pycache__")
+    )
+    noise = copy / "sensor" / "noise.py"
+    before, seed, after = noise.read_text().partition("    seed: Annotated")
+    noise.write_text(before + LINE + seed + after)
+    roots = (copy.parent, ROOT / "kernels", ROOT / "scheduler", ROOT)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, roots))}
+
+    def run(*arguments: object) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, *map(str, arguments)],
+            env=environment,
+            cwd=copy.parent,
+            capture_output=True,
+            text=True,
+            timeout=300,
+        )
+
+    return run
+
+
+def test_it_is_in_the_template_and_in_the_schema(python, tmp_path):
+    python("-m", "lidarpool", "init", tmp_path)
+    (line,) = [
+        one for one in (tmp_path / "scenario.yaml").read_text().splitlines() if "gain" in one
+    ]
+    assert line.split() == ["gain_db:", "0.5", "#", "of", "the", "receiver"]
+    schema = json.loads((tmp_path / "scenario.schema.json").read_text())
+    field = schema["$defs"]["NoiseSection"]["properties"]["gain_db"]
+    assert (field["default"], field["minimum"], field["maximum"]) == (0.5, 0, 9)
+
+
+def test_a_scenario_with_it_is_checked_run_reported_and_not_continued_with_another(
+    python, tmp_path
+):
+    for gain in (2, 3, 10):
+        (tmp_path / f"{gain}.yaml").write_text(SMALL.format(gain=gain))
+    wrong = python("-m", "lidarpool", "check", tmp_path / "10.yaml")
+    assert wrong.returncode == 2 and "noise.gain_db is 10; " in wrong.stderr
+
+    done = python("-m", "lidarpool", "run", tmp_path / "2.yaml", "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["parameters"]["noise"]["gain_db"] == 2
+
+    begun = tmp_path / "begun"
+    begun.mkdir()
+    left = python("-c", UNFINISHED, tmp_path / "2.yaml", begun / "run")
+    assert left.stdout == "gain_db is 10; it must be 0 to 9.\n", left.stderr
+    other = python("-m", "lidarpool", "run", tmp_path / "3.yaml", "--out", begun, "--resume")
+    assert other.returncode == 2 and "it is of another survey" in other.stderr

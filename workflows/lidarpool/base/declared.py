@@ -1,0 +1,53 @@
+"""Declarations of quantities that users set: what a scenario file needs beyond Python's types.
+
+A quantity is a field of a dataclass: `Annotated[type, Field(limits, description)] = default`.
+`checked_fields` lets the dataclass refuse values outside the limits, and a section of a scenario
+inherits the fields (`lidarpool.scenario.sections`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, Field, GetPydanticSchema, Strict
+
+Share = Annotated[float, Field(ge=0, le=1)]
+Seed = Annotated[int, Field(ge=0, le=2**63 - 1)]
+Text = Annotated[str, Field(min_length=1)]
+# Nothing on Earth is farther from the origin of its map.
+Coordinate = Annotated[float, Field(ge=-1e8, le=1e8)]
+Angle = Annotated[float, Field(ge=-36_000, le=36_000)]
+# YAML has only lists, which strict validation does not accept as tuples.
+Triple = Annotated[tuple[Coordinate, Coordinate, Coordinate], Strict(False)]
+
+# A field that may be empty in a scenario, because lidarpool then fills it in.
+FILLED_IN = GetPydanticSchema(lambda kind, handler: handler(kind | None))
+
+
+def declared(thing: Any, by: type) -> dict[str, Any]:
+    """Values that a thing has for the fields of one of its bases: {name: value}."""
+    return {field.name: getattr(thing, field.name) for field in fields(by)}
+
+
+def written_as(kind: Any) -> GetPydanticSchema:
+    """Let a scenario have another type for a field than Python."""
+    return GetPydanticSchema(lambda _, handler: handler.generate_schema(kind))
+
+
+def short(is_short: Callable[[Any], bool], long: Callable[[Any], Any], allowed: Any) -> Any:
+    """Expand a short form in a scenario; `allowed` is its type, for the schema."""
+    return BeforeValidator(
+        lambda value: long(value) if is_short(value) else value, json_schema_input_type=allowed
+    )
+
+
+def is_text(value: Any) -> bool:
+    """Whether a value is text."""
+    return isinstance(value, str)
+
+
+# A list of texts, or one of them without the list.
+Texts = Annotated[tuple[Text, ...], Strict(False)]
+TextOrTexts = Annotated[Texts, short(is_text, lambda v: [v], Text | Texts)]
