@@ -159,6 +159,19 @@ def test_a_drive_through_a_large_scene_is_looked_at_from_near(cloud):
     assert np.ptp(state["box"], axis=0).max() < 200 < np.ptp(state["bounds"], axis=0).max()
 
 
+def test_around_an_object_a_picture_of_all_holds_it_and_the_sensors_not_a_box_of_both(cloud):
+    scene = Scene.from_meshes([box("Duck", (2, 2, 2))])
+    places = np.array([[9, 0, 1.0], [-9, 0, 1], [0, 0, 9]])
+    way = SensorWay(np.arange(3) * 1e9, places, False, "", "VLP-16")
+    hits, rays = np.zeros(scene.triangles, np.int64), np.zeros((0, 2, 3), np.float32)
+    seen = Pictured(scene, [way], hits, rays, None, None, (), 3e9)
+    state, arrays = told(result_view(CloudFile(cloud), seen), "state")
+    corners = arrays["corners"]
+    assert np.array_equal([corners[:8].min(axis=0), corners[:8].max(axis=0)], scene.bounds)
+    assert np.array_equal(corners[8:], places)
+    assert np.array_equal([corners.min(axis=0), corners.max(axis=0)], state["box"])
+
+
 def test_under_a_wide_roof_a_drive_is_cut_below_the_roof(cloud):
     roof = box("Roof", (800, 800, 1))
     roof = replace(roof, vertices=roof.vertices + np.array([0, 0, 10]))

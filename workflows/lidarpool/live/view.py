@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -36,6 +37,7 @@ _SAMPLE = 100_000  # points that colour scales and limits are taken from
 _HITS_SAMPLE = 500_000  # points that tell where on large triangles the hits are
 _MOST_NAMES = 2000  # in a menu
 _ACTOR_PLACES = 1000
+_PLACES = 1000  # of a sensor that a picture of all holds
 _IMAGE_WIDTH, _IMAGE_ROWS = 1024, 128  # most columns; rows of sensors with few or many channels
 _FEW, _MANY = 4, 512
 _NARROW = math.radians(300)  # a sensor that sees less is no spinning one
@@ -167,7 +169,8 @@ class View:
     def _state(self) -> Answer:
         """Tell all but points and surfaces."""
         near = around_ways(self._bounds, ways_of(self.sensors, self._actors, self._duration_ns))
-        arrays: dict[str, NDArray[Any]] = {"rays": self.rays_shown}
+        box = self._bounds if near is None else near
+        arrays: dict[str, NDArray[Any]] = {"rays": self.rays_shown, "corners": self._corners(near)}
         for number, way in enumerate(self.sensors):
             arrays[f"sensor{number}_times"] = way.times_ns / _NS
             arrays[f"sensor{number}_places"] = way.positions
@@ -190,7 +193,7 @@ class View:
                  "meaning": column.meaning} for name, column in self.columns.items()
             ],
             "origin": self.origin.tolist(),
-            "box": (self._bounds if near is None else near).tolist(),
+            "box": box.tolist(),
             "bounds": self._bounds.tolist(),
             "cut": None if near is None else float(near[1, 2]),
             "scene": scene,
@@ -207,6 +210,22 @@ class View:
             "note": self.note,
         }  # fmt: skip
         return header, arrays
+
+    def _corners(self, near: Floats | None) -> Floats:
+        """Corners of the scene or of the part that is looked at, then sensors, (k, 3), local.
+
+        A picture of all has to hold them. The box of scene and sensors is larger: around an object
+        it would be mostly empty.
+        """
+        pictured = self.pictured
+        if near is not None or pictured is None:
+            return _corners_of(self._bounds if near is None else near)
+        corners = [_corners_of(pictured.scene.bounds)]
+        corners += [way.positions[:: len(way.positions) // _PLACES + 1] for way in self.sensors]
+        if (planning := pictured.planning) is not None:
+            ends = np.array([planning.start, planning.target])
+            corners.append(np.column_stack([ends, np.full(2, self._bounds[0, 2])]))
+        return np.concatenate(corners)
 
     @property
     def rays_shown(self) -> NDArray[np.float32]:
@@ -419,6 +438,10 @@ def _of_points(points: Points | None) -> Bounds:
     box = np.percentile(places, [0.5, 99.5], axis=0)
     origin = np.where(np.abs(box[0]) > 10_000, np.round(box[0]), 0.0)
     return origin, box - origin
+
+
+def _corners_of(box: Floats) -> Floats:
+    return np.array(list(itertools.product(*box.T)))
 
 
 def _actor_arrays(name: str, actor: Actor, duration_ns: float) -> dict[str, NDArray[Any]]:

@@ -811,10 +811,11 @@ async function begin() {
   setTheme(savedTheme() ?? (systemDark.matches ? "dark" : "light"));
   systemDark.addEventListener("change", () => { if (!savedTheme()) setTheme(systemDark.matches ? "dark" : "light"); });
   say("Reading …");
-  takeState(await ask("state"));
-  const words = readLink();
+  const told = await ask("state");
   picture.resize();
-  picture.frame(state.box, state.bounds);
+  picture.frame(told.box, told.arrays.corners, told.bounds); // the size of sensors depends on it
+  takeState(told);
+  const words = readLink();
   buildPanel();
   setTheme(document.documentElement.dataset.theme);
   buildSteps();
