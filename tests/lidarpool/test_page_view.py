@@ -262,6 +262,25 @@ def test_a_range_image_has_channels_from_above_and_azimuth_from_left_to_right():
     assert few.shape[0] == 128  # by elevation
 
 
+@pytest.mark.parametrize("steps", [360, 900, 1024])
+def test_a_range_image_of_a_full_turn_has_no_empty_columns(steps):
+    turn = np.radians((np.arange(steps) + 0.5) * 360 / steps)
+    ring = 5 * np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
+    image = range_image(ring, np.full(steps, 5.0), np.repeat([0, 7], [steps - 20, 20]), (5.0, 9.0))
+    assert image[:, :, 3].any(axis=0).all()
+    assert image.shape[1] > 0.8 * steps
+
+
+def test_points_in_the_axes_of_their_sensor_are_shown_without_the_scene(cloud, pictured):
+    scene = Scene.from_meshes([box("Wall", (1, 8, 8))])
+    survey = Survey(Sensor.grid(layers=4), poses=[(-5, 0, 1)], coordinates="sensor")
+    view = result_view(CloudFile(cloud), pictured, Sweeps.of(survey, scene))
+    state, arrays = told(view, "state")
+    assert (state["scene"], "axes of their sensor" in state["note"]) == (None, True)
+    assert not arrays["sensor0_places"].any()  # each sensor is at its own origin
+    assert ["Wall", 0] in told(view, "column", name="object")[0]["labels"]
+
+
 def test_columns_of_other_programs_can_be_coloured_and_filtered_by(tmp_path):
     """A cloud without scans, far from zero, with columns of one value or none."""
     rows = np.zeros(20, [*((a, "<f8") for a in "xyz"), ("nx", "<f4"), ("2-a", "|u1"),

@@ -39,9 +39,11 @@ _MOST_NAMES = 2000  # in a menu
 _ACTOR_PLACES = 1000
 _PLACES = 1000  # of a sensor that a picture of all holds
 _IMAGE_WIDTH, _IMAGE_ROWS = 1024, 128  # most columns; rows of sensors with few or many channels
+_NO_GAPS = 0.9  # columns of a range image, as a share of a sensor's steps of azimuth
 _FEW, _MANY = 4, 512
 _NARROW = math.radians(300)  # a sensor that sees less is no spinning one
 _NS = 1e9
+IN_SENSOR_AXES = "Points are in the axes of their sensor, where the scene does not fit."
 
 
 @dataclass(eq=False)
@@ -103,11 +105,13 @@ class View:
         if self.pictured is not None:
             return self.pictured.sensors
         sweeps, ways = self.sweeps, []
-        if sweeps is None or sweeps.coordinates != "world":
+        if sweeps is None:
             return ()
         for number, name in enumerate(sweeps.sensors):
             own = sweeps.sensor == number
             places = sweeps.pose.positions[own] - self.origin
+            if sweeps.coordinates != "world":  # each point is in the axes of its sensor
+                places = np.zeros_like(places)
             moves = len(np.unique(places, axis=0)) > len(places) / 2 > 1
             ways.append(SensorWay(sweeps.begins_ns[own], places, moves, name))
         return ways
@@ -415,7 +419,9 @@ def range_image(
         span = float(np.ptp(elevation)) or 1.0
         count = _IMAGE_ROWS
         line = ((elevation.max() - elevation) * ((count - 1) / span)).astype(np.int64)
-    width = int(np.clip(np.bincount(line).max() * (2 * math.pi / _NARROW), 32, _IMAGE_WIDTH))
+    fullest = azimuth[line == np.bincount(line).argmax()]
+    each = float(np.ptp(fullest)) / len(fullest)  # between two points; columns are wider than that
+    width = int(np.clip(_NO_GAPS * (left - right) / max(each, 1e-9), 32, _IMAGE_WIDTH))
     across = ((left - azimuth) * (width / max(left - right, 1e-9))).astype(np.int64)
     image = np.zeros((count, width, 4), np.uint8)
     order = np.argsort(-ranges, kind="stable")  # the nearest is written last
