@@ -271,6 +271,18 @@ def test_a_range_image_of_a_full_turn_has_no_empty_columns(steps):
     assert image.shape[1] > 0.8 * steps
 
 
+def test_a_range_image_of_a_sensor_that_looks_down_is_a_row_across_its_way():
+    across = np.radians(np.linspace(20, -20, 200))
+    places = 500 * np.stack([0 * across, np.sin(across), -np.cos(across)], axis=1)
+    ranges = np.linspace(500, 520, 200)
+    image = range_image(places, ranges, np.zeros(200, np.int64), (500.0, 520.0))
+    assert image.shape[0] == 1 and 150 < image.shape[1] <= 200
+    assert image[0, :, 3].all()
+    green = image[0, :, 1].astype(int)  # falls from near to far
+    assert (np.diff(green) <= 0).all()
+    assert green[0] - green[-1] > 200  # the left is near
+
+
 def test_points_in_the_axes_of_their_sensor_are_shown_without_the_scene(cloud, pictured):
     scene = Scene.from_meshes([box("Wall", (1, 8, 8))])
     survey = Survey(Sensor.grid(layers=4), poses=[(-5, 0, 1)], coordinates="sensor")

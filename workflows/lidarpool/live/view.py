@@ -41,6 +41,7 @@ _PLACES = 1000  # of a sensor that a picture of all holds
 _IMAGE_WIDTH, _IMAGE_ROWS = 1024, 128  # most columns; rows of sensors with few or many channels
 _NO_GAPS = 0.9  # columns of a range image, as a share of a sensor's steps of azimuth
 _FEW, _MANY = 4, 512
+_DOWNWARDS = -0.7  # sine of the elevation
 _NARROW = math.radians(300)  # a sensor that sees less is no spinning one
 _NS = 1e9
 IN_SENSOR_AXES = "Points are in the axes of their sensor, where the scene does not fit."
@@ -406,13 +407,17 @@ def range_image(
     """Range image of points in their sensor's axes, RGBA (rows, columns, 4), the nearest ahead.
 
     Rows are channels, the highest above, or steps of elevation if the sensor has few or very
-    many. Columns are steps of azimuth from left to right. Empty pixels are transparent.
+    many. Columns are steps of azimuth from left to right. A sensor that looks down has one row,
+    of angles across its way. Empty pixels are transparent.
     """
-    azimuth = np.arctan2(places[:, 1], places[:, 0])
+    downwards = float(np.median(places[:, 2] / np.maximum(ranges, 1e-9))) < _DOWNWARDS
+    azimuth = np.arctan2(places[:, 1], -places[:, 2] if downwards else places[:, 0])
     left, right = float(azimuth.max()), float(azimuth.min())
     if left - right > _NARROW:
         left, right = math.pi, -math.pi
-    if channels is not None and _FEW <= (count := int(channels.max()) + 1) <= _MANY:
+    if downwards:
+        count, line = 1, np.zeros(len(places), np.int64)
+    elif channels is not None and _FEW <= (count := int(channels.max()) + 1) <= _MANY:
         line = count - 1 - channels
     else:
         elevation = np.arcsin(places[:, 2] / np.maximum(ranges, 1e-9))

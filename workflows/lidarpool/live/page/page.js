@@ -778,6 +778,7 @@ function follow() {
   news().catch((error) => {
     failed(error);
     panel.stop.hidden = true;
+    panel.progress.replaceChildren(); // it goes on no more
   });
 }
 

@@ -325,11 +325,12 @@ export class Picture {
   setSensors(sensors) {
     for (const made of this.sensorParts ?? []) this.scene.remove(made);
     this.sensorParts = [];
+    this.balls = []; // [mesh, radius in metres]
     this.sensors = sensors;
     const ball = new THREE.SphereGeometry(1, 20, 12), red = new THREE.MeshBasicMaterial({ color: RED });
     for (const sensor of sensors) {
       sensor.marker = new THREE.Mesh(ball, red);
-      sensor.marker.scale.setScalar((sensor.moves ? 0.0036 : 0.009) * this.extent);
+      this.balls.push([sensor.marker, (sensor.moves ? 0.0036 : 0.009) * this.extent]);
       this.sensorParts.push(sensor.marker);
       const { places } = sensor, count = places.length / 3;
       sensor.way = new THREE.Group();
@@ -341,7 +342,7 @@ export class Picture {
         for (let k = 0; k < count && k < 1000; k++) {
           const mark = new THREE.Mesh(ball, red);
           mark.position.set(...places.subarray(3 * k, 3 * k + 3));
-          mark.scale.setScalar(0.0054 * this.extent);
+          this.balls.push([mark, 0.0054 * this.extent]);
           sensor.way.add(mark);
         }
       }
@@ -464,10 +465,11 @@ export class Picture {
       const way = b.sub(a).setZ(0);
       if (way.length() > 1e-6) ahead.copy(way.normalize());
     }
-    const back = 0.045 * this.extent;
+    const back = 0.045 * this.extent, target = this.carrier.clone().addScaledVector(ahead, 0.1 * this.extent);
     const eye = this.carrier.clone().addScaledVector(ahead, -back).add(new THREE.Vector3(0, 0, back / 2));
+    if (moving && this.carrier.z - this.middle.z > 0.1 * this.extent) target.z = this.middle.z; // the ground is far below
     this.useParallel(false);
-    this.place(eye, this.carrier.clone().addScaledVector(ahead, 0.1 * this.extent));
+    this.place(eye, target);
   }
 
   place(position, target) {
@@ -534,6 +536,7 @@ export class Picture {
     const height = this.target.height;
     uniforms.flat_.value = this.isParallel;
     uniforms.pixels.value = height / (this.isParallel ? this.viewHeight : 2 * Math.tan((FOV * Math.PI) / 360));
+    for (const [ball, radius] of this.balls ?? []) ball.scale.setScalar(Math.min(radius, 0.012 * this.distanceTo(ball.position)));
     for (const mark of this.marks) if (mark.ball) mark.ball.scale.setScalar(0.006 * this.distanceTo(mark.place));
     const shade = this.shading.uniforms;
     shade.pixel.value.set(1 / this.target.width, 1 / height);
