@@ -518,6 +518,7 @@ function drawTicks() {
   const room = 8, at = (time) => room + (width - 2 * room) * (time / duration()); // a thumb is 16 pixels wide
   pen.fillStyle = style.getPropertyValue("--line");
   if (steps.length < width / 3) for (const time of steps) pen.fillRect(at(time), 0, 1, 4);
+  if (!state.duration) return; // one sweep of a cloud alone: nobody knows how long it took
   const most = width / 70, step = [1, 2, 5, 10].map((n) => n * 10 ** Math.floor(Math.log10(duration() / most))).find((n) => duration() / n <= most);
   pen.fillStyle = style.getPropertyValue("--muted");
   pen.font = "11px system-ui, sans-serif";
