@@ -84,6 +84,38 @@ def test_view_shows_the_cloud_and_asks_nobody_else(served, new_tab, tmp_path):
     assert tab.errors == []
 
 
+def test_a_look_at_all_fills_the_picture_and_the_sensor_can_be_seen(served, new_tab):
+    tab = opened(new_tab, served)
+    tab.wait_for(lambda _: drawn(tab) == COUNT)
+    for key in "atsf":
+        tab.key(key)
+        tab.value(f"{PICTURE}.updateCamera()")
+        most = tab.value(
+            "(({ corners, camera }) => Math.max(...corners.map((corner) => {"
+            " const at = corner.clone().project(camera);"
+            f" return Math.max(Math.abs(at.x), Math.abs(at.y)); }})))({PICTURE})"
+        )
+        assert most == pytest.approx(0.9, abs=0.01), key
+    share = tab.value(f"{PICTURE}.sensors[0].marker.scale.x / {PICTURE}.extent")
+    assert share == pytest.approx(0.0036)
+    assert tab.errors == []
+
+
+def test_the_keyboard_alone_presses_buttons_and_keys_work_after_a_box_was_clicked(served, new_tab):
+    tab = opened(new_tab, served)
+    tab.wait_for(lambda _: drawn(tab) == COUNT)
+    tab.tick("shade by depth", on=False)
+    tab.value("document.querySelector('label.tick input').focus()")
+    tab.key("t")
+    tab.wait_for(lambda _: tab.value(f"{PICTURE}.isParallel"))
+    tab.value("document.querySelector('summary').focus({ focusVisible: true })")
+    for kind in ("keyDown", "keyUp"):
+        tab.call("Input.dispatchKeyEvent", type=kind, key=" ", code="Space", text=" ")
+    tab.wait_for(lambda _: not tab.value("document.querySelector('details').open"))
+    assert tab.value("lidarpool.playing") is False
+    assert tab.errors == []
+
+
 def test_play_shows_a_sweep_and_moves_on_and_the_arrows_step(served, new_tab):
     tab = opened(new_tab, served)
     tab.wait_for(lambda _: drawn(tab) == COUNT)

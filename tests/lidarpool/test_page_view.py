@@ -158,6 +158,19 @@ def test_a_drive_through_a_large_scene_is_looked_at_from_near(cloud):
     assert np.ptp(state["box"], axis=0).max() < 200 < np.ptp(state["bounds"], axis=0).max()
 
 
+def test_around_an_object_a_picture_of_all_holds_it_and_the_sensors_not_a_box_of_both(cloud):
+    scene = Scene.from_meshes([box("Duck", (2, 2, 2))])
+    places = np.array([[9, 0, 1.0], [-9, 0, 1], [0, 0, 9]])
+    way = SensorWay(np.arange(3) * 1e9, places, False, "", "VLP-16")
+    hits, rays = np.zeros(scene.triangles, np.int64), np.zeros((0, 2, 3), np.float32)
+    seen = Pictured(scene, [way], hits, rays, None, None, (), 3e9)
+    state, arrays = told(result_view(CloudFile(cloud), seen), "state")
+    corners = arrays["corners"]
+    assert np.array_equal([corners[:8].min(axis=0), corners[:8].max(axis=0)], scene.bounds)
+    assert np.array_equal(corners[8:], places)
+    assert np.array_equal([corners.min(axis=0), corners.max(axis=0)], state["box"])
+
+
 def test_under_a_wide_roof_a_drive_is_cut_below_the_roof(cloud):
     roof = box("Roof", (800, 800, 1))
     roof = replace(roof, vertices=roof.vertices + np.array([0, 0, 10]))
@@ -246,6 +259,37 @@ def test_a_range_image_has_channels_from_above_and_azimuth_from_left_to_right():
     assert whole.shape == half.shape[:1] + whole.shape[1:]
     few = range_image(spots, away, np.repeat([0, 1], 360), (5.0, 9.0))
     assert few.shape[0] == 128  # by elevation
+
+
+@pytest.mark.parametrize("steps", [360, 900, 1024])
+def test_a_range_image_of_a_full_turn_has_no_empty_columns(steps):
+    turn = np.radians((np.arange(steps) + 0.5) * 360 / steps)
+    ring = 5 * np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
+    image = range_image(ring, np.full(steps, 5.0), np.repeat([0, 7], [steps - 20, 20]), (5.0, 9.0))
+    assert image[:, :, 3].any(axis=0).all()
+    assert image.shape[1] > 0.8 * steps
+
+
+def test_a_range_image_of_a_sensor_that_looks_down_is_a_row_across_its_way():
+    across = np.radians(np.linspace(20, -20, 200))
+    places = 500 * np.stack([0 * across, np.sin(across), -np.cos(across)], axis=1)
+    ranges = np.linspace(500, 520, 200)
+    image = range_image(places, ranges, np.zeros(200, np.int64), (500.0, 520.0))
+    assert image.shape[0] == 1 and 150 < image.shape[1] <= 200
+    assert image[0, :, 3].all()
+    green = image[0, :, 1].astype(int)  # falls from near to far
+    assert (np.diff(green) <= 0).all()
+    assert green[0] - green[-1] > 200  # the left is near
+
+
+def test_points_in_the_axes_of_their_sensor_are_shown_without_the_scene(cloud, pictured):
+    scene = Scene.from_meshes([box("Wall", (1, 8, 8))])
+    survey = Survey(Sensor.grid(layers=4), poses=[(-5, 0, 1)], coordinates="sensor")
+    view = result_view(CloudFile(cloud), pictured, Sweeps.of(survey, scene))
+    state, arrays = told(view, "state")
+    assert (state["scene"], "axes of their sensor" in state["note"]) == (None, True)
+    assert not arrays["sensor0_places"].any()  # each sensor is at its own origin
+    assert ["Wall", 0] in told(view, "column", name="object")[0]["labels"]
 
 
 def test_columns_of_other_programs_can_be_coloured_and_filtered_by(tmp_path):

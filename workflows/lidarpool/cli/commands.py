@@ -152,9 +152,9 @@ def demo(out: Path | Storage, **shown: Any) -> None:
 def run(scenario: Path, **given: Any) -> None:
     """Run the survey of a scenario or mesh file.
 
-    A mesh file is scanned from the middle of its floor, below the ceiling; every hit is kept, to
-    1 mm. For another sensor, pose or unit of length, lidarpool init DIR --mesh FILE writes a
-    scenario to edit.
+    A mesh file is scanned from the middle of its floor, below the ceiling, or from around and
+    above if it is an object; every hit is kept, to 1 mm. For another sensor, pose or unit of
+    length, lidarpool init DIR --mesh FILE writes a scenario to edit.
 
     \b
     Examples:

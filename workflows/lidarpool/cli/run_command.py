@@ -259,9 +259,10 @@ def _tell(out: Path | Storage, result: RunResult, job: Job, report: dict[str, An
     if not result.hits:
         click.echo(f"note: {no_hits(job)}")
     click.echo(
-        f"{job.survey.scan_count:,} scans, {result.rays:,} rays, {result.hits:,} hits on "
-        f"{counted(len(job.scene.all_names), 'object')}, {len(result.points):,} points in the "
-        f"cloud{result.thinned} ({result.backend}, {result.survey_seconds:.1f} s)"
+        f"{counted(job.survey.scan_count, 'scan')}, {counted(result.rays, 'ray')}, "
+        f"{counted(result.hits, 'hit')} on {counted(len(job.scene.all_names), 'object')}, "
+        f"{counted(len(result.points), 'point')} in the cloud{result.thinned} "
+        f"({result.backend}, {result.survey_seconds:.1f} s)"
     )
     if result.plan is not None:
         plan = result.plan

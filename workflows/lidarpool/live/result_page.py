@@ -11,13 +11,14 @@ import click
 
 from ..base.errors import LidarpoolError
 from ..base.notebook import cell_display
+from ..base.words import counted
 from ..columns.cloud_file import CloudFile
 from ..export.sweeps import SWEEPS_FILE, Sweeps
 from ..pipeline.database import FILE
 from ..run.picture_file import PICTURE_FILE, Pictured
 from ..run.store import RUN_FOLDER
 from .server import PORT, PageServer, announced, page_server
-from .view import View
+from .view import IN_SENSOR_AXES, View
 
 CLOUD = "cloud.ply"
 
@@ -29,7 +30,12 @@ def result_view(
     note: str = "",
     title: str = "lidarpool",
 ) -> View:
-    """Return what a page shows of a result, with what is known of it beside its points."""
+    """Return what a page shows of a result, with what is known of it beside its points.
+
+    Points in the axes of their sensors do not fit the scene, which is left out then.
+    """
+    if sweeps is not None and sweeps.coordinates != "world":
+        pictured, note = None, note or IN_SENSOR_AXES
     view = View(title, file, file.table, pictured, sweeps, note=note)
     if pictured is not None:
         faces = len(pictured.scene.faces)
@@ -41,10 +47,10 @@ def result_view(
 @contextmanager
 def result_page(view: View, *, port: int = PORT, browser: bool = True) -> Iterator[PageServer]:
     """Serve the page of a result while the body runs; see `announced`."""
-    count = 0 if view.points is None else len(view.points)
+    count = counted(0 if view.points is None else len(view.points), "point")
     with page_server(view, port) as page:
         ends = "" if cell_display() else "; Ctrl-C ends it"
-        with announced(page, f"{page.url} shows {count:,} points{ends}", browser):
+        with announced(page, f"{page.url} shows {count}{ends}", browser):
             yield page
 
 

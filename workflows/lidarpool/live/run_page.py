@@ -36,7 +36,7 @@ from ..sensor.materials import MaterialTable
 from .live_points import LivePoints
 from .points import HeldPoints
 from .server import PORT, Answer, Arguments, PageServer, announced, page_server
-from .view import View
+from .view import IN_SENSOR_AXES, View
 
 READ_EVERY_S, READING_SHARE = 0.2, 0.06  # of a core, to read parts while the run goes on
 ASKED_WITHIN_S = 10.0  # a page that asked no longer ago is open
@@ -63,6 +63,8 @@ class LiveRun:
             survey.duration_ns, (), table.reflectance,
         )  # fmt: skip
         self._view = View("lidarpool", None, (SCAN, *survey.stored_columns), pictured)
+        if survey.coordinates != "world":
+            self._view.note = IN_SENSOR_AXES
         self._view.hits = self._hits
         self._starting = "starting"  # the state before there is any progress
         self._store: RunStore | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -36,10 +37,14 @@ _SAMPLE = 100_000  # points that colour scales and limits are taken from
 _HITS_SAMPLE = 500_000  # points that tell where on large triangles the hits are
 _MOST_NAMES = 2000  # in a menu
 _ACTOR_PLACES = 1000
+_PLACES = 1000  # of a sensor that a picture of all holds
 _IMAGE_WIDTH, _IMAGE_ROWS = 1024, 128  # most columns; rows of sensors with few or many channels
+_NO_GAPS = 0.9  # columns of a range image, as a share of a sensor's steps of azimuth
 _FEW, _MANY = 4, 512
+_DOWNWARDS = -0.7  # sine of the elevation
 _NARROW = math.radians(300)  # a sensor that sees less is no spinning one
 _NS = 1e9
+IN_SENSOR_AXES = "Points are in the axes of their sensor, where the scene does not fit."
 
 
 @dataclass(eq=False)
@@ -101,11 +106,13 @@ class View:
         if self.pictured is not None:
             return self.pictured.sensors
         sweeps, ways = self.sweeps, []
-        if sweeps is None or sweeps.coordinates != "world":
+        if sweeps is None:
             return ()
         for number, name in enumerate(sweeps.sensors):
             own = sweeps.sensor == number
             places = sweeps.pose.positions[own] - self.origin
+            if sweeps.coordinates != "world":  # each point is in the axes of its sensor
+                places = np.zeros_like(places)
             moves = len(np.unique(places, axis=0)) > len(places) / 2 > 1
             ways.append(SensorWay(sweeps.begins_ns[own], places, moves, name))
         return ways
@@ -167,7 +174,8 @@ class View:
     def _state(self) -> Answer:
         """Tell all but points and surfaces."""
         near = around_ways(self._bounds, ways_of(self.sensors, self._actors, self._duration_ns))
-        arrays: dict[str, NDArray[Any]] = {"rays": self.rays_shown}
+        box = self._bounds if near is None else near
+        arrays: dict[str, NDArray[Any]] = {"rays": self.rays_shown, "corners": self._corners(near)}
         for number, way in enumerate(self.sensors):
             arrays[f"sensor{number}_times"] = way.times_ns / _NS
             arrays[f"sensor{number}_places"] = way.positions
@@ -190,7 +198,7 @@ class View:
                  "meaning": column.meaning} for name, column in self.columns.items()
             ],
             "origin": self.origin.tolist(),
-            "box": (self._bounds if near is None else near).tolist(),
+            "box": box.tolist(),
             "bounds": self._bounds.tolist(),
             "cut": None if near is None else float(near[1, 2]),
             "scene": scene,
@@ -207,6 +215,22 @@ class View:
             "note": self.note,
         }  # fmt: skip
         return header, arrays
+
+    def _corners(self, near: Floats | None) -> Floats:
+        """Corners of the scene or of the part that is looked at, then sensors, (k, 3), local.
+
+        A picture of all has to hold them. The box of scene and sensors is larger: around an object
+        it would be mostly empty.
+        """
+        pictured = self.pictured
+        if near is not None or pictured is None:
+            return _corners_of(self._bounds if near is None else near)
+        corners = [_corners_of(pictured.scene.bounds)]
+        corners += [way.positions[:: len(way.positions) // _PLACES + 1] for way in self.sensors]
+        if (planning := pictured.planning) is not None:
+            ends = np.array([planning.start, planning.target])
+            corners.append(np.column_stack([ends, np.full(2, self._bounds[0, 2])]))
+        return np.concatenate(corners)
 
     @property
     def rays_shown(self) -> NDArray[np.float32]:
@@ -383,20 +407,26 @@ def range_image(
     """Range image of points in their sensor's axes, RGBA (rows, columns, 4), the nearest ahead.
 
     Rows are channels, the highest above, or steps of elevation if the sensor has few or very
-    many. Columns are steps of azimuth from left to right. Empty pixels are transparent.
+    many. Columns are steps of azimuth from left to right. A sensor that looks down has one row,
+    of angles across its way. Empty pixels are transparent.
     """
-    azimuth = np.arctan2(places[:, 1], places[:, 0])
+    downwards = float(np.median(places[:, 2] / np.maximum(ranges, 1e-9))) < _DOWNWARDS
+    azimuth = np.arctan2(places[:, 1], -places[:, 2] if downwards else places[:, 0])
     left, right = float(azimuth.max()), float(azimuth.min())
     if left - right > _NARROW:
         left, right = math.pi, -math.pi
-    if channels is not None and _FEW <= (count := int(channels.max()) + 1) <= _MANY:
+    if downwards:
+        count, line = 1, np.zeros(len(places), np.int64)
+    elif channels is not None and _FEW <= (count := int(channels.max()) + 1) <= _MANY:
         line = count - 1 - channels
     else:
         elevation = np.arcsin(places[:, 2] / np.maximum(ranges, 1e-9))
         span = float(np.ptp(elevation)) or 1.0
         count = _IMAGE_ROWS
         line = ((elevation.max() - elevation) * ((count - 1) / span)).astype(np.int64)
-    width = int(np.clip(np.bincount(line).max() * (2 * math.pi / _NARROW), 32, _IMAGE_WIDTH))
+    fullest = azimuth[line == np.bincount(line).argmax()]
+    each = float(np.ptp(fullest)) / len(fullest)  # between two points; columns are wider than that
+    width = int(np.clip(_NO_GAPS * (left - right) / max(each, 1e-9), 32, _IMAGE_WIDTH))
     across = ((left - azimuth) * (width / max(left - right, 1e-9))).astype(np.int64)
     image = np.zeros((count, width, 4), np.uint8)
     order = np.argsort(-ranges, kind="stable")  # the nearest is written last
@@ -419,6 +449,10 @@ def _of_points(points: Points | None) -> Bounds:
     box = np.percentile(places, [0.5, 99.5], axis=0)
     origin = np.where(np.abs(box[0]) > 10_000, np.round(box[0]), 0.0)
     return origin, box - origin
+
+
+def _corners_of(box: Floats) -> Floats:
+    return np.array(list(itertools.product(*box.T)))
 
 
 def _actor_arrays(name: str, actor: Actor, duration_ns: float) -> dict[str, NDArray[Any]]:

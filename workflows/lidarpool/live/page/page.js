@@ -10,6 +10,7 @@ const AHEAD = 3; // sweeps that are asked for before they are played
 const GROWING = 300_000; // points of all sweeps up to now, while they are played
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 5, 10];
 const BUDGETS = [0.2, 0.5, 1, 2, 5, 10, 20].map((millions) => millions * 1e6);
+const SHOWS = [["all", "all points"], ["sweep", "one sweep"], [0.5, "last 0.5 s"], [2, "last 2 s"], [10, "last 10 s"], ["now", "all until now"]];
 const HIDDEN = "not shown";
 const TYPES = {
   float32: Float32Array, float64: Float64Array, uint8: Uint8Array, uint16: Uint16Array, uint32: Uint32Array, int32: Int32Array,
@@ -237,7 +238,7 @@ function tellFacts() {
   const some = layers[0]?.count ?? (chosen.colour === HIDDEN ? state.points : 0);
   const count = state.sampled ? state.points : some; // of a run, some parts are read
   const drawn = Math.min(picture.drawn, count), n = (value) => value.toLocaleString("en");
-  const parts = [`<b>${n(count)} points</b>`];
+  const parts = [`<b>${n(count)} ${count === 1 ? "point" : "points"}</b>`];
   if (count < state.points) parts.push(`of ${n(state.points)}`);
   if (drawn < count && chosen.colour !== HIDDEN) parts.push(`· ${n(drawn)} drawn`);
   panel.facts.innerHTML = parts.join(" ");
@@ -478,8 +479,7 @@ function buildTime() {
   $("time").hidden = !timed;
   if (!timed) return;
   clock.play = iconButton("play", "Play (space)", () => setPlaying(!playing));
-  const shows = [["all", "all points"], ["sweep", "one sweep"], [0.5, "last 0.5 s"], [2, "last 2 s"], [10, "last 10 s"], ["now", "all until now"]];
-  clock.show = menu("", shows.filter(([value]) => !(+value >= state.duration)), chosen.show, (value) => { clock.own = true; setShow(value); });
+  clock.show = menu("", SHOWS.filter(([value]) => !(+value >= state.duration)), chosen.show, (value) => { clock.own = true; setShow(value); });
   clock.show.title = "Points that are shown";
   clock.slider = element("input", { type: "range", min: 0, max: duration(), step: "any", value: chosen.time, title: "Time" });
   clock.slider.setAttribute("aria-label", "time, seconds");
@@ -518,6 +518,7 @@ function drawTicks() {
   const room = 8, at = (time) => room + (width - 2 * room) * (time / duration()); // a thumb is 16 pixels wide
   pen.fillStyle = style.getPropertyValue("--line");
   if (steps.length < width / 3) for (const time of steps) pen.fillRect(at(time), 0, 1, 4);
+  if (!state.duration) return; // one sweep of a cloud alone: nobody knows how long it took
   const most = width / 70, step = [1, 2, 5, 10].map((n) => n * 10 ** Math.floor(Math.log10(duration() / most))).find((n) => duration() / n <= most);
   pen.fillStyle = style.getPropertyValue("--muted");
   pen.font = "11px system-ui, sans-serif";
@@ -676,7 +677,7 @@ function readLink() {
   const columns = state.columns.map((column) => column.name), get = (name) => words.get(name) ?? "";
   if ([...columns, HIDDEN].includes(get("colour"))) chosen.colour = get("colour");
   if ([...(state.scene ?? []), HIDDEN].includes(get("scene"))) chosen.scene = get("scene");
-  if (get("show")) { chosen.show = get("show"); clock.own = true; }
+  if (SHOWS.some(([value]) => `${value}` === get("show"))) { chosen.show = get("show"); clock.own = true; }
   if (get("size")) chosen.size = picture.pointScale = Math.min(10, Math.max(0.1, +get("size") || 1));
   chosen.time = Math.min(Math.max(+get("time") || 0, 0), state.duration);
   for (const entry of get("filter").split(";").filter(Boolean)) {
@@ -778,21 +779,25 @@ function follow() {
   news().catch((error) => {
     failed(error);
     panel.stop.hidden = true;
+    panel.progress.replaceChildren(); // it goes on no more
   });
 }
 
 function keys(event) {
   if (event.ctrlKey || event.metaKey || event.altKey) return;
-  if (["INPUT", "SELECT"].includes(event.target.tagName) && event.target !== clock.slider) return;
+  // Controls keep the keys that they need; a button its space if the keyboard, not the mouse, led there.
+  const { target, key } = event, letter = key.length === 1 && key !== " ";
+  if (target.tagName === "SELECT" || (target.type === "range" && target !== clock.slider && !letter)) return;
+  if (key === " " && (target.type === "checkbox" || target.matches("button:focus-visible, summary:focus-visible"))) return;
   const acts = {
     " ": () => setPlaying(!playing), ArrowLeft: () => stepBy(event.shiftKey ? -10 : -1), ArrowRight: () => stepBy(event.shiftKey ? 10 : 1),
     Home: () => stepBy(-1e9), End: () => stepBy(1e9), a: () => look("all"), t: () => look("top"), s: () => look("side"), f: () => look("front"),
     p: () => { picture.useParallel(!picture.isParallel); panel.parallel.box.checked = picture.isParallel; }, c: copyLink,
   };
   const timed = [" ", "ArrowLeft", "ArrowRight", "Home", "End"];
-  const act = acts[event.key.length === 1 ? event.key.toLowerCase() : event.key];
-  if (!act || (timed.includes(event.key) && $("time").hidden)) return;
-  if (event.target.tagName === "BUTTON" && event.key === " ") event.target.blur();
+  const act = acts[letter ? key.toLowerCase() : key];
+  if (!act || (timed.includes(key) && $("time").hidden)) return;
+  if (target.tagName === "BUTTON" && key === " ") target.blur();
   event.preventDefault();
   act();
 }
@@ -811,10 +816,11 @@ async function begin() {
   setTheme(savedTheme() ?? (systemDark.matches ? "dark" : "light"));
   systemDark.addEventListener("change", () => { if (!savedTheme()) setTheme(systemDark.matches ? "dark" : "light"); });
   say("Reading …");
-  takeState(await ask("state"));
-  const words = readLink();
+  const told = await ask("state");
   picture.resize();
-  picture.frame(state.box, state.bounds);
+  picture.frame(told.box, told.arrays.corners, told.bounds); // the size of sensors depends on it
+  takeState(told);
+  const words = readLink();
   buildPanel();
   setTheme(document.documentElement.dataset.theme);
   buildSteps();

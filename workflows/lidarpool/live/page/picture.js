@@ -165,11 +165,14 @@ export class Picture {
 
   // -- what is shown ---------------------------------------------------------------------
 
-  // box: [low, high] that is looked at; bounds: of all
-  frame(box, bounds) {
+  // box: [low, high] that is looked at; corners: those of the scene, and sensors; bounds: of all
+  frame(box, corners, bounds) {
+    this.corners = [];
+    for (let k = 0; k < corners.length; k += 3) this.corners.push(new THREE.Vector3(...corners.subarray(k, k + 3)));
     this.box = box.map((corner) => new THREE.Vector3(...corner));
     this.bounds = bounds.map((corner) => new THREE.Vector3(...corner));
     this.extent = this.box[0].distanceTo(this.box[1]) || 1;
+    this.middle = this.corners[0].clone().add(this.corners[7]).multiplyScalar(0.5); // of the scene
     this.reach = this.bounds[0].distanceTo(this.bounds[1]) || 1;
     this.setClip([[null, null], [null, null], [null, null]]);
     this.addGrid();
@@ -322,11 +325,12 @@ export class Picture {
   setSensors(sensors) {
     for (const made of this.sensorParts ?? []) this.scene.remove(made);
     this.sensorParts = [];
+    this.balls = []; // [mesh, radius in metres]
     this.sensors = sensors;
     const ball = new THREE.SphereGeometry(1, 20, 12), red = new THREE.MeshBasicMaterial({ color: RED });
     for (const sensor of sensors) {
       sensor.marker = new THREE.Mesh(ball, red);
-      sensor.marker.scale.setScalar((sensor.moves ? 0.0036 : 0.009) * this.extent);
+      this.balls.push([sensor.marker, (sensor.moves ? 0.0036 : 0.009) * this.extent]);
       this.sensorParts.push(sensor.marker);
       const { places } = sensor, count = places.length / 3;
       sensor.way = new THREE.Group();
@@ -338,7 +342,7 @@ export class Picture {
         for (let k = 0; k < count && k < 1000; k++) {
           const mark = new THREE.Mesh(ball, red);
           mark.position.set(...places.subarray(3 * k, 3 * k + 3));
-          mark.scale.setScalar(0.0054 * this.extent);
+          this.balls.push([mark, 0.0054 * this.extent]);
           sensor.way.add(mark);
         }
       }
@@ -428,39 +432,44 @@ export class Picture {
 
   // -- camera ----------------------------------------------------------------------------
 
+  // So far away that all corners are within 0.9 of the picture.
   look(side) {
     const away = new THREE.Vector3(...SIDES[side]).normalize();
-    const [low, high] = this.box;
-    const middle = low.clone().add(high).multiplyScalar(0.5);
     const up = new THREE.Vector3(0, side === "top" ? 1 : 0, side === "top" ? 0 : 1);
     const right = up.clone().cross(away).normalize(), tall = away.clone().cross(right);
-    const aspect = this.perspective.aspect, slope = Math.tan((FOV * Math.PI) / 360);
+    const slope = 0.9 * Math.tan((FOV * Math.PI) / 360);
+    const ahead = this.corners.map((corner) => corner.dot(away)), depth = (Math.min(...ahead) + Math.max(...ahead)) / 2;
+    const target = away.clone().multiplyScalar(depth);
     let distance = 0;
-    for (let k = 0; k < 8; k++) {
-      const corner = new THREE.Vector3(...[0, 1, 2].map((axis) => (k & (1 << axis) ? high : low).getComponent(axis))).sub(middle);
-      const reach = Math.max(Math.abs(corner.dot(right)) / aspect, Math.abs(corner.dot(tall))) / 0.9 / slope;
-      distance = Math.max(distance, (side === "all" ? corner.dot(away) : 0) + reach);
+    for (const [axis, tangent] of [[right, slope * this.perspective.aspect], [tall, slope]]) {
+      // The sides of the picture touch the outermost corners; those ahead are larger in it.
+      const ends = [1, -1].map((sign) => Math.max(...this.corners.map((corner, k) =>
+        sign * corner.dot(axis) + (side === "all" ? tangent * (ahead[k] - depth) : 0))));
+      target.addScaledVector(axis, (ends[0] - ends[1]) / 2);
+      distance = Math.max(distance, (ends[0] + ends[1]) / 2 / tangent);
     }
-    this.place(middle.clone().addScaledVector(away, distance || 1), middle);
-    if (side === "all") this.useParallel(false);
-    else this.useParallel(true);
+    this.place(target.clone().addScaledVector(away, distance || 1), target);
+    this.useParallel(side !== "all");
   }
 
-  // Behind and above the carrier, looking ahead.
+  // Behind and above the carrier, looking ahead; or to the middle, if it stands.
   lookFromSensor() {
     if (!this.carrier) return;
     const moving = this.sensors.find((sensor) => sensor.moves);
     const ahead = new THREE.Vector3(1, 0, 0);
+    const inwards = this.middle.clone().sub(this.carrier);
+    if (!moving && inwards.length() > 0.1 * this.extent) ahead.copy(inwards.normalize());
     if (moving) {
       const step = 0.02 * (moving.times.at(-1) - moving.times[0]);
       const [a, b] = [-step, step].map((part) => new THREE.Vector3(...placeAt(moving.times, moving.places, this.time + part, true)));
       const way = b.sub(a).setZ(0);
       if (way.length() > 1e-6) ahead.copy(way.normalize());
     }
-    const back = 0.045 * this.extent;
+    const back = 0.045 * this.extent, target = this.carrier.clone().addScaledVector(ahead, 0.1 * this.extent);
     const eye = this.carrier.clone().addScaledVector(ahead, -back).add(new THREE.Vector3(0, 0, back / 2));
+    if (moving && this.carrier.z - this.middle.z > 0.1 * this.extent) target.z = this.middle.z; // the ground is far below
     this.useParallel(false);
-    this.place(eye, this.carrier.clone().addScaledVector(ahead, 0.1 * this.extent));
+    this.place(eye, target);
   }
 
   place(position, target) {
@@ -527,6 +536,7 @@ export class Picture {
     const height = this.target.height;
     uniforms.flat_.value = this.isParallel;
     uniforms.pixels.value = height / (this.isParallel ? this.viewHeight : 2 * Math.tan((FOV * Math.PI) / 360));
+    for (const [ball, radius] of this.balls ?? []) ball.scale.setScalar(Math.min(radius, 0.012 * this.distanceTo(ball.position)));
     for (const mark of this.marks) if (mark.ball) mark.ball.scale.setScalar(0.006 * this.distanceTo(mark.place));
     const shade = this.shading.uniforms;
     shade.pixel.value.set(1 / this.target.width, 1 / height);
