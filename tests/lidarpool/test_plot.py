@@ -199,6 +199,15 @@ def test_a_result_without_a_plan(unplanned, tmp_path):
         plot(result, "--only", "path")
 
 
+def test_points_in_the_axes_of_their_sensors_are_in_no_picture(unplanned, tmp_path):
+    """They do not fit the scene."""
+    result = make(tmp_path / "result", replace(unplanned, coordinates="sensor"))
+    plot(result, *SMALL, "--out", tmp_path / "out")
+    assert names(tmp_path / "out") == {"scene.png", "intensity.png"}
+    with pytest.raises(LidarpoolError, match="no picture 'cloud': its run has points in the axes"):
+        plot(result, "--only", "cloud")
+
+
 def test_a_result_in_storage(result, tmp_path):
     url = f"memory://{tmp_path.name}/result"
     with pytest.raises(LidarpoolError, match=f"^{url} has no complete result, which has a report"):

@@ -181,7 +181,7 @@ class _Pictures:
         """Draw the pictures of the cloud, whose file is there by now, and write the page."""
         from .page.page import write_page
 
-        self._drawn |= {name: self._begun(name) for name in _OF_CLOUD}
+        self._drawn |= {n: self._begun(n) for n in _OF_CLOUD if n in self._makers}
         self._pictured.save(self._staged / PICTURE_FILE)
         images = {name: self._drawn[name].result() for name in self._makers}
         write_page(self._staged / PAGE, report, result, cloud, images, scenario)

@@ -56,7 +56,8 @@ def draw_pictures(
             there = did_you_mean(name, PICTURES) or f" There are {', '.join(PICTURES)}."
             raise LidarpoolError(f"There is no picture {name!r}.{there}")
         if name not in makers:
-            raise LidarpoolError(f"There is no picture {name!r}: its run planned no path.")
+            why = "planned no path" if name == "path" else "has points in the axes of its sensors"
+            raise LidarpoolError(f"There is no picture {name!r}: its run {why}.")
     with explained(f"The folder {folder} cannot be made", "give another"):
         Path(folder).mkdir(parents=True, exist_ok=True)
     for name in only or makers:
@@ -70,7 +71,8 @@ def picture_makers(
 ) -> dict[str, Callable[[], Page]]:
     """Return functions that draw pictures, all from the same viewpoint.
 
-    Without planning there is no picture of the path.
+    Without planning there is no picture of the path; and none of points in the axes of their
+    sensors, which do not fit the scene.
 
     Parameters
     ----------
@@ -83,6 +85,7 @@ def picture_makers(
     colour
         Column that the cloud is coloured by.
     """
+    alone = shown.coordinates == "sensor"
     middle, moving = shown.duration_ns / 2, [way for way in shown.sensors if way.moves]
     ways = [way.positions for way in moving]
 
@@ -128,7 +131,7 @@ def picture_makers(
         _, parents, shares, _ = part()
         hits = int(shown.hit_counts.sum())
         counts = shown.hit_counts[parents] * shares
-        places = points().positions - shown.scene.origin
+        places = np.empty((0, 3)) if alone else points().positions - shown.scene.origin
         return draw_intensity(shot(), counts, places, shown.sample_rays, hits)
 
     def draw_points() -> Page:
@@ -146,8 +149,9 @@ def picture_makers(
     makers: dict[str, Callable[[], Page]] = {
         "scene": lambda: draw_scene(shot(), shown.scene.triangles),
         "intensity": draw_hits,
-        "cloud": draw_points,
     }
+    if not alone:
+        makers["cloud"] = draw_points
     planning, plan = shown.planning, shown.plan
     if planning is not None and plan is not None:
         makers["path"] = lambda: draw_path(

@@ -28,7 +28,7 @@ PICTURE_FILE = "pictures.npz"
 
 MODELS_MOST = 4  # sensors named in a picture
 PLACES_MOST = 1000  # positions of a moving sensor or actor
-_FORMAT = 3
+_FORMAT = 4
 _ACTOR = ("vertices", "faces", "times", "positions", "quaternions")
 _PLAN_NUMBERS = ("length", "shortest_possible", "clearance", "trial", "trials")
 
@@ -89,6 +89,8 @@ class Pictured:
         None if it is not known.
     own
         Columns of the cloud that are not in the table of columns; their values are in its file.
+    coordinates
+        Of the cloud's points: "world", or "sensor", where they do not fit the scene.
     """
 
     scene: Scene
@@ -101,6 +103,7 @@ class Pictured:
     duration_ns: float = 0.0
     own: Sequence[Column] = ()
     reflectance: NDArray[np.float64] | None = None
+    coordinates: str = "world"
 
     @classmethod
     def of(cls, result: RunResult) -> Pictured:
@@ -118,6 +121,7 @@ class Pictured:
             survey.duration_ns,
             [replace(c, source="") for c in survey.stored_columns if c.name not in TABLE],
             MaterialTable.of(survey.materials, scene.all_names).reflectance,
+            survey.coordinates,
         )
 
     @property
@@ -159,6 +163,7 @@ class Pictured:
             "actors": [actor.name for actor in self.scene.actors],
             "sensors": [[way.name, way.model, way.moves] for way in self.sensors],
             "own": [asdict(column) for column in self.own],
+            "coordinates": self.coordinates,
         }
         arrays: dict[str, Any] = {
             "format": _FORMAT,
@@ -236,14 +241,14 @@ class Pictured:
             raise ValueError(f"hit_counts of {counts.shape} for {scene.triangles} triangles")
         rays, duration = arrays["sample_rays"], float(arrays["duration_ns"])
         own = [Column(**column) for column in names["own"]]
-        shares = arrays.get("reflectance")
+        rest = duration, own, arrays.get("reflectance"), names["coordinates"]
         if "path" not in arrays:
-            return cls(scene, sensors, counts, rays, None, None, (), duration, own, shares)
+            return cls(scene, sensors, counts, rays, None, None, (), *rest)
         start, target = arrays["ends"]
         planning = Planning(start, target, arrays["centres"], arrays["radii"])
         numbers = {name: arrays[name].item() for name in _PLAN_NUMBERS}
         plan, trials = Plan(path=arrays["path"], **numbers), tuple(arrays["waypoints"])
-        return cls(scene, sensors, counts, rays, planning, plan, trials, duration, own, shares)
+        return cls(scene, sensors, counts, rays, planning, plan, trials, *rest)
 
 
 def sensor_ways(survey: Survey) -> list[SensorWay]:
