@@ -9,6 +9,7 @@ import subprocess
 import time
 import urllib.request
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -48,7 +49,9 @@ class Tab:
     """One page of a browser: what it asked for, what it complained of, what it shows."""
 
     def __init__(self, url: str):
-        self._socket = connect(url, max_size=None, compression=None, ping_interval=None)
+        self._open = ExitStack()
+        link = connect(url, max_size=None, compression=None, ping_interval=None)
+        self._socket = self._open.enter_context(link)
         self._numbers = itertools.count(1)
         self.requests: list[str] = []  # addresses
         self.errors: list[str] = []  # of the console, and exceptions
@@ -156,7 +159,7 @@ class Tab:
 
     def close(self) -> None:
         """Let go of the page."""
-        self._socket.close()
+        self._open.close()
 
 
 @pytest.fixture(scope="session")
