@@ -167,15 +167,24 @@ def test_poses_within_a_closed_body_are_told_of_with_some_that_see_it(tmp_path):
     assert "only the backs of its surfaces" in given.advice(given.build_scene())[-1]
 
 
-@pytest.mark.parametrize(("length", "noted"), [(13.0, True), (4.0, False), (0.05, False)])
-def test_the_unit_of_a_long_object_is_asked_for(tmp_path, length, noted):
+@pytest.mark.parametrize(
+    ("file", "length", "noted"),
+    [
+        ("screw.stl", 13.0, True),
+        ("screw.stl", 4.0, False),
+        ("screw.stl", 0.05, False),
+        ("engine.glb", 700.0, True),  # of an exporter that writes millimetres
+        ("engine.glb", 40.0, False),
+    ],
+)
+def test_the_unit_of_a_long_object_is_asked_for(tmp_path, file, length, noted):
     capsule = creation.capsule(length * 0.8, length * 0.1)
-    (tmp_path / "screw.stl").write_bytes(capsule.export(file_type="stl"))
-    read = Scenario.load(tmp_path / "screw.stl")
+    (tmp_path / file).write_bytes(capsule.export(file_type=file[-3:]))
+    read = Scenario.load(tmp_path / file)
     scene = read.build_scene()
     read.survey(scene)
     notes = " ".join(read.advice(scene))
-    assert "looks like an object" in notes and ("states no unit" in notes) == noted
+    assert "looks like an object" in notes and ("give the file's unit (mm?)" in notes) == noted
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".obj"])

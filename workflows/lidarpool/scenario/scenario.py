@@ -52,8 +52,9 @@ from .validation_errors import validation_errors
 FLAT_M = 0.2
 
 # Sizes of scenes in metres are between these. An .stl is mostly a part, in millimetres; an object
-# to look at from outside is rarely longer than a bus.
-LARGE_M, LARGE_STL_M, LARGE_OBJECT_M, SMALL_M = 500.0, 20.0, 10.0, 0.2
+# to look at from outside is rarely longer than a bus. glTF is in metres, and some exporters write
+# millimetres.
+LARGE_M, LARGE_STL_M, LARGE_OBJECT_M, LARGE_STATED_M, SMALL_M = 500.0, 20.0, 10.0, 100.0, 0.2
 
 SEED_START = (25.0, 25.0)
 SEED_TARGET = (-30.0, -20.0)
@@ -275,25 +276,26 @@ class Scenario(Section):
         return [*notes, *filter(None, (self._of_size(scene), poses))]
 
     def _of_size(self, scene: Scene) -> str:
+        files = [entry.file for entry in self.scene.files if entry.unit is None]
         unitless = [
-            entry.file
-            for entry in self.scene.files
-            if entry.unit is None
-            and Path(entry.file).suffix.lower() in UNITLESS
-            and not wrote_it(self._path(entry.file))
+            file
+            for file in files
+            if Path(file).suffix.lower() in UNITLESS and not wrote_it(self._path(file))
         ]
         side = float(np.ptp(scene.bounds, axis=0).max())
         parts = any(file.lower().endswith(".stl") for file in unitless)
         least, large = SMALL_M, LARGE_STL_M if parts else LARGE_M
-        if self._placing is not None and self._placing.around:
-            least, large = 0.0, LARGE_OBJECT_M
-        if not unitless or least <= side <= large:
+        around = self._placing is not None and self._placing.around
+        if around:
+            least, large = 0.0, LARGE_OBJECT_M if unitless else LARGE_STATED_M
+        if not (unitless or (around and files)) or least <= side <= large:
             return ""
         unit = "mm" if side > large else "km"
+        said = "states no unit" if unitless else "is in metres by its format"
         return (
-            f"{unitless[0]} states no unit, and in metres the scene is {side:,.5g} m long. If that "
-            f"is wrong, give the file's unit ({unit}?) in scene.files (lidarpool init DIR --mesh "
-            f"FILE --unit {unit} writes such a scenario)"
+            f"{(unitless or files)[0]} {said}, and in metres the scene is {side:,.5g} m long. If "
+            f"that is wrong, give the file's unit ({unit}?) in scene.files (lidarpool init DIR "
+            f"--mesh FILE --unit {unit} writes such a scenario)"
         )
 
     def _of_poses(self, scene: Scene) -> str:
