@@ -24,7 +24,7 @@ from ..run.picture_file import Pictured, SensorWay, ways_of
 from ..scene.actors import Actor
 from ..sensor.trajectory import quaternions_of
 from .legend import Legend, as_bytes, legend_of
-from .points import Eye, Filter, PointFinder, Points, Rows, Scans, positions, within
+from .points import Eye, Filter, PointFinder, Points, Scans, positions, within
 from .server import Answer, Arguments
 from .surface import Surface, colours_for
 
@@ -283,19 +283,17 @@ class View:
             known[name, wanted] = colours_of(values, self.columns[name], self._names(name))
         return known[name, wanted]
 
-    def _sample(self, name: str) -> tuple[Rows, NDArray[Any]]:
-        """Rows of an evenly spaced sample and their finite values of a column."""
+    def _sample(self, name: str) -> NDArray[Any]:
+        """Finite values of a column in an evenly spaced sample of the points."""
         if self._finder is None:
-            return np.empty(0, np.int64), np.empty(0)
-        rows, _ = self._finder.find(_SAMPLE)
-        values = self._finder.points.values(name, rows)
-        known = np.isfinite(values)
-        return rows[known], values[known]
+            return np.empty(0)
+        values = self._finder.points.values(name, self._finder.find(_SAMPLE)[0])
+        return values[np.isfinite(values)]
 
     def _column(self, name: str) -> Answer:
         """Tell what a column can be filtered by: its limits, or its labels."""
         column = self.columns[name]
-        _, values = self._sample(name)
+        values = self._sample(name)
         names, found = self._names(name), np.unique(values)
         few = len(found) <= (_MOST_NAMES if names else MOST_ENTRIES) and name != "scan"
         if column.kind == "label" and len(found) and few:

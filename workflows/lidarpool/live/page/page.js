@@ -759,7 +759,7 @@ async function news() {
       showPath();
     }
     if (told.ends !== (news.ends ?? 0)) {
-      Object.assign(news, { ends: told.ends, over: true });
+      news.ends = told.ends;
       cache.clear();
       takeState(await ask("state"));
       picture.setTime(chosen.time);
